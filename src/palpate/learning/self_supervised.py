@@ -1,0 +1,272 @@
+"""Learning a controller through a differentiable model (SPiD, arXiv 2602.03623, Algorithm 2).
+
+The task's loss of whole episodes is differentiated through policy and model. Start states are
+moved by the task's symmetries and the model is perturbed anew in every iteration; episodes grow
+longer in stages, and perturbations wider.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from palpate.devices import data_parallel
+from palpate.errors import PalpateError
+from palpate.models.model import Model
+from palpate.networks.policy import CommandPolicy, Policy
+from palpate.parameters import randomise
+from palpate.perception.velocity import VelocityEstimator
+from palpate.runs import Run, interruptible, progress
+from palpate.tasks.task import Start, Task
+
+MOST_SKIPPED = 20  # updates in a row without a finite gradient: more will not help
+
+
+@dataclass(frozen=True)
+class Training:
+    """Settings of `train`.
+
+    The first four switch off, one at a time, what Algorithm 2 adds to plain descent:
+    `horizon_curriculum` (whole episodes from the start), `noise_curriculum` (full perturbations
+    from the start), `randomisation` (the nominal model only), `augmentation` (start states as they
+    were drawn).
+    """
+
+    horizon_curriculum: bool = True
+    noise_curriculum: bool = True
+    randomisation: bool = True
+    augmentation: bool = True
+    iterations: int = 1000
+    batch: int = 128  # episodes per iteration
+    starts: int = 10_000  # K, the pool of start states
+    stages: tuple[float, ...] = (0.5, 1.0)  # episode length, as shares of the task's duration
+    amplitude_growth: float = 0.3  # share of the iterations until perturbations are at full width
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 0.02  # share of it left in the end (cosine)
+    warm_up: int = 20  # iterations until the learning rate is reached
+    clip: float = 1.0  # bound on the global norm of a gradient
+    observation_noise: float = 0.0  # of what the policy sees, in the observation's unit
+    width: int = 256
+    depth: int = 2
+    checkpoint_every: int = 100
+
+
+def simulate(
+    task: Task,
+    models: Model,
+    policy: Policy,
+    start: Start,
+    steps: int,
+    key: PRNGKeyArray | None = None,
+    noise: float = 0.0,
+) -> tuple[Any, Array]:
+    """States after each of `steps` decisions in closed loop, and the actions: (batch, time, ...).
+
+    Without noise the policy sees the state. With it, the policy sees what a robot would: noisy
+    observations (standard deviation `noise`, in the observation's unit) and velocities estimated
+    from them.
+    """
+    key = jax.random.key(0) if key is None else key
+    estimator = VelocityEstimator(models.control_period)
+
+    def perceived(window: Array, state: Any, key: PRNGKeyArray) -> tuple[Array, Any]:
+        observed = models.observe(state)
+        observed = observed + noise * jax.random.normal(key, observed.shape, observed.dtype)
+        window, velocity = estimator.update(window, observed)
+        before = observed - models.control_period * velocity
+        return window, models.initial_state(jnp.stack([before, observed], axis=1))
+
+    def advance(loop: tuple[Any, Array, Array], index: Array) -> tuple[Any, Any]:
+        state, memory, window = loop
+        for_noise, for_policy = jax.random.split(jax.random.fold_in(key, index))
+        seen = state
+        if noise:
+            window, seen = perceived(window, state, for_noise)
+        memory, action = policy(memory, task.features(seen, start.goal), start.goal, for_policy)
+        state = models.step(state, action)
+        return (state, memory, window), (state, action)
+
+    window = _past(models, start, estimator, jax.random.fold_in(key, steps), noise)
+    loop = start.state, policy.initial_carry(start.command), window
+    _, (states, actions) = jax.lax.scan(advance, loop, jnp.arange(steps))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (states, actions))
+
+
+def _past(
+    models: Model, start: Start, estimator: VelocityEstimator, key: PRNGKeyArray, noise: float
+) -> Array:
+    """What was seen before the first decision: the start's motion, continued backwards."""
+    observed = models.observe(start.state)
+    following = models.observe(models.step(start.state, start.command))
+    back = jnp.arange(-estimator.frames, 0, dtype=observed.dtype)
+    back = back.reshape(-1, *(1,) * observed.ndim)
+    window = observed + back * (following - observed)
+    return window + noise * jax.random.normal(key, window.shape, window.dtype)
+
+
+class TrainingState(eqx.Module):
+    """What a checkpoint holds: the rest follows from the seed and the iteration."""
+
+    policy: CommandPolicy  # its arrays
+    optimiser: optax.OptState
+    skipped: Array  # updates in a row whose gradient was not finite
+
+
+def train(
+    task: Task, model: Model, training: Training, seed: int, run: Run | None = None
+) -> CommandPolicy:
+    """A policy for the task, trained through the model.
+
+    With a `run`, every iteration's metrics are logged ("loss", "gradient_norm", "horizon" in
+    control steps, "amplitude" of the perturbations, "learning_rate") and checkpoints are written;
+    a run that was cut off goes on from its last checkpoint to the same result. The caller opens
+    the run and finishes it.
+
+    Raises `PalpateError` when the gradient is not finite for many iterations in a row.
+    """
+    key = jax.random.key(seed)
+    for_starts, for_policy, for_updates = jax.random.split(key, 3)
+    pool = jax.jit(task.starts, static_argnums=2)(model, for_starts, training.starts)
+    policy = CommandPolicy.create(
+        for_policy,
+        task.features(pool.state, pool.goal),
+        model.action_shape,
+        period=model.control_period,
+        limit=task.action_limit,
+        rate_limit=task.action_rate_limit,
+        width=training.width,
+        depth=training.depth,
+    )
+    optimiser = _optimiser(training)
+    arrays, static = eqx.partition(policy, eqx.is_array)
+    state = TrainingState(arrays, optimiser.init(arrays), jnp.zeros((), int))
+    done = 0
+    if run is not None:
+        done, state = run.restore(state) or (0, state)
+    stages = _stages(task, model, training)
+    bar = progress(range(done + 1, training.iterations + 1), "training", done=done)
+    update, horizon = None, 0
+    with interruptible() as stop:
+        for iteration in bar:
+            wanted = stages[(iteration - 1) * len(stages) // training.iterations]
+            if wanted != horizon:
+                horizon = wanted
+                update = _update(task, model, training, optimiser, pool, static, horizon)
+            state, metrics = update(state, for_updates, jnp.asarray(iteration))
+            metrics = {name: _finite(value) for name, value in metrics.items()}
+            bar.show(loss=metrics["loss"], horizon=horizon)
+            if int(state.skipped) >= MOST_SKIPPED:
+                raise PalpateError(
+                    f"the gradient was not finite in {MOST_SKIPPED} iterations in a row: expected "
+                    "a model that stays finite over an episode; a shorter duration or narrower "
+                    "spreads of its parameters may help"
+                )
+            if run is not None:
+                run.log(iteration, horizon=horizon, **metrics)
+                last = iteration == training.iterations
+                if stop or last or iteration % training.checkpoint_every == 0:
+                    run.save(iteration, state)
+            if stop:
+                break
+    return eqx.combine(state.policy, static)
+
+
+def _finite(value: Array) -> float | None:
+    value = float(value)
+    return value if math.isfinite(value) else None
+
+
+def _stages(task: Task, model: Model, training: Training) -> list[int]:
+    """Episode lengths in control steps, one per stage."""
+    shares = training.stages if training.horizon_curriculum else training.stages[-1:]
+    return [max(1, round(share * task.duration / model.control_period)) for share in shares]
+
+
+def _schedule(training: Training) -> optax.Schedule:
+    return optax.warmup_cosine_decay_schedule(
+        0.0,
+        training.learning_rate,
+        min(training.warm_up, training.iterations // 2),
+        training.iterations,
+        training.final_learning_rate * training.learning_rate,
+    )
+
+
+def _optimiser(training: Training) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(training.clip), optax.adam(_schedule(training)))
+
+
+def _amplitude(training: Training, iteration: Array) -> Array:
+    """Of the perturbations, as a share of the declared spreads."""
+    if not training.randomisation:
+        return jnp.zeros(())
+    if not training.noise_curriculum:
+        return jnp.ones(())
+    return jnp.minimum(1.0, iteration / (training.amplitude_growth * training.iterations))
+
+
+def _update(
+    task: Task,
+    model: Model,
+    training: Training,
+    optimiser: optax.GradientTransformation,
+    pool: Start,
+    static: CommandPolicy,
+    horizon: int,
+):
+    """The jitted iteration for one horizon: (state, key, iteration) to (state, metrics)."""
+
+    def value_and_gradient(shared, batch):
+        arrays, shared_model, key = shared
+        own_model, start, index = batch
+        models = eqx.combine(own_model, shared_model)
+
+        def loss(arrays):
+            policy = eqx.combine(arrays, static)
+            noise_key = jax.random.fold_in(key, index[0])
+            states, actions = simulate(
+                task, models, policy, start, horizon, noise_key, training.observation_noise
+            )
+            return jnp.mean(task.loss(models, start, states, actions))
+
+        return jax.value_and_grad(loss)(arrays)
+
+    divided = data_parallel(value_and_gradient, training.batch)
+
+    @jax.jit
+    def update(state: TrainingState, key: PRNGKeyArray, iteration: Array):
+        keys = jax.random.split(jax.random.fold_in(key, iteration), 4)
+        amplitude = _amplitude(training, iteration)
+        models = randomise(model, keys[0], amplitude, training.batch)
+        chosen = jax.random.randint(keys[1], (training.batch,), 0, training.starts)
+        start = jax.tree.map(lambda leaf: leaf[chosen], pool)
+        if training.augmentation:
+            start = task.augment(start, keys[2])
+        start = task.adapt(start, models)
+        own = jax.tree.map(lambda leaf, single: leaf.ndim > single.ndim, models, model)
+        own, shared = eqx.partition(models, own)
+        loss, gradient = divided(
+            (state.policy, shared, keys[3]), (own, start, jnp.arange(training.batch))
+        )
+        norm = optax.global_norm(gradient)
+        finite = jnp.isfinite(norm) & jnp.isfinite(loss)
+        changes, moments = optimiser.update(gradient, state.optimiser)
+        changed = TrainingState(
+            optax.apply_updates(state.policy, changes), moments, jnp.zeros((), int)
+        )
+        kept = eqx.tree_at(lambda s: s.skipped, state, state.skipped + 1)
+        state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), changed, kept)
+        metrics = {
+            "loss": loss,
+            "gradient_norm": norm,
+            "amplitude": amplitude,
+            "learning_rate": _schedule(training)(iteration),
+        }
+        return state, metrics
+
+    return update

@@ -1,0 +1,109 @@
+"""Models on disk: JSON that a person can read, with the unit and meaning of every parameter."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.models.model import Model
+from palpate.models.rope import Rope
+from palpate.parameters import describe, parameters_of
+from palpate.storage import read_json, write_json
+
+MODELS: dict[str, type[Model]] = {"rope": Rope}
+_FORMAT = "palpate.model"
+_VERSION = 1
+
+
+def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None = None) -> None:
+    """Write a model as JSON; `about` is what it was made from (recordings, errors, intervals).
+
+    What this instance declares differently (fixed, shared, other priors) is not kept: it belongs
+    to the identification that used it. Raises `PalpateError` for a model that is not registered.
+    """
+    names = [name for name, kind in MODELS.items() if type(model) is kind]
+    if not names:
+        raise PalpateError(
+            f"a model of type {type(model).__name__} cannot be saved; known: {', '.join(MODELS)}"
+        )
+    write_json(
+        path,
+        {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "model": names[0],
+            "structure": {name: getattr(model, name) for name in _structure(type(model))},
+            "parameters": describe(model),
+            "about": dict(about or {}),
+        },
+    )
+
+
+def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
+    """Read what `save_model` wrote: the model, and what it was made from.
+
+    Raises `PalpateError` that says what is wrong with the file.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise PalpateError(
+            f"{path} is not a model: expected a JSON file written by `palpate identify`"
+        )
+    if content.get("version") != _VERSION:
+        raise PalpateError(
+            f"{path} has version {content.get('version')}; this palpate reads version {_VERSION}"
+        )
+    kind = MODELS.get(content.get("model", ""))
+    if kind is None:
+        raise PalpateError(
+            f"{path} holds the unknown model '{content.get('model')}'; "
+            f"there are: {', '.join(MODELS)}"
+        )
+    try:
+        rows = {row["name"]: row["value"] for row in content["parameters"]}
+        structure = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in content["structure"].items()
+        }
+        about = dict(content["about"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise PalpateError(f"{path} is damaged: its parameters or structure are missing") from error
+    _check_names(path, "parameters", rows, parameters_of(kind))
+    _check_names(path, "structure", structure, _structure(kind))
+    values = {name: _numbers(path, name, value) for name, value in rows.items()}
+    try:
+        return kind(**values, **structure), about
+    except (TypeError, IndexError) as error:
+        raise PalpateError(f"{path} is damaged: {error}") from error
+
+
+def _structure(kind: type[Model]) -> list[str]:
+    declared = parameters_of(kind)
+    return [
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.name not in declared and field.name != "overrides"
+    ]
+
+
+def _check_names(path: str | Path, what: str, came: Any, expected: Any) -> None:
+    if set(came) != set(expected):
+        missing = sorted(set(expected) - set(came))
+        unknown = sorted(set(came) - set(expected))
+        raise PalpateError(
+            f"the {what} in {path} do not fit: missing {missing or 'none'}, "
+            f"unknown {unknown or 'none'}"
+        )
+
+
+def _numbers(path: str | Path, name: str, value: Any) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise PalpateError(f"'{name}' in {path} is not numbers: {value!r}") from error
+    if not np.isfinite(array).all():
+        raise PalpateError(f"'{name}' in {path} is not finite")
+    return array

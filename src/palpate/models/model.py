@@ -1,0 +1,95 @@
+"""The contract of every model: what the robot believes about how an object moves."""
+
+from abc import abstractmethod
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from palpate.errors import PalpateError
+from palpate.parameters import Parameter
+
+State = TypeVar("State")
+
+
+class Model(eqx.Module):
+    """Differentiable dynamics at a control rate: a frozen pytree of parameters and structure.
+
+    Batch axes lead. `step` and `observe` accept states and actions with one leading batch axis, or
+    none, and parameters likewise; what has no batch axis serves the whole batch. States are small
+    named pytrees; actions are arrays of `action_shape`, observations of `observation_shape`, and
+    `features` are what a network should see of a state.
+    """
+
+    overrides: eqx.AbstractVar[tuple[tuple[str, Parameter], ...]]
+    control_period: eqx.AbstractVar[float]
+
+    @property
+    @abstractmethod
+    def action_shape(self) -> tuple[int, ...]:
+        """Shape of one action."""
+
+    @property
+    @abstractmethod
+    def observation_shape(self) -> tuple[int, ...]:
+        """Shape of one observation."""
+
+    @abstractmethod
+    def step(self, state: Any, action: Array) -> Any:
+        """The state one control period later."""
+
+    @abstractmethod
+    def observe(self, state: Any) -> Array:
+        """What a sensor would show in this state."""
+
+    @abstractmethod
+    def initial_state(self, observations: Array) -> Any:
+        """The state at the last of a few consecutive observed frames (one: at rest).
+
+        Shape (frames, *observation_shape), with or without a batch axis before.
+        """
+
+    def constrain(self) -> "Model":
+        """The nearest legal model: what couples several parameters stands here."""
+        return self
+
+
+def batch_size(model: Model, actions: Array) -> int | None:
+    """Length of the batch axis of a sequence of actions (time after batch), None without one.
+
+    Raises `PalpateError` when the trailing axes are not the model's action shape.
+    """
+    shape = model.action_shape
+    axes = actions.ndim - len(shape) - 1
+    if axes not in (0, 1) or actions.shape[actions.ndim - len(shape) :] != shape:
+        raise PalpateError(
+            f"{type(model).__name__} expects actions of shape (time, {_spell(shape)}) or "
+            f"(batch, time, {_spell(shape)}), got {actions.shape}"
+        )
+    return actions.shape[0] if axes else None
+
+
+def rollout(model: Model, state: State, actions: Array) -> State:
+    """The states after each action, open loop.
+
+    `actions` is (time, *action_shape), or (batch, time, *action_shape) with a state whose leaves
+    lead with the same batch axis; the result's leaves are (time, ...) or (batch, time, ...).
+
+    Reverse-mode derivatives keep only the state at each control period and compute the inside of
+    a period again: memory grows with control periods, not with integration steps.
+    """
+    batched = batch_size(model, actions) is not None
+    in_time = jnp.moveaxis(actions, 1, 0) if batched else actions
+
+    def advance(state: State, action: Array) -> tuple[State, State]:
+        following = model.step(state, action)
+        return following, following
+
+    _, states = jax.lax.scan(jax.checkpoint(advance, prevent_cse=False), state, in_time)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states) if batched else states
+
+
+def _spell(shape: tuple[int, ...]) -> str:
+    return ", ".join(map(str, shape))

@@ -1,0 +1,423 @@
+"""A rope as a chain of point masses, springs and dampers (SPiD, Long et al., arXiv 2602.03623)."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from palpate.errors import PalpateError
+from palpate.models import rope_kernel
+from palpate.models.model import Model
+from palpate.parameters import LogNormal, Normal, Parameter, parameter, parameters_of
+
+# Ropes integrated side by side. Measured on two CPUs: 4 keeps the reverse sweep of a block in the
+# first-level cache; 16 is a third faster forwards but three times slower backwards.
+LANES = 4
+
+STABILITY_LIMIT = 3.6  # of 4: the rest is for stretched, folded and turning ropes
+
+
+class RopeState(eqx.Module):
+    """Node positions (m, world frame) and velocities (m/s), from the first driven end."""
+
+    position: Float[Array, "*batch nodes 3"]
+    velocity: Float[Array, "*batch nodes 3"]
+
+
+class Rope(Model):
+    """Mass-spring-damper rope of N segments and N + 1 nodes, some of them driven.
+
+    Six elements per segment (rest length; stretch stiffness and damping; bend stiffness and
+    damping; twist stiffness), mass, air drag and gravity: the parameters of the seed's talk.
+    Bending acts at the N - 1 joints between segments and twisting over the N - 2 pairs of joints.
+    A model without damping is that of Lv et al. 2017 (J. Manuf. Syst. 43:385-399).
+
+    An action gives, for each driven node and axis, what `drive` says: the `position` (m) it has at
+    the end of the control period (moved there at constant velocity), the `velocity` (m/s) it has
+    then (reached at constant acceleration), or its `acceleration` (m/s^2) over the period.
+    """
+
+    node_mass: Float[Array, "*batch nodes"] = parameter(
+        "kg",
+        prior=LogNormal(None, 0.3),
+        spread=0.25,
+        fixed=True,
+        about="mass of each node; without force data only the other parameters per mass are seen",
+    )
+    rest_length: Float[Array, "*batch segments"] = parameter(
+        "m", prior=LogNormal(None, 0.03), spread=0.1, about="length of each segment at rest"
+    )
+    stretch_stiffness: Float[Array, "*batch segments"] = parameter(
+        "N/m",
+        prior=LogNormal(1e3, 1.0),
+        about="tension per metre of stretch; a stiff rope's is bounded by the time step",
+    )
+    stretch_damping: Float[Array, "*batch segments"] = parameter(
+        "N s/m", prior=LogNormal(1e-1, 1.0), about="tension per rate of stretch"
+    )
+    bend_stiffness: Float[Array, "*batch joints"] = parameter(
+        "N m/rad",
+        prior=LogNormal(1e-2, 1.5),
+        spread=0.5,
+        about="restoring torque per radian between neighbouring segments",
+    )
+    bend_damping: Float[Array, "*batch joints"] = parameter(
+        "N m s/rad",
+        prior=LogNormal(5e-4, 1.5),
+        spread=0.5,
+        about="torque against the rate of bending",
+    )
+    twist_stiffness: Float[Array, "*batch torsions"] = parameter(
+        "N m/rad",
+        prior=LogNormal(1e-5, 1.0),
+        spread=0.5,
+        about="torque per radian between the planes of neighbouring joints",
+    )
+    air_drag: Float[Array, "*batch"] = parameter(
+        "N s/m",
+        prior=LogNormal(1e-3, 1.5),
+        spread=0.5,
+        about="drag force per node and velocity, linear part",
+    )
+    quadratic_drag: Float[Array, "*batch"] = parameter(
+        "N s^2/m^2",
+        prior=LogNormal(1e-4, 1.5),
+        spread=0.5,
+        about="drag force per node and squared velocity",
+    )
+    gravity: Float[Array, "*batch"] = parameter(
+        "m/s^2",
+        prior=Normal(9.81, 0.3),
+        about="acceleration of free fall; identified, it also absorbs what the model leaves out",
+    )
+    driven: tuple[int, ...] = eqx.field(static=True, default=(0,))
+    drive: Literal["position", "velocity", "acceleration"] = eqx.field(
+        static=True, default="velocity"
+    )
+    control_period: float = eqx.field(static=True, default=0.01)
+    substeps: int = eqx.field(static=True, default=10)
+    overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        nodes = self.nodes
+        expected = {"rest_length": nodes - 1} | self._elements(nodes)
+        if nodes < 4:
+            raise PalpateError(f"a rope needs at least 4 nodes, got {nodes}")
+        for name, count in expected.items():
+            shape = getattr(self, name).shape
+            if count and shape[-1:] != (count,):
+                raise PalpateError(
+                    f"{name} of a rope of {nodes} nodes must have {count} elements, "
+                    f"got shape {shape}"
+                )
+        if self.drive not in ("position", "velocity", "acceleration"):
+            raise PalpateError(
+                f"unknown drive '{self.drive}'; there are: position, velocity, acceleration"
+            )
+        if not self.driven or any(not 0 <= node < nodes for node in self.driven):
+            raise PalpateError(
+                f"driven nodes must lie in 0 to {nodes - 1} and be at least one, got {self.driven}"
+            )
+        if len(set(self.driven)) < len(self.driven):
+            raise PalpateError(f"driven nodes must differ from each other, got {self.driven}")
+        if self.substeps < 1 or not self.control_period > 0:
+            raise PalpateError(
+                "a rope needs at least one time step in a positive control period, "
+                f"got {self.substeps} in {self.control_period} s"
+            )
+
+    @classmethod
+    def uniform(cls, length: float = 1.0, mass: float = 0.1, nodes: int = 21, **fields) -> "Rope":
+        """A rope of equal segments: length in m, mass in kg, `fields` as in `from_rest_lengths`."""
+        if nodes < 4:
+            raise PalpateError(f"a rope needs at least 4 nodes, got {nodes}")
+        return cls.from_rest_lengths(np.full(nodes - 1, length / (nodes - 1)), mass, **fields)
+
+    @classmethod
+    def from_rest_lengths(cls, rest_length: np.ndarray, mass: float, **fields) -> "Rope":
+        """A rope with given segments (m) and `mass` (kg) in equal nodes, made legal.
+
+        Other parameters are given in `fields`, a number standing for all elements, or start from
+        the centre of their prior.
+        """
+        rest_length = np.asarray(rest_length)
+        if not np.all(np.isfinite(rest_length)) or np.any(rest_length <= 0):
+            raise PalpateError(f"rest lengths must be positive, got {rest_length}")
+        if not mass > 0:
+            raise PalpateError(f"the mass of a rope must be positive, got {mass}")
+        nodes = len(rest_length) + 1
+        for name, count in cls._elements(nodes).items():
+            prior = parameters_of(cls)[name].prior
+            centre = prior.median if isinstance(prior, LogNormal) else prior.mean
+            value = fields.get(name, centre)
+            fields[name] = np.full(count, value) if np.ndim(value) == 0 and count else value
+        fields |= {"node_mass": np.full(nodes, mass / nodes), "rest_length": rest_length}
+        return cls(**fields).constrain()
+
+    @staticmethod
+    def _elements(nodes: int) -> dict[str, int]:
+        """How many elements each of the remaining parameters has; 0: one number for the rope."""
+        per_rope = dict.fromkeys(("air_drag", "quadratic_drag", "gravity"), 0)
+        return {
+            "stretch_stiffness": nodes - 1,
+            "stretch_damping": nodes - 1,
+            "bend_stiffness": nodes - 2,
+            "bend_damping": nodes - 2,
+            "twist_stiffness": nodes - 3,
+        } | per_rope
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes, N + 1."""
+        return self.node_mass.shape[-1]
+
+    @property
+    def time_step(self) -> float:
+        """Integration time step, s."""
+        return self.control_period / self.substeps
+
+    @property
+    def action_shape(self) -> tuple[int, int]:
+        """(driven nodes, 3)."""
+        return len(self.driven), 3
+
+    @property
+    def observation_shape(self) -> tuple[int, int]:
+        """(nodes, 3): a marker at every node."""
+        return self.nodes, 3
+
+    def observe(self, state: RopeState) -> Float[Array, "*batch nodes 3"]:
+        """Marker positions, m."""
+        return state.position
+
+    def initial_state(self, observations: Float[Array, "*batch frames nodes 3"]) -> RopeState:
+        """The state at the last frame; velocity from the last two, zero with one frame."""
+        position = observations[..., -1, :, :]
+        if observations.shape[-3] < 2:
+            return RopeState(position, jnp.zeros_like(position))
+        return RopeState(position, (position - observations[..., -2, :, :]) / self.control_period)
+
+    def step(self, state: RopeState, action: Float[Array, "*batch driven 3"]) -> RopeState:
+        """The state one control period later. A batch is integrated in blocks of `LANES` ropes."""
+        state, increment = self._drive(state, action)
+        coefficients = self._coefficients()
+        batch = state.position.shape[:-2]
+        if not batch:
+            batch = jnp.broadcast_shapes(
+                *(leaf.shape[:-1] for leaf in jax.tree.leaves(coefficients))
+            )
+            if not batch:
+                return self._integrate(state, increment, coefficients, 1)
+            state, increment = jax.tree.map(
+                lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), (state, increment)
+            )
+        return self._integrate_blocks(state, increment, coefficients, *batch)
+
+    def _drive(self, state: RopeState, action: Array) -> tuple[RopeState, Array]:
+        """Start velocity of the driven nodes, and what each integration step adds to it."""
+        nodes = jnp.asarray(self.driven)
+        start = state.velocity[..., nodes, :]
+        increment = jnp.zeros(action.shape, state.velocity.dtype)
+        if self.drive == "position":
+            start = (action - state.position[..., nodes, :]) / self.control_period
+        elif self.drive == "velocity":
+            increment = (action - start) / self.substeps
+        else:
+            increment = action * self.time_step
+        velocity = state.velocity.at[..., nodes, :].set(start)
+        everywhere = jnp.zeros(velocity.shape, velocity.dtype)
+        return (
+            RopeState(state.position, velocity),
+            everywhere.at[..., nodes, :].set(increment),
+        )
+
+    def _free_nodes(self) -> Float[Array, " nodes"]:
+        """One for each node that forces move, zero for the driven ones."""
+        free = np.ones(self.nodes)
+        free[list(self.driven)] = 0.0
+        return jnp.asarray(free, self.node_mass.dtype)
+
+    def _coefficients(self) -> rope_kernel.Coefficients:
+        """The parameters as the integration uses them, each (*batch, elements)."""
+        free = self._free_nodes()
+
+        def per_node(value: Array) -> Array:
+            return jnp.broadcast_to(value[..., None], (*value.shape, self.nodes))
+
+        return rope_kernel.Coefficients(
+            rest_length=self.rest_length,
+            stretch_stiffness=self.stretch_stiffness,
+            stretch_damping=self.stretch_damping,
+            bend_stiffness=self.bend_stiffness,
+            bend_damping=self.bend_damping,
+            twist_stiffness=self.twist_stiffness,
+            linear_drag=per_node(self.air_drag),
+            quadratic_drag=per_node(self.quadratic_drag),
+            step_per_mass=self.time_step * free / self.node_mass,
+            step_gravity=self.time_step * free * per_node(self.gravity),
+        )
+
+    def _integrate(self, state, increment, coefficients, lanes: int) -> RopeState:
+        """Integrate a block: leaves lead with (lanes,), or have no batch axis for one lane."""
+
+        def flat(values: Array, trailing: int) -> Array:
+            """(lanes, elements) or (elements,) to (elements x lanes,), one lane array after all."""
+            if values.ndim == trailing:
+                values = jnp.broadcast_to(values, (lanes, *values.shape))
+            return jnp.moveaxis(values, 0, -1).reshape(*values.shape[2:], -1)
+
+        def axes(values: Array) -> tuple[Array, Array, Array]:
+            x, y, z = (flat(values[..., axis], 1) for axis in range(3))
+            return x, y, z
+
+        def unflat(values) -> Array:
+            stacked = jnp.stack([v.reshape(self.nodes, lanes) for v in values], axis=-1)
+            return jnp.moveaxis(stacked, 1, 0).reshape(state.position.shape)
+
+        position, velocity = rope_kernel.integrate(
+            axes(state.position),
+            axes(state.velocity),
+            axes(increment),
+            jax.tree.map(lambda leaf: flat(leaf, 1), coefficients),
+            lanes=lanes,
+            steps=self.substeps,
+            time_step=self.time_step,
+        )
+        return RopeState(unflat(position), unflat(velocity))
+
+    def _integrate_blocks(self, state, increment, coefficients, count: int) -> RopeState:
+        """Integrate `count` ropes (leading axis) in blocks; parameters batched or shared."""
+        lanes = min(LANES, count)
+        blocks = -(-count // lanes)
+        missing = blocks * lanes - count
+
+        def block(leaf: Array) -> Array:
+            if missing:  # the last rope again: lanes must be full, and legal
+                leaf = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], missing, axis=0)])
+            return leaf.reshape(blocks, lanes, *leaf.shape[1:])
+
+        batched = jax.tree.map(lambda leaf: leaf.ndim > 1, coefficients)
+        own, shared = eqx.partition(coefficients, batched)
+        xs = jax.tree.map(block, (state, increment, own))
+        result = jax.lax.map(
+            lambda x: self._integrate(x[0], x[1], eqx.combine(x[2], shared), lanes), xs
+        )
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], result)
+
+    def stability_load(self) -> Float[Array, "*batch nodes"]:
+        """How much of the explicit stability limit each node uses: stable below 4.
+
+        Symplectic Euler of M x'' + C x' + K x = 0 is stable when every eigenvector's Rayleigh
+        quotients obey h^2 k/m + 2 h c/m < 4. The load bounds them by row sums of
+        M^-1 (h^2 K + 2 h C) (Gershgorin), element by element: an element of stiffness w on the
+        combination a of node coordinates adds w |a_i| sum |a_j| to row i. Stretch: a = (-1, 1).
+        Bend: a = (1/l, -1/l - 1/l', 1/l'). Twist: at most 4 k_t / `TWIST_FADE` on directions, with
+        sum |a_j| <= 2/l for the shortest l. Stretch and bend add up because they share directions
+        where the rope is bent. Driven nodes have neither row nor column, since no force moves
+        them; drag is implicit and only helps.
+        """
+        h = self.time_step
+        stretch = h**2 * self.stretch_stiffness + 2 * h * self.stretch_damping
+        bend = h**2 * self.bend_stiffness + 2 * h * self.bend_damping
+        twist = h**2 * 4.0 * self.twist_stiffness / rope_kernel.TWIST_FADE
+        per_length = 1.0 / self.rest_length
+        first, second = per_length[..., :-1], per_length[..., 1:]
+        free = self._free_nodes()
+        ends = free[:-1] + free[1:]
+        total = first * free[:-2] + (first + second) * free[1:-1] + second * free[2:]
+        nearest = jnp.maximum(
+            jnp.maximum(per_length[..., :-2], per_length[..., 1:-1]), per_length[..., 2:]
+        )
+        rows = (
+            _spread(stretch * ends, self.nodes, 0)
+            + _spread(stretch * ends, self.nodes, 1)
+            + _spread(bend * total * first, self.nodes, 0)
+            + _spread(bend * total * (first + second), self.nodes, 1)
+            + _spread(bend * total * second, self.nodes, 2)
+            + sum(_spread(twist * 2.0 * nearest**2, self.nodes, k) for k in range(4))
+        )
+        return rows * free / self.node_mass
+
+    def constrain(self) -> "Rope":
+        """Keep the integration stable: soften what loads a node beyond the limit.
+
+        Every stiffness and damping that acts on a node is multiplied by the same factor; up to
+        80 % of `STABILITY_LIMIT` nothing changes, beyond it the load approaches the limit smoothly
+        and never reaches it, so that no value an optimiser can reach is unstable and a gradient
+        always leads back.
+        """
+        share = self.stability_load() / STABILITY_LIMIT
+        knee = 0.8
+        excess = jnp.maximum(share - knee, 0.0) / (1.0 - knee)
+        legal = knee + (1.0 - knee) * excess / (1.0 + excess)
+        factor = legal / jnp.maximum(share, knee)
+
+        def weakest(count: int) -> Array:
+            """The smallest factor of the nodes that each element acts on."""
+            span = self.nodes - count + 1
+            return jnp.min(
+                jnp.stack([factor[..., k : self.nodes - span + 1 + k] for k in range(span)]), axis=0
+            )
+
+        names = (
+            "stretch_stiffness",
+            "stretch_damping",
+            "bend_stiffness",
+            "bend_damping",
+            "twist_stiffness",
+        )
+        return eqx.tree_at(
+            lambda rope: [getattr(rope, name) for name in names],
+            self,
+            [getattr(self, name) * weakest(getattr(self, name).shape[-1]) for name in names],
+        )
+
+    def energy(self, state: RopeState) -> Float[Array, "*batch"]:
+        """Mechanical energy (J) above hanging at rest under the first driven node's position.
+
+        Gravity, motion, stretch, bend and twist (seed 1: E_rope), minus the same of the rope
+        hanging still, stretched by its own weight, from where the gripper is now: lowering the
+        gripper earns nothing.
+        """
+        head = state.position[..., self.driven[0], :]
+        below = jnp.cumsum(self.node_mass[..., ::-1], axis=-1)[..., ::-1][..., 1:]
+        tension = below * self.gravity[..., None]
+        hanging_length = self.rest_length + tension / self.stretch_stiffness
+        hanging_height = -jnp.cumsum(hanging_length, axis=-1)
+        height = state.position[..., 1:, 2] - head[..., None, 2] - hanging_height
+        weight = self.node_mass[..., 1:] * self.gravity[..., None]
+        gravity = jnp.sum(weight * height, axis=-1)
+        kinetic = 0.5 * jnp.sum(
+            self.node_mass * jnp.sum(jnp.square(state.velocity), axis=-1), axis=-1
+        )
+        elastic_at_rest = 0.5 * jnp.sum(jnp.square(tension) / self.stretch_stiffness, axis=-1)
+        return gravity + kinetic + self.elastic_energy(state.position) - elastic_at_rest
+
+    def elastic_energy(self, position: Float[Array, "*batch nodes 3"]) -> Float[Array, "*batch"]:
+        """Energy of stretch, bend and twist, J."""
+        edge = jnp.diff(position, axis=-2)
+        length = jnp.linalg.norm(edge, axis=-1)
+        direction = edge / length[..., None]
+        bend = jnp.diff(direction, axis=-2)
+        binormal = jnp.cross(direction[..., 1:, :], bend)
+        sine_squared = jnp.sum(jnp.square(binormal), axis=-1) + rope_kernel.TWIST_FADE
+        triple = jnp.sum(direction[..., :-2, :] * binormal[..., 1:, :], axis=-1)
+        stretch = self.stretch_stiffness * jnp.square(length - self.rest_length)
+        bending = self.bend_stiffness * jnp.sum(jnp.square(bend), axis=-1)
+        twist = (
+            self.twist_stiffness
+            * jnp.square(triple)
+            / (sine_squared[..., :-1] * sine_squared[..., 1:])
+        )
+        return 0.5 * (
+            jnp.sum(stretch, axis=-1) + jnp.sum(bending, axis=-1) + jnp.sum(twist, axis=-1)
+        )
+
+
+def _spread(values: Array, nodes: int, offset: int) -> Array:
+    """Put element values on the node `offset` after the element's first."""
+    padding = [(0, 0)] * (values.ndim - 1) + [(offset, nodes - values.shape[-1] - offset)]
+    return jnp.pad(values, padding)

@@ -1,0 +1,1 @@
+"""From what sensors show to states and structure."""

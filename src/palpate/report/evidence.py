@@ -1,0 +1,308 @@
+"""What a run leaves for its report, and how it is read back.
+
+`evidence.npz` lies beside `configuration.json`, `metrics.jsonl` and `result.json` in the run's
+folder and holds plain arrays, named by what they are:
+
+    motion.time          (frames,)            s
+    motion.<label>       (frames, points, 3)  m; a chain of points, its last one is called the tip
+    horizon.time         (times,)             s since the prediction began
+    horizon.<label>      (times,)             m; root-mean-square error of the prediction
+    horizon.<label>.low, horizon.<label>.high  (times,)  m; quantiles around it, both or neither
+    energy.time          (times,)             s
+    energy.<label>       (episodes, times)    energy relative to the start of its episode
+
+Several motions stand side by side as `motion/<group>.time`, `motion/<group>.<label>`. NaN is a gap.
+What else a report shows is read from the run's other files: figures from `result.json`, and from
+its "parameters" rows {name, value, unit, about, fixed, shared, lower, upper, verdict}, where value
+and 90 % interval are a number, a list of them or null; the learning curve from `metrics.jsonl`.
+"""
+
+import io
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from palpate.errors import PalpateError
+from palpate.result import Figure
+from palpate.runs import CONFIGURATION, ENVIRONMENT, METRICS, RESULT, read_metrics
+from palpate.storage import DamagedFileError, read_json, write_bytes
+
+EVIDENCE = "evidence.npz"
+_LARGEST = 2**29  # bytes when unpacked: far above what a page can show
+_KEY = re.compile(r"(motion)(?:/([^./]+))?\.(.+)|(horizon|energy)\.(.+)")
+_KEYS = "motion.<label>, motion/<group>.<label>, horizon.<label>, energy.<label>"
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Point chains over time: `time` (frames,) in s, each of `chains` (frames, points, 3) in m."""
+
+    group: str
+    time: np.ndarray
+    chains: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Labelled quantities over `time` (times,) in s.
+
+    `values` are (times,), or (episodes, times) for energies; `bands` holds (low, high) of shape
+    (times,) for those labels that have them.
+    """
+
+    time: np.ndarray
+    values: dict[str, np.ndarray]
+    bands: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What was identified: `value` (elements,) in `unit`, NaN where nothing is known.
+
+    `lower` and `upper` (elements,) are the 90 % interval; NaN where there is none. `verdict` is a
+    sentence about how far to trust it, or None.
+    """
+
+    name: str
+    value: np.ndarray
+    unit: str
+    about: str
+    fixed: bool
+    shared: bool
+    lower: np.ndarray
+    upper: np.ndarray
+    verdict: str | None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that a run's folder holds for a report; what is not there is empty or None.
+
+    `metrics` are the run's logged lines. `rendering` is a moving picture of the scene,
+    `rendering.webp`, `.gif` or `.png`, where the machine could render one.
+    """
+
+    path: Path
+    name: str
+    motions: tuple[Motion, ...] = ()
+    horizon: Curves | None = None
+    energy: Curves | None = None
+    parameters: tuple[Parameter, ...] = ()
+    metrics: tuple[dict[str, Any], ...] = ()
+    figures: tuple[Figure, ...] = ()
+    configuration: dict[str, Any] = field(default_factory=dict)
+    environment: dict[str, Any] = field(default_factory=dict)
+    result: dict[str, Any] = field(default_factory=dict)
+    rendering: Path | None = None
+
+
+def write_evidence(run: str | Path, arrays: Mapping[str, ArrayLike]) -> Path:
+    """Write `evidence.npz` into the folder of a run, in place of what it held; atomic.
+
+    `arrays` are named as this module describes. They are kept as float32, times as float64. The
+    same arrays give the same bytes.
+
+    Raises `PalpateError` naming the array that has another name, shape or content.
+    """
+    path = Path(run) / EVIDENCE
+    kept = {}
+    for key, values in arrays.items():
+        kind = np.float64 if key.endswith(".time") else np.float32
+        try:
+            kept[key] = np.asarray(values, dtype=kind)
+        except (TypeError, ValueError) as error:
+            raise PalpateError(f"'{key}' is not an array of numbers: {error}") from error
+    _sorted_out(kept)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **kept)  # type: ignore[arg-type]  # its stub wants bool keywords
+    write_bytes(path, buffer.getvalue())
+    return path
+
+
+def read_evidence(run: str | Path) -> Evidence:
+    """Everything in the folder of a run that a report shows; finished or not.
+
+    Raises `PalpateError` when the folder holds no run, `DamagedFileError` when a file in it is
+    truncated, corrupt or of another layout, naming the file.
+    """
+    run = Path(run)
+    if not run.is_dir():
+        raise PalpateError(f"there is no run {run}: expected the folder of one")
+    known = (CONFIGURATION, RESULT, METRICS, EVIDENCE)
+    if not any((run / name).exists() for name in known):
+        raise PalpateError(f"{run} holds no run: expected {', '.join(known)} or some of them")
+    motions, horizon, energy = _arrays(run / EVIDENCE)
+    result = _object(run / RESULT)
+    configuration = _object(run / CONFIGURATION)
+    renderings = (run / f"rendering{suffix}" for suffix in RENDERINGS)
+    return Evidence(
+        path=run,
+        name=str(result.get("name") or run.resolve().name),
+        motions=motions,
+        horizon=horizon,
+        energy=energy,
+        parameters=tuple(_rows(run / RESULT, result, "parameters", _parameter)),
+        metrics=tuple(read_metrics(run)),
+        figures=tuple(_rows(run / RESULT, result, "figures", _figure)),
+        configuration=configuration,
+        environment=_object(run / ENVIRONMENT),
+        result=result,
+        rendering=next((path for path in renderings if path.exists()), None),
+    )
+
+
+RENDERINGS = {".webp": "image/webp", ".gif": "image/gif", ".png": "image/png"}
+
+
+# --- arrays -----------------------------------------------------------------------------------
+
+_Sections = tuple[tuple[Motion, ...], Curves | None, Curves | None]
+
+
+def _arrays(path: Path) -> _Sections:
+    if not path.exists():
+        return (), None, None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > _LARGEST:
+            raise PalpateError(f"it unpacks to {size / 2**20:.0f} MiB, at most 512 are read")
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: np.asarray(archive[key]) for key in archive.files}
+    except PalpateError as error:
+        raise PalpateError(f"{path}: {error}") from error
+    except Exception as error:  # what zipfile and NumPy raise on wrong bytes has no end
+        reason = str(error).partition("\n")[0]
+        raise DamagedFileError(f"{path} is damaged or not NPZ ({reason})") from error
+    try:
+        return _sorted_out(arrays)
+    except PalpateError as error:
+        raise DamagedFileError(f"{path}: {error}") from error
+
+
+def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
+    """The arrays by section, once each was found to fit its name."""
+    sections: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+    for key, values in arrays.items():
+        match = _KEY.fullmatch(key)
+        if match is None:
+            raise PalpateError(f"unknown evidence '{key}': expected {_KEYS}, each beside its .time")
+        kind, group, label = match[1] or match[4], match[2] or "", match[3] or match[5]
+        if values.dtype.kind not in "fiu":
+            raise PalpateError(f"'{key}' has the dtype {values.dtype}: expected real numbers")
+        if values.size == 0 or np.isinf(values).any():
+            raise PalpateError(f"'{key}' is empty or infinite: expected numbers, NaN for a gap")
+        sections.setdefault((kind, group), {})[label] = values
+    motions, curves = [], {}
+    for (kind, group), values in sections.items():
+        where = f"{kind}/{group}" if group else kind
+        time = _time(where, values)
+        if kind == "motion":
+            shape = ("frames", "points", 3)
+            motions.append(Motion(group, time, _fitting(where, values, time, shape, 0)))
+        elif kind == "energy":
+            shape = ("episodes", "times")
+            curves[kind] = Curves(time, _fitting(where, values, time, shape, 1))
+        else:
+            curves[kind] = _banded(time, _fitting(where, values, time, ("times",), 0))
+    return tuple(motions), curves.get("horizon"), curves.get("energy")
+
+
+def _time(where: str, values: dict[str, np.ndarray]) -> np.ndarray:
+    time = values.pop("time", None)
+    if time is None or not values:
+        lacking = f"'{where}.time'" if time is None else f"anything beside '{where}.time'"
+        raise PalpateError(f"the evidence lacks {lacking}")
+    if time.ndim != 1 or not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
+        raise PalpateError(f"'{where}.time' has to be one axis of finite, increasing seconds")
+    return time
+
+
+def _fitting(
+    where: str,
+    values: dict[str, np.ndarray],
+    time: np.ndarray,
+    shape: tuple[str | int, ...],
+    time_axis: int,
+) -> dict[str, np.ndarray]:
+    for label, array in values.items():
+        fits = array.ndim == len(shape) and array.shape[time_axis] == len(time)
+        if not fits or (shape[-1] == 3 and array.shape[-1] != 3):
+            raise PalpateError(
+                f"'{where}.{label}' has the shape {array.shape}: expected "
+                f"({', '.join(map(str, shape))}) with {len(time)} {shape[time_axis]} as in "
+                f"'{where}.time'"
+            )
+    return values
+
+
+def _banded(time: np.ndarray, values: dict[str, np.ndarray]) -> Curves:
+    edges = {label for label in values if label.endswith((".low", ".high"))}
+    labels = [label for label in values if label not in edges]
+    bands = {}
+    for label in labels:
+        pair = {f"{label}.low", f"{label}.high"}
+        if pair <= edges:
+            bands[label] = (values[f"{label}.low"], values[f"{label}.high"])
+            edges -= pair
+    if edges:
+        raise PalpateError(
+            f"'horizon.{min(edges)}' stands alone: expected <label>, <label>.low and <label>.high"
+        )
+    return Curves(time, {label: values[label] for label in labels}, bands)
+
+
+# --- result.json ------------------------------------------------------------------------------
+
+
+def _object(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        return {}
+    document = read_json(path)
+    if not isinstance(document, dict):
+        raise DamagedFileError(f"{path} holds a {type(document).__name__}: expected an object")
+    return document
+
+
+def _rows(path: Path, document: dict[str, Any], key: str, read: Any) -> list[Any]:
+    rows = document.get(key) or []
+    if not isinstance(rows, list):
+        raise DamagedFileError(f"{path} has no list under '{key}'")
+    found = []
+    for index, row in enumerate(rows):
+        try:
+            found.append(read(row))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise DamagedFileError(f"{path}: {key}[{index}] cannot be read ({error})") from error
+    return found
+
+
+def _figure(row: dict[str, Any]) -> Figure:
+    return Figure(**{item.name: row[item.name] for item in fields(Figure) if item.name in row})
+
+
+def _parameter(row: dict[str, Any]) -> Parameter:
+    value = np.ravel(np.asarray(row["value"], dtype=float))
+    edges = {}
+    for name in ("lower", "upper"):
+        edge = np.ravel(np.asarray(row.get(name), dtype=float))  # None becomes NaN
+        if edge.size not in (1, value.size):
+            raise ValueError(f"'{name}' has {edge.size} elements, 'value' {value.size}")
+        edges[name] = np.broadcast_to(edge, value.shape)
+    verdict = row.get("verdict")
+    return Parameter(
+        name=str(row["name"]),
+        value=value,
+        unit=str(row.get("unit", "")),
+        about=str(row.get("about", "")),
+        fixed=bool(row.get("fixed", False)),
+        shared=bool(row.get("shared", False)),
+        verdict=None if verdict is None else str(verdict),
+        **edges,
+    )

@@ -1,0 +1,50 @@
+"""How one series is told from another: by colour, by line and by marker, the same everywhere.
+
+Colours are those of Okabe and Ito, darkened or lightened to be read on white and on near-black;
+whoever sees no colour has the line's dashes and the marker's shape.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Style:
+    """One series' look: hex colours on a light and a dark page, dashes, marker, line width.
+
+    `dash` is the length of strokes and gaps in pixels, () for a solid line; `symbol` is Plotly's
+    name of a marker and `marker` Matplotlib's; `width` is in pixels.
+    """
+
+    light: str
+    dark: str
+    dash: tuple[int, ...]
+    symbol: str
+    marker: str
+    width: float
+
+
+# The first is drawn broad and pale beneath the others, so that what agrees with it can be seen. It
+# is kept for what the others are held against.
+_REFERENCES = ("observed", "held still")
+STYLES = (
+    Style("#8a94a0", "#8d97a4", (), "circle", "o", 5.0),
+    Style("#0062a8", "#5cb8f0", (9, 4), "diamond", "D", 2.0),
+    Style("#c04d00", "#f29a4a", (), "square", "s", 2.0),
+    Style("#007a59", "#42c9a0", (10, 4, 2, 4), "triangle-up", "^", 2.0),
+    Style("#98447b", "#e3a0c9", (16, 5), "cross", "P", 2.0),
+    Style("#7a5c00", "#e2cc55", (2, 4), "x", "X", 2.0),
+)
+
+
+def numbered(labels: Iterable[str]) -> dict[str, int]:
+    """The index into `STYLES` of each label, in order of first appearance, beginning anew after 5.
+
+    Index 0 is for "observed" or "held still", the one that comes first. One mapping for all charts
+    of a run keeps a label's look.
+    """
+    distinct = list(dict.fromkeys(labels))
+    reference = next((label for label in distinct if label in _REFERENCES), None)
+    others = [label for label in distinct if label != reference]
+    looks = {label: 1 + index % (len(STYLES) - 1) for index, label in enumerate(others)}
+    return looks if reference is None else {reference: 0} | looks

@@ -1,0 +1,1 @@
+"""What is real: MuJoCo scenes. Nothing else may look inside them."""

@@ -1,0 +1,148 @@
+"""The contract of a world: what can be done to it, and what it lets out."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import os
+import sys
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from palpate.errors import PalpateError
+
+if TYPE_CHECKING:
+    import mujoco
+
+GL_PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
+
+
+class World(ABC):
+    """A piece of reality that is acted upon and observed once per control period.
+
+    A world hides its parameters. An observation holds only what a sensor could see, with its
+    noise and delay, and carries `time`: the seconds since `reset` at which it was measured.
+    The same seed and the same actions give the same observations.
+    """
+
+    @property
+    @abstractmethod
+    def control_period(self) -> float:
+        """Seconds that one call of `step` advances the world."""
+
+    @abstractmethod
+    def reset(self, seed: int, **options: Any) -> Any:
+        """Start a new episode and return its first observation; `seed` draws all randomness."""
+
+    @abstractmethod
+    def step(self, action: Any) -> Any:
+        """Hold `action` for one control period and return the newest observation."""
+
+    @abstractmethod
+    def truth(self) -> Any:
+        """The hidden state and parameters, for experiments and tests alone."""
+
+    @abstractmethod
+    def render(self, width: int = 640, height: int = 480) -> np.ndarray:
+        """A picture of the present state, uint8 of shape (height, width, 3).
+
+        Raises `PalpateError`, naming the packages to install, where the machine has no OpenGL.
+        """
+
+
+class Decimated(World):
+    """A world seen by a slower decision: each action is held for `every` control periods.
+
+    The observation returned is the last of them.
+    """
+
+    def __init__(self, world: World, every: int):
+        if not isinstance(every, int | np.integer) or every < 1:
+            raise PalpateError(
+                f"a decision is held for a whole number of control periods, 1 or more, not {every}"
+            )
+        self.world = world
+        self.every = int(every)
+
+    @property
+    def control_period(self) -> float:
+        return self.every * self.world.control_period
+
+    def reset(self, seed: int, **options: Any) -> Any:
+        return self.world.reset(seed, **options)
+
+    def step(self, action: Any) -> Any:
+        for _ in range(self.every):
+            observation = self.world.step(action)
+        return observation
+
+    def truth(self) -> Any:
+        return self.world.truth()
+
+    def render(self, width: int = 640, height: int = 480) -> np.ndarray:
+        return self.world.render(width, height)
+
+
+@functools.cache
+def _gl_context() -> Any:
+    """The one OpenGL context of this process; pictures of any size are drawn beside its window."""
+    if sys.platform == "linux" and not os.environ.get("MUJOCO_GL"):
+        from mujoco.egl import GLContext
+    else:
+        from mujoco import GLContext
+    context = GLContext(64, 64)
+    atexit.register(context.free)  # while the libraries it calls are still there
+    return context
+
+
+class OffscreenCamera:
+    """Draws a MuJoCo model without a window.
+
+    OpenGL is first touched when the camera is made, so that a machine without it can import
+    and run every world. The back end is EGL on Linux, unless the variable MUJOCO_GL names
+    another.
+
+    Args:
+        model: the compiled scene.
+        width, height: size of the picture in pixels.
+
+    Raises:
+        PalpateError: the size is not positive, or OpenGL is missing or refuses to start.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int):
+        import mujoco
+
+        if min(width, height) < 1:
+            raise PalpateError(f"a picture is at least 1 x 1 pixel, not {width} x {height}")
+        self.model, self.width, self.height = model, width, height
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        try:
+            self._gl = _gl_context()
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except Exception as error:  # a missing library shows as almost any type of exception
+            raise PalpateError(
+                "rendering needs OpenGL, which did not start here "
+                f"({type(error).__name__}: {error}); on Debian and Ubuntu install "
+                f"{', '.join(GL_PACKAGES[:-1])} and {GL_PACKAGES[-1]}"
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
+
+    def picture(self, data: mujoco.MjData, view: mujoco.MjvCamera) -> np.ndarray:
+        """The state `data` seen from `view`: uint8 of shape (height, width, 3)."""
+        import mujoco
+
+        self._gl.make_current()
+        mujoco.mjv_updateScene(
+            self.model, data, mujoco.MjvOption(), None, view, mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )  # fmt: skip
+        frame = mujoco.MjrRect(0, 0, self.width, self.height)
+        mujoco.mjr_render(frame, self._scene, self._context)
+        pixels = np.empty((self.height, self.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, frame, self._context)
+        return pixels[::-1].copy()  # OpenGL counts rows from below

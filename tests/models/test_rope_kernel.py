@@ -1,0 +1,242 @@
+"""Forces of the rope against their energies, and gradients against finite differences (float64)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from rope_states import at_rest, bent
+
+from palpate.models import rope_kernel
+from palpate.models.model import rollout
+from palpate.models.rope import Rope, RopeState
+
+NODES = 7
+SHAPES = [(0.05, 0.1), (0.3, 0.1), (1.0, 0.3), (4.0, 0.3)]  # bending, stretching: up to crumpled
+shapes = pytest.mark.parametrize(("bending", "stretching"), SHAPES)
+
+
+def uneven_rope(rng, **settings) -> Rope:
+    """Every element of its own, twist as strong as bending so that no term hides another."""
+    return Rope.from_rest_lengths(
+        rng.uniform(0.06, 0.14, NODES - 1),
+        0.07,
+        stretch_stiffness=rng.uniform(50.0, 200.0, NODES - 1),
+        stretch_damping=rng.uniform(0.05, 0.2, NODES - 1),
+        bend_stiffness=rng.uniform(0.05, 0.2, NODES - 2),
+        bend_damping=rng.uniform(1e-3, 2e-3, NODES - 2),
+        twist_stiffness=rng.uniform(0.05, 0.2, NODES - 3),
+        air_drag=0.02,
+        quadratic_drag=0.01,
+        **settings,
+    )
+
+
+@jax.jit
+def internal_forces(rope, position, velocity):
+    edge = rope_kernel.edge_forces(
+        tuple(position.T), tuple(velocity.T), rope._coefficients(), lanes=1
+    )
+    edge = jnp.stack(edge, axis=-1)
+    return jnp.pad(edge, ((0, 1), (0, 0))) - jnp.pad(edge, ((1, 0), (0, 0)))
+
+
+def rayleigh(rope, position, velocity):
+    """Half the dissipated power, from the definitions: rates of lengths and of directions."""
+
+    def lengths_and_bends(position):
+        edge = jnp.diff(position, axis=0)
+        length = jnp.linalg.norm(edge, axis=1)
+        return length, jnp.diff(edge / length[:, None], axis=0)
+
+    _, (stretching, bending) = jax.jvp(lengths_and_bends, (position,), (velocity,))
+    return 0.5 * (
+        jnp.sum(rope.stretch_damping * stretching**2)
+        + jnp.sum(rope.bend_damping[:, None] * bending**2)
+    )
+
+
+def independent_energy(rope, position) -> float:
+    """Stretch, bend and twist from lengths, angles and dihedral angles, in NumPy."""
+    edge = np.diff(np.asarray(position), axis=0)
+    length = np.linalg.norm(edge, axis=1)
+    u = edge / length[:, None]
+    angle = np.arccos(np.clip(np.sum(u[1:] * u[:-1], axis=1), -1, 1))
+    normal = np.cross(u[:-1], u[1:])
+    sine, cosine = (
+        np.sum(np.cross(normal[:-1], normal[1:]) * u[1:-1], axis=1),
+        np.sum(normal[:-1] * normal[1:], axis=1),
+    )
+    torsion = np.arctan2(sine, cosine)
+    fade = np.sin(angle) ** 2 / (np.sin(angle) ** 2 + rope_kernel.TWIST_FADE)
+    return float(
+        np.sum(0.5 * np.asarray(rope.stretch_stiffness) * (length - rope.rest_length) ** 2)
+        + np.sum(np.asarray(rope.bend_stiffness) * (1 - np.cos(angle)))
+        + np.sum(
+            0.5 * np.asarray(rope.twist_stiffness) * np.sin(torsion) ** 2 * fade[1:] * fade[:-1]
+        )
+    )
+
+
+@shapes
+def test_the_energy_is_that_of_lengths_angles_and_torsions(bending, stretching, float64):
+    rng = np.random.default_rng(1)
+    rope = uneven_rope(rng)
+    for _ in range(5):
+        position = bent(rope, rng, bending, stretching)
+        ours = float(rope.elastic_energy(position))
+        assert ours == pytest.approx(independent_energy(rope, position), rel=1e-10)
+
+
+@shapes
+def test_forces_are_minus_the_gradient_of_the_energy(bending, stretching, float64):
+    rng = np.random.default_rng(2)
+    rope = uneven_rope(rng)
+    gradient = jax.jit(jax.grad(lambda rope, position: rope.elastic_energy(position), argnums=1))
+    for _ in range(5):
+        position = bent(rope, rng, bending, stretching)
+        expected = -gradient(rope, position)
+        ours = internal_forces(rope, position, jnp.zeros_like(position))
+        np.testing.assert_allclose(ours, expected, atol=1e-11 * np.abs(expected).max())
+
+
+@shapes
+def test_damping_is_minus_the_gradient_of_the_dissipation_and_takes_power(
+    bending, stretching, float64
+):
+    rng = np.random.default_rng(3)
+    rope = uneven_rope(rng)
+    gradient = jax.jit(jax.grad(rayleigh, argnums=2))
+    for _ in range(5):
+        position = bent(rope, rng, bending, stretching)
+        velocity = jnp.asarray(rng.normal(size=position.shape))
+        at_rest_force = internal_forces(rope, position, jnp.zeros_like(position))
+        ours = internal_forces(rope, position, velocity) - at_rest_force
+        expected = -gradient(rope, position, velocity)
+        np.testing.assert_allclose(ours, expected, atol=1e-11 * np.abs(expected).max())
+        power = float(jnp.sum(ours * velocity))
+        assert power == pytest.approx(-2 * float(rayleigh(rope, position, velocity)), rel=1e-9)
+        assert power < 0
+
+
+@shapes
+def test_internal_forces_have_no_sum_and_no_torque(bending, stretching, float64):
+    rng = np.random.default_rng(4)
+    rope = uneven_rope(rng)
+    position = bent(rope, rng, bending, stretching)
+    force = internal_forces(rope, position, jnp.asarray(rng.normal(size=position.shape)))
+    scale = np.abs(force).max()
+    np.testing.assert_allclose(jnp.sum(force, axis=0), 0, atol=1e-12 * scale)
+    np.testing.assert_allclose(jnp.sum(jnp.cross(position, force), axis=0), 0, atol=1e-12 * scale)
+
+
+def test_a_rope_that_nothing_holds_keeps_both_momenta(float64):
+    """Without gravity, drag and gripper. Symplectic Euler keeps angular momentum exactly."""
+    rng = np.random.default_rng(5)
+    rope = uneven_rope(rng)
+    position = bent(rope, rng, 0.5, 0.1)
+    velocity = jnp.asarray(rng.normal(size=position.shape))
+    mass = rng.uniform(0.5, 1.5, NODES) * rope.node_mass
+    nothing = jnp.zeros(NODES)
+    coefficients = eqx.tree_at(
+        lambda c: (c.linear_drag, c.quadratic_drag, c.step_gravity, c.step_per_mass),
+        rope._coefficients(),
+        (nothing, nothing, nothing, 1e-3 / mass),
+    )
+    later = rope_kernel.integrate(
+        tuple(position.T), tuple(velocity.T), (nothing,) * 3, coefficients,
+        lanes=1, steps=500, time_step=1e-3,
+    )  # fmt: skip
+    later_position, later_velocity = (jnp.stack(axes, axis=-1) for axes in later)
+    assert float(jnp.abs(later_position - position).max()) > 0.1
+
+    def momenta(position, velocity):
+        momentum = mass[:, None] * velocity
+        return np.concatenate([momentum.sum(0), jnp.cross(position, momentum).sum(0)])
+
+    np.testing.assert_allclose(
+        momenta(later_position, later_velocity), momenta(position, velocity), atol=1e-13
+    )
+
+
+def test_lanes_do_not_touch_each_other(float64):
+    rng = np.random.default_rng(6)
+    ropes = [uneven_rope(rng) for _ in range(3)]
+    starts = [bent(rope, rng, 0.5, 0.1) for rope in ropes]
+    velocity = jnp.asarray(rng.normal(size=(3, NODES, 3)))
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *ropes)
+    together = rollout(batch, RopeState(jnp.stack(starts), velocity), jnp.ones((3, 5, 1, 3)))
+    for lane, rope in enumerate(ropes):
+        alone = rollout(rope, RopeState(starts[lane], velocity[lane]), jnp.ones((5, 1, 3)))
+        np.testing.assert_allclose(together.position[lane], alone.position, atol=1e-13)
+        np.testing.assert_allclose(together.velocity[lane], alone.velocity, atol=1e-12)
+
+
+@pytest.mark.parametrize("drive", ["velocity", "position"])
+def test_every_gradient_matches_finite_differences(drive, float64):
+    """Each element of each parameter, of the state and of the actions, over several periods."""
+    rng = np.random.default_rng(7)
+    driven = (0,) if drive == "velocity" else (0, NODES - 1)
+    rope = uneven_rope(rng, drive=drive, driven=driven, control_period=0.012, substeps=6)
+    state = RopeState(bent(rope, rng, 0.4, 0.05), jnp.asarray(rng.normal(size=(NODES, 3))))
+    actions = rng.normal(size=(4, *rope.action_shape))
+    if drive == "position":
+        actions = np.asarray(state.position)[list(driven)] + 0.02 * actions
+    weights = jnp.asarray(rng.normal(size=(2, 4, NODES, 3)))
+    arguments = (rope, state, jnp.asarray(actions))
+    flat, unravel = ravel_pytree(arguments)
+
+    @jax.jit
+    def loss(flat):
+        states = rollout(*unravel(flat))
+        return jnp.sum(weights[0] * states.position + 0.1 * weights[1] * states.velocity)
+
+    gradient = np.asarray(jax.jit(jax.grad(loss))(flat))
+    # a step of a ten-thousandth of the value: parameters span seven orders of magnitude
+    step = 1e-4 * np.maximum(np.abs(flat), 1e-6)
+
+    def moved(index, share):
+        return loss(flat.at[index].add(share * step[index]))
+
+    for index in range(flat.size):
+        near = (moved(index, 1.0) - moved(index, -1.0)) / 2
+        far = (moved(index, 2.0) - moved(index, -2.0)) / 4
+        expected = (4 * near - far) / 3 / step[index]  # fourth order
+        # rounding of the loss over the step taken, beside a relative 1e-6
+        allowed = 1e-6 * abs(expected) + 2e-14 / step[index]
+        assert abs(gradient[index] - expected) < allowed, unravel(jnp.arange(flat.size) == index)
+    for leaf in jax.tree.leaves(unravel(gradient)):
+        assert np.any(leaf != 0)
+
+
+def straight(rope):
+    return bent(rope, np.random.default_rng(0), 0.0)
+
+
+def folded(rope):
+    """Every second segment goes exactly back: all joints at 180 degrees."""
+    step = np.asarray(rope.rest_length) * np.where(np.arange(rope.nodes - 1) % 2, 1.0, -1.0)
+    return np.concatenate([[0.0], np.cumsum(step)])[:, None] * [0.0, 0.0, 1.0]
+
+
+def crumpled(rope):
+    return bent(rope, np.random.default_rng(1), 9.0, 0.5)
+
+
+@pytest.mark.parametrize("shape", [straight, folded, crumpled])
+def test_forces_and_gradients_are_finite_in_float32_however_the_rope_lies(shape):
+    """180 degrees is an unstable equilibrium of bending, and singular for nobody."""
+    rope = Rope.uniform(length=0.6, mass=0.07, nodes=NODES, twist_stiffness=1e-3)
+    state = at_rest(jnp.asarray(shape(rope), jnp.float32))
+
+    def loss(rope, state, actions):
+        states = rollout(rope, state, actions)
+        return jnp.sum(states.position**2) + jnp.sum(states.velocity**2)
+
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(rope, state, jnp.zeros((20, 1, 3)))
+    force = internal_forces(rope, state.position, state.velocity)
+    for leaf in jax.tree.leaves((gradient, force)):
+        assert np.all(np.isfinite(leaf))
+    if shape is not crumpled:  # straight is an equilibrium, folded too
+        assert float(jnp.abs(force).max()) < 1e-4

@@ -1,0 +1,86 @@
+"""The wheel that users get works from an empty folder, without the source tree beside it."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "palpate"
+
+
+def run(*arguments: object, cwd: Path, **environment: str) -> str:
+    """The standard output of `python ARGUMENTS`; its standard error is shown when it fails."""
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        cwd=cwd,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that holds palpate as its wheel installs it, and nothing else."""
+    top = tmp_path_factory.mktemp("wheel")
+    run("-m", "build", "--wheel", "--no-isolation", "--outdir", top, ROOT, cwd=top)
+    (wheel,) = top.glob("*.whl")
+    target = top / "installed"
+    pip = ("-m", "pip", "--disable-pip-version-check", "install", "--no-deps", "--no-index")
+    run(*pip, "--target", target, wheel, cwd=top)
+    return target
+
+
+@pytest.fixture
+def python(installed: Path, tmp_path: Path):
+    """Run Python in an empty folder where the installed wheel goes before the source tree."""
+
+    def python(*arguments: str) -> str:
+        return run(*arguments, cwd=tmp_path, PYTHONPATH=str(installed))
+
+    return python
+
+
+def test_every_file_is_packaged(installed: Path) -> None:
+    def contents(package: Path) -> dict[str, bytes]:
+        return {
+            path.relative_to(package).as_posix(): path.read_bytes()
+            for path in package.rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
+        }
+
+    assert contents(installed / "palpate") == contents(SOURCE)
+
+
+def test_wheel_carries_licence_and_command(installed: Path) -> None:
+    (information,) = installed.glob("palpate-*.dist-info")
+    assert (information / "licenses" / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+    assert "palpate = palpate.cli:main" in (information / "entry_points.txt").read_text()
+
+
+def test_package_imports_from_an_empty_folder(python, installed: Path) -> None:
+    told = python("-c", "import palpate; print(palpate.__version__, palpate.__file__)")
+    assert told.split() == [version("palpate"), str(installed / "palpate" / "__init__.py")]
+
+
+def test_every_module_imports_from_an_empty_folder(python) -> None:
+    """What a module reads when it is imported has to be in the wheel as well."""
+    names = [
+        ".".join(("palpate", *path.relative_to(SOURCE).with_suffix("").parts))
+        for path in sorted(SOURCE.rglob("*.py"))
+        if not path.stem.startswith("__")
+    ]
+    python("-c", "".join(f"import {name}\n" for name in names))
+
+
+def test_command_line_helps_from_an_empty_folder(python, installed: Path) -> None:
+    told = python(str(installed / "bin" / "palpate"), "--help")
+    assert "usage: palpate" in told
+    assert "identify" in told

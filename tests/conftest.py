@@ -1,8 +1,6 @@
-"""What every test has: palpate first, so that JAX is set up as a user's is; float64 on request."""
+"""What every test may ask for: float64, and no implicit promotion of dtypes."""
 
-import palpate  # noqa: F401  before JAX: it sets compiler flags
-
-import jax  # noqa: I001
+import jax
 import pytest
 
 

@@ -22,8 +22,9 @@ def chain(damping: float = 0.35, rate: float = 6.0, points: int = 21, seconds: f
     steps = np.stack(
         [np.sin(tilt_x) * np.cos(tilt_y), np.sin(tilt_y), -np.cos(tilt_x) * np.cos(tilt_y)], -1
     ) / (points - 1)
-    head = np.zeros((len(time), 1, 3))
-    return time, np.concatenate([head, np.cumsum(steps, axis=1)], axis=1) + [0.0, 0.0, 1.0]
+    head = np.array([0.0, 0.0, 1.0])
+    steps = np.concatenate([np.zeros((len(time), 1, 3)), steps], axis=1)
+    return time, head + np.cumsum(steps, axis=1)
 
 
 def write_run(folder: Path, name: str, **result) -> Path:
@@ -98,7 +99,7 @@ def parameter(name, value, unit, about, **more):
     return row | {"shared": False, "lower": None, "upper": None, "verdict": None} | more
 
 
-def training(folder: Path, steps: int = 3000) -> Path:
+def training(folder: Path, steps: int = 400) -> Path:
     """A run with a long and noisy learning curve whose horizon and amplitude grow."""
     rng = np.random.default_rng(1)
     lines = []

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array, Float
-from toys import Cart, Pendulum
 
 from palpate.errors import PalpateError
 from palpate.models.model import Model
@@ -30,6 +29,7 @@ from palpate.parameters import (
     sample_prior,
     with_values,
 )
+from toys import Cart, Pendulum
 
 coordinates = st.floats(-4.0, 4.0)
 positive = st.floats(1e-3, 1e3)

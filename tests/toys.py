@@ -1,11 +1,15 @@
-"""Two toy models, a cart and a pendulum, that pass through the same code as every family."""
+"""A cart and a pendulum, with a task each, that pass through the same code as every family."""
+
+from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.models.model import Model
 from palpate.parameters import LogNormal, Parameter, parameter
+from palpate.tasks.task import Start, Task
 
 
 class CartState(eqx.Module):
@@ -102,3 +106,65 @@ def _at_last(observations: Array, period: float) -> tuple[Array, Array]:
     if observations.shape[-2] < 2:
         return last, jnp.zeros_like(last)
     return last, (last - observations[..., -2, :]) / period
+
+
+class CartToOrigin(Task):
+    """Bring the cart to the origin, and to rest there, with a bounded force."""
+
+    name: ClassVar[str] = "cart-to-origin"
+    duration: float = eqx.field(static=True, default=3.0)
+    action_limit: float = eqx.field(static=True, default=4.0)  # N
+    action_rate_limit: float | None = eqx.field(static=True, default=None)
+
+    def starts(self, model: Model, key: PRNGKeyArray, count: int) -> Start:
+        position, velocity = jax.random.uniform(key, (2, count, 1), minval=-1.0)
+        return Start(CartState(position, velocity), jnp.zeros((count, 1)))
+
+    def augment(self, start: Start, key: PRNGKeyArray) -> Start:
+        """The rail has no preferred direction."""
+        side = jax.random.rademacher(key, start.command.shape, start.command.dtype)
+        return jax.tree.map(lambda leaf: side * leaf, start)
+
+    def features(self, state: CartState, goal: None) -> Array:
+        return jnp.concatenate([state.position, state.velocity], axis=-1)
+
+    def feature_names(self, model: Model) -> dict[str, str]:
+        return {"position": "(1,) m", "velocity": "(1,) m/s"}
+
+    def loss(self, models: Model, start: Start, states: CartState, actions: Array) -> Array:
+        return jnp.mean(states.position**2 + 0.1 * states.velocity**2, axis=(1, 2))
+
+    def outcome(self, models, start, states, actions) -> dict[str, Array]:
+        near = jnp.abs(states.position[:, -1, 0]) < 0.05
+        still = jnp.abs(states.velocity[:, -1, 0]) < 0.05
+        return {"success": jnp.asarray(near & still, float)}
+
+
+class PendulumDamping(Task):
+    """Take the swing out of the pendulum by accelerating its pivot, which takes time to change."""
+
+    name: ClassVar[str] = "pendulum-damping"
+    duration: float = eqx.field(static=True, default=1.5)
+    action_limit: float = eqx.field(static=True, default=6.0)  # m/s^2
+    action_rate_limit: float | None = eqx.field(static=True, default=60.0)  # m/s^3
+
+    def starts(self, model: Model, key: PRNGKeyArray, count: int) -> Start:
+        angle, rate = jax.random.uniform(key, (2, count, 1), minval=-1.0)
+        return Start(PendulumState(angle, 2.0 * rate), jnp.zeros((count, 1)))
+
+    def features(self, state: PendulumState, goal: None) -> Array:
+        return jnp.concatenate([jnp.sin(state.angle), jnp.cos(state.angle), state.rate], axis=-1)
+
+    def feature_names(self, model: Model) -> dict[str, str]:
+        return {"sine and cosine of the angle": "(2,)", "rate": "(1,) rad/s"}
+
+    def loss(self, models: Model, start: Start, states: PendulumState, actions: Array) -> Array:
+        return jnp.mean(_energy(models, states), axis=1)
+
+    def outcome(self, models, start, states, actions) -> dict[str, Array]:
+        share = _energy(models, states)[:, -1] / models.energy(start.state)
+        return {"success": jnp.asarray(share < 0.02, float)}
+
+
+def _energy(models: Model, states: PendulumState) -> Array:
+    return jax.vmap(models.energy, in_axes=1, out_axes=1)(states)

@@ -1,5 +1,6 @@
 """Which processors the arithmetic runs on, and how a batch is divided among them."""
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable
@@ -18,13 +19,11 @@ _TRIED = ("0.10.",)
 
 
 def prepare() -> None:
-    """Set up JAX's CPU back end before JAX is loaded: compiler flags, one device per core.
+    """Set up JAX's CPU back end before it starts: compiler flags, one device per core.
 
-    Called when palpate is imported. Leaves alone what the user has set, and does nothing when JAX
-    is loaded already: then the same results come, slower.
+    Called when palpate is imported. Leaves alone what the user has set, and has no effect once JAX
+    has computed something: then the same results come, slower.
     """
-    if "jax" in sys.modules:
-        return
     try:
         tried = version("jax").startswith(_TRIED)
     except PackageNotFoundError:
@@ -35,8 +34,15 @@ def prepare() -> None:
             if flag.partition("=")[0] not in flags:
                 flags = f"{flags} {flag}".strip()
         os.environ["XLA_FLAGS"] = flags
-    if "host_platform_device_count" not in flags:
-        os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(cores()))
+    if "host_platform_device_count" in flags or "JAX_NUM_CPU_DEVICES" in os.environ:
+        return
+    if "jax" not in sys.modules:
+        os.environ["JAX_NUM_CPU_DEVICES"] = str(cores())
+        return
+    import jax
+
+    with contextlib.suppress(RuntimeError):  # the back end has started
+        jax.config.update("jax_num_cpu_devices", cores())
 
 
 def cores() -> int:
@@ -46,28 +52,31 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def data_parallel(function: Callable[..., Any], batch_size: int) -> Callable[..., Any]:
+def data_parallel(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """Divide a batch over all devices: `function(shared, batch)` gives means over its batch.
 
     The result takes the same arguments, runs `function` on an equal part of `batch` (leading axis
-    of every leaf, `batch_size` long) on each device, and returns the mean of what they return. With
-    a batch that does not divide evenly, or one device, it is `function` itself.
+    of every leaf) on each device, and returns the mean of what they return. A batch that does not
+    divide evenly is left whole.
     """
     import jax
     from jax.sharding import Mesh, PartitionSpec
 
     devices = jax.devices()
-    if len(devices) == 1 or batch_size % len(devices):
-        return function
-    mesh = Mesh(devices, ("batch",))
 
     def part(shared: Any, batch: Any) -> Any:
         return jax.tree.map(lambda x: jax.lax.pmean(x, "batch"), function(shared, batch))
 
-    return jax.shard_map(
+    divided = jax.shard_map(
         part,
-        mesh=mesh,
+        mesh=Mesh(devices, ("batch",)),
         in_specs=(PartitionSpec(), PartitionSpec("batch")),
         out_specs=PartitionSpec(),
         check_vma=False,
     )
+
+    def call(shared: Any, batch: Any) -> Any:
+        size = jax.tree.leaves(batch)[0].shape[0]
+        return function(shared, batch) if size % len(devices) else divided(shared, batch)
+
+    return call

@@ -157,9 +157,7 @@ def parameters_of(model: Any) -> dict[str, Parameter]:
     return dict(_walk(model, "", {}))
 
 
-def _walk(
-    module: Any, prefix: str, outer: dict[str, Parameter]
-) -> Iterator[tuple[str, Parameter]]:
+def _walk(module: Any, prefix: str, outer: dict[str, Parameter]) -> Iterator[tuple[str, Parameter]]:
     own = () if isinstance(module, type) else getattr(module, "overrides", ())
     overrides = {prefix + name: declaration for name, declaration in own} | outer
     for field in dataclasses.fields(module):
@@ -243,6 +241,19 @@ class FreeParameters(eqx.Module):
     def build(self, free: dict[str, Array]) -> Any:
         """The legal model at these free values."""
         return self.unconstrained(free).constrain()
+
+    def project(self, free: dict[str, Array]) -> dict[str, Array]:
+        """The free values of the legal model at these: a descent that leaves the legal set returns.
+
+        Without it a value beyond a limit would feel no gradient, and never come back.
+        """
+        legal = self.build(free)
+        projected = {}
+        for path, declaration in self.declarations.items():
+            reference = value_of(self.reference, path)
+            coordinate = declaration.prior.to_free(value_of(legal, path), reference)
+            projected[path] = jnp.mean(coordinate) if declaration.shared else coordinate
+        return projected
 
     def unconstrained(self, free: dict[str, Array]) -> Any:
         """As `build`, before what couples several parameters is applied."""

@@ -4,6 +4,7 @@ A trial is one rope, one start pose and one seed. Many run side by side, so that
 asked once per control period for all of them.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,13 +19,16 @@ import numpy as np
 from palpate import devices
 from palpate.errors import PalpateError
 from palpate.models.rope import RopeState
-from palpate.networks import Policy
+from palpate.networks import CommandPolicy
 from palpate.perception.velocity import VelocityEstimator
-from palpate.tasks.rope_stabilization import AT_REST, FIRST_ROOT, STABILISED, STAY
-from palpate.tasks.task import Task
-from palpate.worlds.rope import START_POSES, RopeConfiguration, RopeObservation, RopeWorld
-
-TRIAL_PERIODS = 4.0  # length of a trial, in first periods of its rope
+from palpate.tasks.rope_stabilization import (
+    AT_REST,
+    FIRST_ROOT,
+    STABILISED,
+    STAY,
+    RopeStabilization,
+)
+from palpate.worlds.rope import RopeConfiguration, RopeWorld
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,6 @@ class Seen:
 
     markers: np.ndarray  # (worlds, markers, 3) m
     gripper_position: np.ndarray  # (worlds, 3) m
-    gripper_velocity: np.ndarray  # (worlds, 3) m/s
 
 
 class Controller(Protocol):
@@ -68,27 +71,33 @@ class Episodes:
     """What happened in trials, sampled once per control period from the start on.
 
     `energy` (trials, times) in J is the true one; NaN after a simulation diverged. `gripper_speed`
-    (trials, times) in m/s. `markers` (trials, times, markers, 3) in m is empty along its second
-    axis unless it was asked for. `failures`: why a simulation ended early, by trial.
+    (trials, times) in m/s. `markers` (kept trials, times, markers, 3) in m, as seen, of those
+    trials that were asked for. `failures`: why a simulation ended early, by trial.
     """
 
-    control_period: float
     energy: np.ndarray
     gripper_speed: np.ndarray
     markers: np.ndarray
     failures: dict[int, str]
 
+    @classmethod
+    def empty(cls, trials: int, times: int, kept: int, markers: int) -> "Episodes":
+        """All NaN, to be filled."""
+        energy, speed = np.full((2, trials, times), np.nan, np.float32)
+        return cls(energy, speed, np.full((kept, times, markers, 3), np.nan, np.float32), {})
+
 
 class LearnedController:
     """A policy, fed with what it was trained on: positions and velocities of a model's nodes.
 
-    The nodes are the markers, or every second of them, and so on: `nodes` - 1 divides the number
-    of markers less one. Where the gripper is, its encoder says better than its marker.
+    The nodes are the markers, or every second of them, and so on, as the policy's features tell.
+    Where the gripper is, its encoder says better than its marker.
     """
 
-    def __init__(self, policy: Policy, task: Task, nodes: int, control_period: float):
-        estimator = VelocityEstimator(control_period)
-        self._policy, self._nodes, self._estimator = policy, nodes, estimator
+    def __init__(self, policy: CommandPolicy, task: RopeStabilization):
+        self._policy = policy
+        self._segments = policy.mean.shape[0] // 6  # 3 coordinates and 3 velocities of each node
+        self._estimator = estimator = VelocityEstimator(policy.period)
 
         @eqx.filter_jit
         def decide(policy, window, carry, positions):
@@ -114,11 +123,11 @@ class LearnedController:
 
     def _positions(self, seen: Seen) -> jax.Array:
         markers = seen.markers.shape[1]
-        every, rest = divmod(markers - 1, self._nodes - 1)
+        every, rest = divmod(markers - 1, self._segments)
         if rest:
             raise PalpateError(
-                f"a policy for {self._nodes} nodes needs a multiple of {self._nodes - 1} markers "
-                f"and one more, not {markers}"
+                f"a policy for {self._segments + 1} nodes needs a multiple of {self._segments} "
+                f"markers and one more, not {markers}"
             )
         positions = seen.markers[:, ::every].copy()
         positions[:, 0] = seen.gripper_position
@@ -126,73 +135,64 @@ class LearnedController:
 
 
 def run_trials(
-    trials: Sequence[Trial], controller: Controller, duration: float, keep_markers: bool = False
+    trials: Sequence[Trial], controller: Controller, steps: int, kept: Sequence[int] = ()
 ) -> Episodes:
-    """Run all trials side by side for `duration` seconds, the worlds on as many threads as cores.
+    """Run all trials side by side for `steps` control periods, on as many threads as cores.
 
-    A simulation that diverges ends its own trial and no other.
+    The markers of the trials numbered in `kept` are kept. A simulation that diverges ends its own
+    trial and no other.
     """
-    period = trials[0].configuration.control_period
-    steps = round(duration / period)
-    episodes = _Recorder(trials, steps, keep_markers, period)
-    seen = episodes.seen
-    controller.begin(seen)
+    recorder = _Recorder(trials, steps, kept)
+    controller.begin(recorder.seen)
+    shares = np.array_split(np.arange(len(trials)), devices.cores())
     with ThreadPoolExecutor(devices.cores()) as threads:
-        shares = np.array_split(np.arange(len(trials)), devices.cores())
         for step in range(1, steps + 1):
-            commands = controller.command(seen)
-            list(threads.map(lambda share: episodes.advance(share, step, commands), shares))  # noqa: B023
-            seen = episodes.seen
-    return episodes.episodes()
+            commands = controller.command(recorder.seen)
+            advance = functools.partial(recorder.advance, step, commands)
+            list(threads.map(advance, shares))  # MuJoCo lets the other threads run meanwhile
+    return recorder.episodes
 
 
 class _Recorder:
     """Worlds, the last observation of each, and what is kept of them."""
 
-    def __init__(self, trials: Sequence[Trial], steps: int, keep_markers: bool, period: float):
+    def __init__(self, trials: Sequence[Trial], steps: int, kept: Sequence[int]):
         self._worlds = [RopeWorld(trial.configuration) for trial in trials]
-        self._latest: list[RopeObservation] = [
+        self._latest = [
             world.reset(trial.seed, start=trial.start)
             for world, trial in zip(self._worlds, trials, strict=True)
         ]
-        self._period = period
-        count, markers = len(trials), len(self._latest[0].markers)
-        self._energy = np.full((count, steps + 1), np.nan, np.float32)
-        self._speed = np.full((count, steps + 1), np.nan, np.float32)
-        kept = steps + 1 if keep_markers else 0
-        self._markers = np.full((count, kept, markers, 3), np.nan, np.float32)
-        self._failures: dict[int, str] = {}
-        for trial in range(count):
+        self._kept = {trial: place for place, trial in enumerate(kept)}
+        self.episodes = Episodes.empty(
+            len(trials), steps + 1, len(kept), len(self._latest[0].markers)
+        )
+        for trial in range(len(trials)):
             self._keep(trial, 0)
 
     @property
     def seen(self) -> Seen:
+        """The newest observations; of a world that diverged, its last one."""
         return Seen(
             np.stack([observation.markers for observation in self._latest]),
             np.stack([observation.gripper_position for observation in self._latest]),
-            np.stack([observation.gripper_velocity for observation in self._latest]),
         )
 
-    def advance(self, share: np.ndarray, step: int, commands: np.ndarray) -> None:
+    def advance(self, step: int, commands: np.ndarray, share: np.ndarray) -> None:
+        failures = self.episodes.failures
         for trial in share.tolist():
-            if trial not in self._failures:
+            if trial not in failures:
                 try:
                     self._latest[trial] = self._worlds[trial].step(commands[trial])
                     self._keep(trial, step)
                 except PalpateError as error:
-                    self._failures[trial] = str(error)
+                    failures[trial] = str(error)
 
     def _keep(self, trial: int, step: int) -> None:
         truth = self._worlds[trial].truth()
-        self._energy[trial, step] = truth.energy
-        self._speed[trial, step] = np.linalg.norm(truth.gripper_velocity)
-        if self._markers.shape[1]:
-            self._markers[trial, step] = self._latest[trial].markers
-
-    def episodes(self) -> Episodes:
-        return Episodes(
-            self._period, self._energy, self._speed, self._markers, dict(self._failures)
-        )
+        self.episodes.energy[trial, step] = truth.energy
+        self.episodes.gripper_speed[trial, step] = np.linalg.norm(truth.gripper_velocity)
+        if trial in self._kept:
+            self.episodes.markers[self._kept[trial], step] = self._latest[trial].markers
 
 
 def settling_time(
@@ -208,6 +208,7 @@ def settling_time(
     passed = np.cumsum(np.pad(above, ((0, 0), (1, 0))), axis=1)
     stays = passed[:, stay + 1 :] == passed[:, : -stay - 1]
     settled = stays & (gripper_speed[:, stay:] < AT_REST)
+    settled = np.pad(settled, ((0, 0), (0, 1)))  # a trial may be shorter than that second
     return np.where(settled.any(1), settled.argmax(1) * control_period, np.nan)
 
 

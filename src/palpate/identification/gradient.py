@@ -7,7 +7,7 @@ horizons from the start meet a loss full of folds; short ones alone cannot see s
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -63,10 +63,6 @@ class Settings:
             )
         if not all(0.0 < share <= 1.0 for share in self.horizons):
             raise PalpateError(f"horizons are shares between 0 and 1, got {self.horizons}")
-        if self.method not in ("adam", "levenberg-marquardt"):
-            raise PalpateError(
-                f"unknown method '{self.method}'; there are: adam, levenberg-marquardt"
-            )
 
 
 class Descent(eqx.Module):
@@ -78,6 +74,7 @@ class Descent(eqx.Module):
     within: int = 0  # iterations done in this stage
 
 
+@runtime_checkable
 class Method(Protocol):
     """One way to go downhill."""
 
@@ -107,6 +104,8 @@ def identify(
     check_shapes(model, aligned)
     coordinates = FreeParameters(model)
     source = WindowSource.of(aligned)
+    if settings.method not in METHODS:
+        raise PalpateError(f"unknown method '{settings.method}'; there are: {', '.join(METHODS)}")
     method = METHODS[settings.method](coordinates, observation_scale(aligned), settings)
     descent = Descent(coordinates.initial, method.start(coordinates.initial))
     step = 0
@@ -139,7 +138,11 @@ def _iterate(
     settings: Settings,
 ) -> tuple[Descent, float]:
     """One iteration on windows that depend on the seed and the step alone."""
-    windows = source.sample(np.random.default_rng((settings.seed, step)), settings.windows, horizon)
+    windows = source.sample(
+        np.random.default_rng((settings.seed, step)),
+        min(settings.windows, source.distinct(horizon)),
+        horizon,
+    )
     last = descent.stage == len(settings.horizons) - 1
     remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
     free, optimiser, loss = method.step(descent.free, descent.optimiser, windows, remaining)
@@ -177,13 +180,13 @@ class Adam:
                 )
             )(free)
 
-        divided = devices.data_parallel(loss_and_gradient, settings.windows)
+        divided = devices.data_parallel(loss_and_gradient)
 
         def step(free: Free, optimiser: Any, windows: Windows, rate: Array):
             loss, gradient = divided(free, windows)
             direction, optimiser = self._transform.update(gradient, optimiser)
             free = jax.tree.map(lambda x, d: x - rate * d, free, direction)
-            return free, optimiser, loss
+            return coordinates.project(free), optimiser, loss
 
         self._step = jax.jit(step)
 

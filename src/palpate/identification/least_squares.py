@@ -72,7 +72,7 @@ class NormalEquations:
         gradient = np.asarray(system.gradient, np.float64) + weight * np.asarray(flat)
         diagonal = np.diag(np.diag(matrix) + 1e-12)
         change = np.linalg.solve(matrix + float(damping) * diagonal, -gradient)
-        proposal = unravel(flat + jnp.asarray(change, flat.dtype))
+        proposal = self.coordinates.project(unravel(flat + jnp.asarray(change, flat.dtype)))
         before = self._loss(free, windows, prior_weight)
         after = self._loss(proposal, windows, prior_weight)
         if np.isfinite(after) and after < before:

@@ -73,6 +73,17 @@ class WindowSource:
         trials = np.arange(len(self.aligned.length))
         return self._cut(trials, np.array([s[0] for s in self.starts]), horizon)
 
+    def distinct(self, horizon: int) -> int:
+        """How many windows of this horizon are worth having at once: no two alike.
+
+        Windows that overlap by more than half tell little more than one.
+        """
+        stride = max(1, horizon // 2)
+        return sum(
+            1 + max(0, int(length - START_FRAMES - horizon - possible[0]) // stride)
+            for length, possible in zip(self.aligned.length, self.starts, strict=True)
+        )
+
     def sample(self, rng: np.random.Generator, batch: int, horizon: int) -> Windows:
         """Windows at random starts that leave room for the horizon, trials drawn evenly."""
         count = len(self.aligned.length)

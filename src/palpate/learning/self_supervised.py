@@ -5,7 +5,9 @@ moved by the task's symmetries and the model is perturbed anew in every iteratio
 longer in stages, and perturbations wider.
 """
 
+import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,14 +15,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, PRNGKeyArray
 
 from palpate.devices import data_parallel
 from palpate.errors import PalpateError
+from palpate.learning.closed_loop import simulate
 from palpate.models.model import Model
-from palpate.networks.policy import CommandPolicy, Policy
-from palpate.parameters import randomise
-from palpate.perception.velocity import VelocityEstimator
+from palpate.networks.policy import CommandPolicy
+from palpate.parameters import describe, randomise
 from palpate.runs import Run, interruptible, progress
 from palpate.tasks.task import Start, Task
 
@@ -54,59 +57,6 @@ class Training:
     width: int = 256
     depth: int = 2
     checkpoint_every: int = 100
-
-
-def simulate(
-    task: Task,
-    models: Model,
-    policy: Policy,
-    start: Start,
-    steps: int,
-    key: PRNGKeyArray | None = None,
-    noise: float = 0.0,
-) -> tuple[Any, Array]:
-    """States after each of `steps` decisions in closed loop, and the actions: (batch, time, ...).
-
-    Without noise the policy sees the state. With it, the policy sees what a robot would: noisy
-    observations (standard deviation `noise`, in the observation's unit) and velocities estimated
-    from them.
-    """
-    key = jax.random.key(0) if key is None else key
-    estimator = VelocityEstimator(models.control_period)
-
-    def perceived(window: Array, state: Any, key: PRNGKeyArray) -> tuple[Array, Any]:
-        observed = models.observe(state)
-        observed = observed + noise * jax.random.normal(key, observed.shape, observed.dtype)
-        window, velocity = estimator.update(window, observed)
-        before = observed - models.control_period * velocity
-        return window, models.initial_state(jnp.stack([before, observed], axis=1))
-
-    def advance(loop: tuple[Any, Array, Array], index: Array) -> tuple[Any, Any]:
-        state, memory, window = loop
-        for_noise, for_policy = jax.random.split(jax.random.fold_in(key, index))
-        seen = state
-        if noise:
-            window, seen = perceived(window, state, for_noise)
-        memory, action = policy(memory, task.features(seen, start.goal), start.goal, for_policy)
-        state = models.step(state, action)
-        return (state, memory, window), (state, action)
-
-    window = _past(models, start, estimator, jax.random.fold_in(key, steps), noise)
-    loop = start.state, policy.initial_carry(start.command), window
-    _, (states, actions) = jax.lax.scan(advance, loop, jnp.arange(steps))
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (states, actions))
-
-
-def _past(
-    models: Model, start: Start, estimator: VelocityEstimator, key: PRNGKeyArray, noise: float
-) -> Array:
-    """What was seen before the first decision: the start's motion, continued backwards."""
-    observed = models.observe(start.state)
-    following = models.observe(models.step(start.state, start.command))
-    back = jnp.arange(-estimator.frames, 0, dtype=observed.dtype)
-    back = back.reshape(-1, *(1,) * observed.ndim)
-    window = observed + back * (following - observed)
-    return window + noise * jax.random.normal(key, window.shape, window.dtype)
 
 
 class TrainingState(eqx.Module):
@@ -148,16 +98,18 @@ def train(
     done = 0
     if run is not None:
         done, state = run.restore(state) or (0, state)
+    # Where an update leaves it: else the second would compile anew, to other last digits.
+    everywhere = NamedSharding(Mesh(jax.devices(), ("batch",)), PartitionSpec())
+    state, pool, for_updates = jax.device_put((state, pool, for_updates), everywhere)
     stages = _stages(task, model, training)
     bar = progress(range(done + 1, training.iterations + 1), "training", done=done)
-    update, horizon = None, 0
+    updates = {}
     with interruptible() as stop:
         for iteration in bar:
-            wanted = stages[(iteration - 1) * len(stages) // training.iterations]
-            if wanted != horizon:
-                horizon = wanted
-                update = _update(task, model, training, optimiser, pool, static, horizon)
-            state, metrics = update(state, for_updates, jnp.asarray(iteration))
+            horizon = stages[(iteration - 1) * len(stages) // training.iterations]
+            if horizon not in updates:
+                updates[horizon] = _update(task, model, training, optimiser, pool, static, horizon)
+            state, metrics = updates[horizon](state, for_updates, jnp.asarray(iteration))
             metrics = {name: _finite(value) for name, value in metrics.items()}
             bar.show(loss=metrics["loss"], horizon=horizon)
             if int(state.skipped) >= MOST_SKIPPED:
@@ -177,8 +129,8 @@ def train(
 
 
 def _finite(value: Array) -> float | None:
-    value = float(value)
-    return value if math.isfinite(value) else None
+    number = float(value)
+    return number if math.isfinite(number) else None
 
 
 def _stages(task: Task, model: Model, training: Training) -> list[int]:
@@ -218,25 +170,24 @@ def _update(
     pool: Start,
     static: CommandPolicy,
     horizon: int,
-):
+) -> Callable[[TrainingState, PRNGKeyArray, Array], tuple[TrainingState, dict[str, Array]]]:
     """The jitted iteration for one horizon: (state, key, iteration) to (state, metrics)."""
 
     def value_and_gradient(shared, batch):
-        arrays, shared_model, key = shared
-        own_model, start, index = batch
-        models = eqx.combine(own_model, shared_model)
+        arrays, common, key = shared
+        own, start, index = batch
+        models = eqx.combine(own, common)
+        key = jax.random.fold_in(key, index[0])  # other noise on each device
 
         def loss(arrays):
             policy = eqx.combine(arrays, static)
-            noise_key = jax.random.fold_in(key, index[0])
-            states, actions = simulate(
-                task, models, policy, start, horizon, noise_key, training.observation_noise
-            )
+            noise = training.observation_noise
+            states, actions = simulate(task, models, policy, start, horizon, key, noise)
             return jnp.mean(task.loss(models, start, states, actions))
 
         return jax.value_and_grad(loss)(arrays)
 
-    divided = data_parallel(value_and_gradient, training.batch)
+    divided = data_parallel(value_and_gradient)
 
     @jax.jit
     def update(state: TrainingState, key: PRNGKeyArray, iteration: Array):
@@ -248,12 +199,12 @@ def _update(
         if training.augmentation:
             start = task.augment(start, keys[2])
         start = task.adapt(start, models)
-        own = jax.tree.map(lambda leaf, single: leaf.ndim > single.ndim, models, model)
-        own, shared = eqx.partition(models, own)
+        perturbed = jax.tree.map(lambda leaf, single: leaf.ndim > single.ndim, models, model)
+        own, common = eqx.partition(models, perturbed)
         loss, gradient = divided(
-            (state.policy, shared, keys[3]), (own, start, jnp.arange(training.batch))
+            (state.policy, common, keys[3]), (own, start, jnp.arange(training.batch))
         )
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(norm) & jnp.isfinite(loss)
         changes, moments = optimiser.update(gradient, state.optimiser)
         changed = TrainingState(
@@ -270,3 +221,14 @@ def _update(
         return state, metrics
 
     return update
+
+
+def manifest(task: Task, model: Model, training: Training, seed: int) -> dict[str, Any]:
+    """What `save_policy` should say of a policy beside its sizes and limits."""
+    return {
+        "task": task.name,
+        "features": task.feature_names(model),
+        "model": {"name": type(model).__name__, "parameters": describe(model)},
+        "training": dataclasses.asdict(training),
+        "seed": seed,
+    }

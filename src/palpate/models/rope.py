@@ -93,6 +93,13 @@ class Rope(Model):
         prior=Normal(9.81, 0.3),
         about="acceleration of free fall; identified, it also absorbs what the model leaves out",
     )
+    rest_bend: Float[Array, "*batch joints 3"] = parameter(
+        "rad",
+        prior=Normal(0.0, 0.15),
+        fixed=True,
+        about="bend at rest along the chord between the ends, across it, and up; ignored unless "
+        "both ends are driven",
+    )
     driven: tuple[int, ...] = eqx.field(static=True, default=(0,))
     drive: Literal["position", "velocity", "acceleration"] = eqx.field(
         static=True, default="velocity"
@@ -138,8 +145,10 @@ class Rope(Model):
 
     @classmethod
     def from_rest_lengths(cls, rest_length: np.ndarray, mass: float, **fields) -> "Rope":
-        """A rope with given segments (m) and `mass` (kg) in equal nodes, made legal.
+        """A rope with given segments (m) and `mass` (kg) spread evenly along it, made legal.
 
+        Each node carries half of its neighbouring segments, so that the inertia of a swing is that
+        of the rope to second order: equal nodes would weigh down the free end.
         Other parameters are given in `fields`, a number standing for all elements, or start from
         the centre of their prior.
         """
@@ -154,7 +163,10 @@ class Rope(Model):
             centre = prior.median if isinstance(prior, LogNormal) else prior.mean
             value = fields.get(name, centre)
             fields[name] = np.full(count, value) if np.ndim(value) == 0 and count else value
-        fields |= {"node_mass": np.full(nodes, mass / nodes), "rest_length": rest_length}
+        share = rest_length / np.sum(rest_length)
+        node_mass = 0.5 * mass * (np.append(share, 0.0) + np.append(0.0, share))
+        fields |= {"node_mass": node_mass, "rest_length": rest_length}
+        fields.setdefault("rest_bend", np.zeros((nodes - 2, 3)))
         return cls(**fields).constrain()
 
     @staticmethod
@@ -203,6 +215,7 @@ class Rope(Model):
     def step(self, state: RopeState, action: Float[Array, "*batch driven 3"]) -> RopeState:
         """The state one control period later. A batch is integrated in blocks of `LANES` ropes."""
         state, increment = self._drive(state, action)
+        rest_bend = self._rest_bend(state.position)
         coefficients = self._coefficients()
         batch = state.position.shape[:-2]
         if not batch:
@@ -210,11 +223,38 @@ class Rope(Model):
                 *(leaf.shape[:-1] for leaf in jax.tree.leaves(coefficients))
             )
             if not batch:
-                return self._integrate(state, increment, coefficients, 1)
-            state, increment = jax.tree.map(
-                lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), (state, increment)
+                return self._integrate((state, increment, rest_bend), coefficients, 1)
+            state, increment, rest_bend = jax.tree.map(
+                lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape),
+                (state, increment, rest_bend),
             )
-        return self._integrate_blocks(state, increment, coefficients, *batch)
+        return self._integrate_blocks((state, increment, rest_bend), coefficients, *batch)
+
+    @property
+    def held_at_both_ends(self) -> bool:
+        """Whether the first and the last node are driven."""
+        return 0 in self.driven and self.nodes - 1 in self.driven
+
+    def _rest_bend(self, position: Array) -> Array | None:
+        """Bend at rest in the world frame, (*batch, joints, 3); None for a straight rope.
+
+        The frame is the chord's: along it in the horizontal plane, across it, and up. Grips that
+        move without turning keep a rope's own bends in it; held at one end, it has no such frame.
+        """
+        if not self.held_at_both_ends:
+            return None
+        chord = position[..., -1, :2] - position[..., 0, :2]
+        along = chord / jnp.sqrt(jnp.sum(jnp.square(chord), axis=-1, keepdims=True) + 1e-6)
+        x, y = along[..., None, 0], along[..., None, 1]
+        bend = self.rest_bend
+        return jnp.stack(
+            [
+                x * bend[..., 0] - y * bend[..., 1],
+                y * bend[..., 0] + x * bend[..., 1],
+                jnp.broadcast_to(bend[..., 2], jnp.broadcast_shapes(x.shape, bend.shape[:-1])),
+            ],
+            axis=-1,
+        )
 
     def _drive(self, state: RopeState, action: Array) -> tuple[RopeState, Array]:
         """Start velocity of the driven nodes, and what each integration step adds to it."""
@@ -260,17 +300,21 @@ class Rope(Model):
             step_gravity=self.time_step * free * per_node(self.gravity),
         )
 
-    def _integrate(self, state, increment, coefficients, lanes: int) -> RopeState:
-        """Integrate a block: leaves lead with (lanes,), or have no batch axis for one lane."""
+    def _integrate(self, motion, coefficients, lanes: int) -> RopeState:
+        """Integrate a block: leaves lead with (lanes,), or have no batch axis for one lane.
 
-        def flat(values: Array, trailing: int) -> Array:
-            """(lanes, elements) or (elements,) to (elements x lanes,), one lane array after all."""
-            if values.ndim == trailing:
+        `motion` is the state, the driven nodes' increment, and the rest bend.
+        """
+        state, increment, rest_bend = motion
+
+        def flat(values: Array) -> Array:
+            """(lanes, elements) or (elements,) to (elements x lanes,)."""
+            if values.ndim == 1:
                 values = jnp.broadcast_to(values, (lanes, *values.shape))
-            return jnp.moveaxis(values, 0, -1).reshape(*values.shape[2:], -1)
+            return jnp.moveaxis(values, 0, -1).reshape(-1)
 
         def axes(values: Array) -> tuple[Array, Array, Array]:
-            x, y, z = (flat(values[..., axis], 1) for axis in range(3))
+            x, y, z = (flat(values[..., axis]) for axis in range(3))
             return x, y, z
 
         def unflat(values) -> Array:
@@ -281,14 +325,15 @@ class Rope(Model):
             axes(state.position),
             axes(state.velocity),
             axes(increment),
-            jax.tree.map(lambda leaf: flat(leaf, 1), coefficients),
+            None if rest_bend is None else axes(rest_bend),
+            jax.tree.map(flat, coefficients),
             lanes=lanes,
             steps=self.substeps,
             time_step=self.time_step,
         )
         return RopeState(unflat(position), unflat(velocity))
 
-    def _integrate_blocks(self, state, increment, coefficients, count: int) -> RopeState:
+    def _integrate_blocks(self, motion, coefficients, count: int) -> RopeState:
         """Integrate `count` ropes (leading axis) in blocks; parameters batched or shared."""
         lanes = min(LANES, count)
         blocks = -(-count // lanes)
@@ -301,9 +346,9 @@ class Rope(Model):
 
         batched = jax.tree.map(lambda leaf: leaf.ndim > 1, coefficients)
         own, shared = eqx.partition(coefficients, batched)
-        xs = jax.tree.map(block, (state, increment, own))
         result = jax.lax.map(
-            lambda x: self._integrate(x[0], x[1], eqx.combine(x[2], shared), lanes), xs
+            lambda x: self._integrate(x[0], eqx.combine(x[1], shared), lanes),
+            jax.tree.map(block, (motion, own)),
         )
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], result)
 
@@ -344,16 +389,11 @@ class Rope(Model):
     def constrain(self) -> "Rope":
         """Keep the integration stable: soften what loads a node beyond the limit.
 
-        Every stiffness and damping that acts on a node is multiplied by the same factor; up to
-        80 % of `STABILITY_LIMIT` nothing changes, beyond it the load approaches the limit smoothly
-        and never reaches it, so that no value an optimiser can reach is unstable and a gradient
-        always leads back.
+        Every stiffness and damping that acts on a node is divided by what the load exceeds
+        `STABILITY_LIMIT` by, so that no value an optimiser can reach is unstable; a legal rope
+        stays as it is.
         """
-        share = self.stability_load() / STABILITY_LIMIT
-        knee = 0.8
-        excess = jnp.maximum(share - knee, 0.0) / (1.0 - knee)
-        legal = knee + (1.0 - knee) * excess / (1.0 + excess)
-        factor = legal / jnp.maximum(share, knee)
+        factor = 1.0 / jnp.maximum(self.stability_load() / STABILITY_LIMIT, 1.0)
 
         def weakest(count: int) -> Array:
             """The smallest factor of the nodes that each element acts on."""
@@ -380,9 +420,15 @@ class Rope(Model):
 
         Gravity, motion, stretch, bend and twist (seed 1: E_rope), minus the same of the rope
         hanging still, stretched by its own weight, from where the gripper is now: lowering the
-        gripper earns nothing.
+        gripper earns nothing. Raises `PalpateError` for a rope that is not held at its first end
+        alone: it has no such rest.
         """
-        head = state.position[..., self.driven[0], :]
+        if self.driven != (0,):
+            raise PalpateError(
+                "the energy above hanging rest is that of a rope driven at node 0 alone, "
+                f"this one is driven at {self.driven}"
+            )
+        head = state.position[..., 0, :]
         below = jnp.cumsum(self.node_mass[..., ::-1], axis=-1)[..., ::-1][..., 1:]
         tension = below * self.gravity[..., None]
         hanging_length = self.rest_length + tension / self.stretch_stiffness
@@ -400,9 +446,12 @@ class Rope(Model):
         """Energy of stretch, bend and twist, J."""
         edge = jnp.diff(position, axis=-2)
         length = jnp.linalg.norm(edge, axis=-1)
-        direction = edge / length[..., None]
+        direction = edge / self.rest_length[..., None]
         bend = jnp.diff(direction, axis=-2)
         binormal = jnp.cross(direction[..., 1:, :], bend)
+        rest_bend = self._rest_bend(position)
+        if rest_bend is not None:
+            bend = bend - rest_bend
         sine_squared = jnp.sum(jnp.square(binormal), axis=-1) + rope_kernel.TWIST_FADE
         triple = jnp.sum(direction[..., :-2, :] * binormal[..., 1:, :], axis=-1)
         stretch = self.stretch_stiffness * jnp.square(length - self.rest_length)

@@ -7,7 +7,7 @@ differentiated rollout, over a batch, and in a robot's control loop.
 from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -78,7 +78,7 @@ class CommandPolicy(Policy):
         rate_limit: float | None = None,
         width: int = 256,
         depth: int = 2,
-    ) -> Self:
+    ) -> "CommandPolicy":
         """An untrained policy that hardly acts, normalised by examples of what it will see.
 
         `period` is in s, `limit` in the action's unit and `rate_limit` in that per second; `depth`

@@ -63,7 +63,7 @@ class Curves:
 
 @dataclass(frozen=True)
 class Parameter:
-    """What was identified: `value` (elements,) in `unit`, NaN where nothing is known.
+    """What was identified: `value` (elements,) in `unit`, one if all elements share it.
 
     `lower` and `upper` (elements,) are the 90 % interval; NaN where there is none. `verdict` is a
     sentence about how far to trust it, or None.
@@ -172,7 +172,8 @@ def _arrays(path: Path) -> _Sections:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > _LARGEST:
-            raise PalpateError(f"it unpacks to {size / 2**20:.0f} MiB, at most 512 are read")
+            limit = f"at most {_LARGEST / 2**20:g} are read"
+            raise PalpateError(f"it unpacks to {size / 2**20:.0f} MiB, {limit}")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {key: np.asarray(archive[key]) for key in archive.files}
     except PalpateError as error:
@@ -284,6 +285,8 @@ def _rows(path: Path, document: dict[str, Any], key: str, read: Any) -> list[Any
 
 
 def _figure(row: dict[str, Any]) -> Figure:
+    if not (isinstance(row["name"], str) and isinstance(row["unit"], str)):
+        raise ValueError("'name' and 'unit' have to be texts")
     return Figure(**{item.name: row[item.name] for item in fields(Figure) if item.name in row})
 
 
@@ -295,14 +298,17 @@ def _parameter(row: dict[str, Any]) -> Parameter:
         if edge.size not in (1, value.size):
             raise ValueError(f"'{name}' has {edge.size} elements, 'value' {value.size}")
         edges[name] = np.broadcast_to(edge, value.shape)
+    fixed, shared = bool(row.get("fixed", False)), bool(row.get("shared", False))
+    if (fixed or shared) and value.size and np.ptp(value) == 0.0:  # one number, many times
+        value, edges = value[:1], {name: edge[:1] for name, edge in edges.items()}
     verdict = row.get("verdict")
     return Parameter(
         name=str(row["name"]),
         value=value,
         unit=str(row.get("unit", "")),
         about=str(row.get("about", "")),
-        fixed=bool(row.get("fixed", False)),
-        shared=bool(row.get("shared", False)),
+        fixed=fixed,
+        shared=shared,
         verdict=None if verdict is None else str(verdict),
         **edges,
     )

@@ -3,6 +3,7 @@
 What they show is what the page shows, in the same looks (`palpate.report.style`), on white.
 """
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.report.charts import quantiles
 from palpate.report.evidence import Curves, Motion
 from palpate.report.style import STYLES, Style, numbered
 from palpate.storage import write_bytes
@@ -18,9 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_NOTHING = "the motion holds nothing but gaps: there is nothing to draw"
 _INK, _QUIET, _RULE = "#1c2127", "#5b6570", "#dfe3e7"
 _FIGURES, _ANIMATIONS = (".png", ".svg"), (".webp", ".gif")
-_SETTINGS: dict[str, Any] = {
+_SETTINGS: Any = {
     "font.size": 9,
     "axes.edgecolor": _RULE,
     "axes.labelcolor": _INK,
@@ -55,15 +58,15 @@ def motion_figure(
         raise PalpateError("a motion figure needs at least one instant, in seconds")
     labels = [*motion.chains, *(energy.values if energy else ())]
     looks = {label: STYLES[index] for label, index in numbered(labels).items()}
+    frames = [int(np.argmin(np.abs(motion.time - instant))) for instant in instants]
     seen = {label: _in_plane(motion, chain) for label, chain in motion.chains.items()}
-    limits = _limits(seen.values())
-    panel = 1.7 * np.clip(np.ptp(limits[0]) / np.ptp(limits[1]), 0.5, 2.0)
-    widths = [panel] * len(instants) + [3.1] * (energy is not None)
+    limits = _limits(chain[frames] for chain in seen.values())
+    panel = 1.4 * np.clip(np.ptp(limits[0]) / np.ptp(limits[1]), 0.5, 2.0)
+    widths = [panel] * len(instants) + [2.8] * (energy is not None)
     with matplotlib.rc_context(_SETTINGS):
-        figure = Figure(figsize=(sum(widths) + 0.8, 2.7), dpi=200, layout="constrained")
+        figure = Figure(figsize=(sum(widths) + 0.8, 2.4), dpi=200, layout="constrained")
         axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
-        for ax, instant in zip(axes, instants, strict=False):
-            frame = int(np.argmin(np.abs(motion.time - instant)))
+        for ax, frame in zip(axes, frames, strict=False):
             for label, chain in seen.items():
                 _draw_chain(ax, chain[frame], looks[label], label)
             ax.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="m")
@@ -73,9 +76,9 @@ def motion_figure(
                 ax.set_ylabel("height (m)")
             else:
                 ax.set_yticklabels([])
-        _legend(figure, axes[0])
         if energy is not None:
             _draw_energy(axes[-1], energy, looks)
+        _legend(figure)
         _save(figure, out)
     return out
 
@@ -86,8 +89,6 @@ def motion_animation(out: str | Path, motion: Motion, rate: float = 20.0) -> Pat
     `out` is a `.webp` or `.gif`. It is what a machine without OpenGL shows in place of a rendered
     scene. Raises `PalpateError` for another suffix or a file that cannot be written.
     """
-    import io
-
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -96,25 +97,28 @@ def motion_animation(out: str | Path, motion: Motion, rate: float = 20.0) -> Pat
     out = _suffixed(out, _ANIMATIONS)
     looks = {label: STYLES[index] for label, index in numbered(motion.chains).items()}
     seen = {label: _from_above(chain) for label, chain in motion.chains.items()}
-    limits = _limits(seen.values())
+    floor = _floor(motion)
+    limits = _limits([*seen.values(), floor])
     times = np.arange(motion.time[0], motion.time[-1], 1.0 / rate)
     frames = np.abs(motion.time[:, None] - times).argmin(axis=0)
     pictures = []
     with matplotlib.rc_context(_SETTINGS):
-        figure = Figure(figsize=(4.8, 4.8), dpi=100)
+        height = 4.8 * np.clip(np.ptp(limits[1]) / np.ptp(limits[0]), 0.4, 1.6)
+        figure = Figure(figsize=(4.8, height + 0.4), dpi=100)
         canvas = FigureCanvasAgg(figure)
-        ax = figure.add_axes((0.03, 0.03, 0.94, 0.88))
+        ax = figure.add_axes((0.0, 0.0, 1.0, height / (height + 0.4)))
         ax.set(xlim=limits[0], ylim=limits[1], aspect="equal")
         ax.set_axis_off()
-        _draw_floor(ax, motion)
+        ax.plot(*floor.T, color=_RULE, lw=0.8, zorder=0)
         paths = {label: ax.plot([], [], color=looks[label].light, lw=1)[0] for label in seen}
         chains = {label: _draw_chain(ax, seen[label][0], looks[label], label) for label in seen}
-        _legend(figure, ax)
-        clock = ax.text(0.0, 0.0, "", transform=ax.transAxes, color=_QUIET)
+        _legend(figure)
+        clock = ax.text(0.02, 0.02, "", transform=ax.transAxes, color=_QUIET)
         for frame in frames:
             for label, chain in seen.items():
-                recent = slice(max(0, int(np.searchsorted(motion.time, motion.time[frame] - 1))),
-                               frame + 1)
+                recent = slice(
+                    max(0, int(np.searchsorted(motion.time, motion.time[frame] - 1))), frame + 1
+                )
                 paths[label].set_data(*chain[recent, -1].T)
                 line, end = chains[label]
                 line.set_data(*chain[frame].T)
@@ -145,7 +149,9 @@ def _in_plane(motion: Motion, chain: np.ndarray) -> np.ndarray:
     """(frames, points, 2): along the horizontal direction of the greatest spread, and height."""
     level = np.concatenate([c[..., :2].reshape(-1, 2) for c in motion.chains.values()])
     level = level[np.isfinite(level).all(axis=1)]
-    _, vectors = np.linalg.eigh(np.cov(level, rowvar=False))
+    if not len(level):
+        raise PalpateError(_NOTHING)
+    _, vectors = np.linalg.eigh(np.cov(level, rowvar=False, bias=True))
     along = vectors[:, -1] * np.sign(vectors[np.argmax(np.abs(vectors[:, -1])), -1])
     return np.stack([chain[..., :2] @ along, chain[..., 2]], axis=-1)
 
@@ -158,10 +164,26 @@ def _from_above(points: np.ndarray, yaw: float = -0.9, pitch: float = 0.28) -> n
     return np.stack([right, np.cos(pitch) * z + np.sin(pitch) * away], axis=-1)
 
 
+def _floor(motion: Motion) -> np.ndarray:
+    """The lines of a grid beneath the motion as `_from_above` shows it, NaN between them."""
+    every = np.concatenate([chain.reshape(-1, 3) for chain in motion.chains.values()])
+    every = every[np.isfinite(every).all(axis=1)]
+    if not len(every):
+        raise PalpateError(_NOTHING)
+    low, high = every.min(axis=0), every.max(axis=0)
+    reach = 0.3 * np.linalg.norm(high - low)
+    lines = []
+    for share in np.linspace(-1, 1, 7):
+        for ends in ([[share, -1], [share, 1]], [[-1, share], [1, share]]):
+            level = (low + high)[:2] / 2 + reach * np.array(ends)
+            lines += [*np.column_stack([level, [low[2]] * 2]), [np.nan] * 3]
+    return _from_above(np.array(lines))
+
+
 def _limits(seen: Any) -> tuple[tuple[float, float], tuple[float, float]]:
     every = np.concatenate([chain.reshape(-1, 2) for chain in seen])
     if not np.isfinite(every).any():
-        raise PalpateError("the motion holds nothing but gaps: there is nothing to draw")
+        raise PalpateError(_NOTHING)
     low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
     margin = 0.06 * max(*(high - low), 1e-3)
     (left, bottom), (right, top) = low - margin, high + margin
@@ -179,7 +201,7 @@ def _round_ticks(low: float, high: float) -> list[float]:
 
 def _draw_chain(ax: "Axes", points: np.ndarray, style: Style, label: str) -> tuple[Any, Any]:
     look = {"color": style.light, "lw": style.width * 0.75, "marker": style.marker}
-    look["linestyle"] = (0, tuple(d / max(style.width, 1) for d in style.dash)) or "-"
+    look["linestyle"] = _dashes(style)
     every = max(1, round(len(points) / 8))
     (line,) = ax.plot(*points.T, ms=3, markevery=(0, every), label=label, **look)
     (end,) = ax.plot(*points[-1:].T, ms=6, color=style.light, marker=style.marker)
@@ -189,15 +211,17 @@ def _draw_chain(ax: "Axes", points: np.ndarray, style: Style, label: str) -> tup
 def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
     for label, values in energy.values.items():
         style = looks[label]
-        low, median, high = np.nanquantile(np.maximum(values, 1e-9), (0.05, 0.5, 0.95), axis=0)
+        low, median, high = quantiles(np.maximum(values, 1e-9), (0.05, 0.5, 0.95))
         if len(values) > 1:
             ax.fill_between(energy.time, low, high, color=style.light, alpha=0.16, lw=0)
-        dash = (0, tuple(d / max(style.width, 1) for d in style.dash)) if style.dash else "-"
-        ax.plot(energy.time, median, color=style.light, lw=style.width * 0.75, ls=dash)
-        seen = np.flatnonzero(median > 3e-4)
-        at = seen[int(0.6 * len(seen))] if seen.size else 0
-        ax.annotate(label, (energy.time[at], median[at]), xytext=(4, 4), color=style.light,
-                    textcoords="offset points")
+        ax.plot(
+            energy.time,
+            median,
+            color=style.light,
+            lw=style.width * 0.75,
+            ls=_dashes(style),
+            label=label,
+        )
     ax.axhline(0.01, color=_INK, lw=0.8, ls=(0, (4, 3)))
     ax.set(yscale="log", ylim=(10**-4.2, None), xlabel="time (s)")
     ax.set_title("energy relative to the start", color=_INK)
@@ -205,22 +229,20 @@ def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
     ax.minorticks_off()
 
 
-def _draw_floor(ax: "Axes", motion: Motion) -> None:
-    every = np.concatenate([chain.reshape(-1, 3) for chain in motion.chains.values()])
-    low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
-    reach = max(high - low) / 2 * 1.1
-    middle = (low + high) / 2
-    for share in np.linspace(-1, 1, 7):
-        for ends in ([[share, -1], [share, 1]], [[-1, share], [1, share]]):
-            corners = middle[:2] + reach * np.array(ends)
-            level = np.column_stack([corners, [low[2]] * 2])
-            ax.plot(*_from_above(level).T, color=_RULE, lw=0.8, zorder=0)
+def _dashes(style: Style) -> Any:
+    """Matplotlib counts dashes in widths of the line."""
+    return (0, tuple(length / style.width for length in style.dash)) if style.dash else "-"
 
 
-def _legend(figure: "Figure", ax: "Axes") -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    if len(labels) > 1:
-        figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), frameon=False)
+def _legend(figure: "Figure") -> None:
+    """One legend for all panels, a label that stands in several shown once."""
+    handles = {}
+    for ax in figure.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    if len(handles) > 1:
+        place = {"loc": "outside upper left", "ncols": len(handles), "frameon": False}
+        figure.legend(handles.values(), handles.keys(), handlelength=3.5, **place)
 
 
 def _suffixed(out: str | Path, known: tuple[str, ...]) -> Path:
@@ -231,8 +253,6 @@ def _suffixed(out: str | Path, known: tuple[str, ...]) -> Path:
 
 
 def _save(figure: "Figure", out: Path) -> None:
-    import io
-
     buffer = io.BytesIO()
     stamp = {"Date": None} if out.suffix == ".svg" else {"Software": None}
     figure.savefig(buffer, format=out.suffix[1:], metadata=stamp)

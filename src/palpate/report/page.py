@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate.errors import PalpateError
 from palpate.report import charts
 from palpate.report.evidence import (
     RENDERINGS,
@@ -25,6 +26,7 @@ from palpate.report.evidence import (
     Parameter,
     read_evidence,
 )
+from palpate.report.parameter_chart import number, parameters
 from palpate.report.player import scene
 from palpate.report.style import STYLES, numbered
 from palpate.result import Figure
@@ -46,6 +48,8 @@ def build_report(
     Raises `PalpateError` when a folder holds no run, when a file in it is damaged, or when `out`
     cannot be written.
     """
+    if not runs:
+        raise PalpateError("a report needs at least one run: give the folder of one")
     found = [read_evidence(run) for run in runs]
     body = "".join(_header(found, title, notes))
     for index, (heading, content) in enumerate(_sections(found)):
@@ -70,12 +74,10 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
     for heading, part in parts:
         contents = [(e.name, part(e, look)) for e, look in zip(found, looks, strict=True)]
         contents = [(name, content) for name, content in contents if content]
-        several = len(contents) > 1
+        if len(contents) > 1:
+            contents = [(name, f"<h3>{_text(name)}</h3>{content}") for name, content in contents]
         if contents:
-            yield heading, "".join(
-                (f"<h3>{_text(name)}</h3>" if several else "") + content
-                for name, content in contents
-            )
+            yield heading, "".join(content for _, content in contents)
     yield "What was run", "".join(map(_provenance, found))
 
 
@@ -97,10 +99,9 @@ def _header(found: Sequence[Evidence], title: str, notes: Sequence[str]) -> Iter
     figures = [figure for evidence in found for figure in evidence.figures]
     verdicts = [figure.met for figure in figures if figure.met is not None]
     if verdicts:
-        yield (
-            f"<p><strong>{sum(verdicts)} of {len(verdicts)} bars met.</strong> "
-            "± is what other seeds are expected to change.</p>"
-        )
+        spread = any(figure.spread is not None for figure in figures)
+        yield f"<p><strong>{sum(verdicts)} of {len(verdicts)} bars met.</strong>"
+        yield " ± is what other seeds are expected to change.</p>" if spread else "</p>"
     yield "".join(f'<p class="note">{_text(note)}</p>' for note in notes) + "</header>\n"
 
 
@@ -153,7 +154,7 @@ def _tip(motion: Motion, looks: dict[str, int], height: int) -> str:
     caption = "where the object's last point is over time"
     observed = motion.chains.get(_OBSERVED)
     apart = [
-        f"{charts.number(_root_mean_square(chain[:, -1] - observed[:, -1]))} m ({label})"
+        f"{number(_root_mean_square(chain[:, -1] - observed[:, -1]))} m ({label})"
         for label, chain in motion.chains.items()
         if observed is not None and label != _OBSERVED
     ]
@@ -179,12 +180,13 @@ def _horizon(curves: Curves | None, looks: dict[str, int]) -> str:
 
 
 def _parameters(rows: Sequence[Parameter]) -> str:
+    rows = [row for row in rows if row.value.size]  # a model may have none of a kind
     if not rows:
         return ""
     free = sum(not row.fixed for row in rows)
     caption = f"{free} of {len(rows)} parameters were identified; a short whisker is one that the "
     caption += "data determine, a long or missing one is not to be trusted."
-    chart = charts.parameters(rows)
+    chart = parameters(rows)
     drawn = _chart(chart) if chart else ""
     cells = []
     for row in rows:
@@ -219,7 +221,7 @@ def _energy(curves: Curves | None, looks: dict[str, int]) -> str:
         return ""
     ends = []
     for label, values in curves.values.items():
-        median = np.nanmedian(values, axis=0) if np.isfinite(values).any() else values[0]
+        (median,) = charts.quantiles(values, (0.5,))
         above = np.flatnonzero(~(median < 0.01))
         stays = 0 if not above.size else above[-1] + 1
         if stays < len(curves.time):
@@ -318,10 +320,11 @@ def _number(value: float | int | str | None, missing: str = "none") -> str:
 
 
 def _elements(values: np.ndarray) -> str:
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    if math.isclose(low, high, rel_tol=5e-4):
-        return charts.number(low)
-    return f"{charts.number(low)} to {charts.number(high)}"
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (math.nan, math.nan)
+    if not known.size or math.isclose(low, high, rel_tol=5e-4):
+        return number(low)
+    return f"{number(low)} to {number(high)}"
 
 
 def _interval(row: Parameter) -> str:
@@ -330,7 +333,7 @@ def _interval(row: Parameter) -> str:
     if not known.any():
         return "–"
     if row.value.size == 1:
-        return f"{charts.number(row.lower[0])} to {charts.number(row.upper[0])}"
+        return f"{number(row.lower[0])} to {number(row.upper[0])}"
     value = row.value[known]
     sides = (np.median((edge[known] - value) / np.abs(value)) for edge in (row.lower, row.upper))
     return "typically " + " to ".join(f"{side:+.0%}" for side in sides).replace("-", "−")
@@ -345,4 +348,6 @@ def _pretty(value: Any) -> str:
 
 
 def _root_mean_square(difference: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(np.sum(difference**2, axis=-1))))
+    squares = np.sum(difference**2, axis=-1)
+    known = squares[np.isfinite(squares)]
+    return math.sqrt(known.mean()) if known.size else math.nan

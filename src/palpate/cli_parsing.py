@@ -1,0 +1,83 @@
+"""Words on a command line become a dataclass, or one sentence that says why they cannot."""
+
+import contextlib
+import io
+import itertools
+import re
+from typing import TypeVar
+
+import tyro
+
+from palpate.errors import PalpateError
+
+Options = TypeVar("Options")
+_TAKES = {
+    "INT": "a whole number",
+    "N": "a whole number",
+    "N ...": "whole numbers",
+    "FLOAT": "a number",
+    "NUMBER": "a number",
+}
+
+
+def parse(kind: type[Options], program: str, words: list[str]) -> Options | None:
+    """The options that `words` give; None when they asked for help, which is then printed.
+
+    Raises `PalpateError` for words that do not fit.
+    """
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(kind, prog=program, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as left:
+        if not left.code:
+            return None
+        raise PalpateError(sentence(said.getvalue(), program, words)) from left
+
+
+def sentence(box: str, program: str, words: list[str]) -> str:
+    """What tyro says in a box of several lines about `words`, as one sentence."""
+    lines = [line.strip("│╭╮╰╯─ ") for line in box.splitlines()]
+    _, *inside = [line for line in lines if line.strip("-")]  # a title, and rules between parts
+    text = " ".join(" ".join(inside).split())
+    for pattern, told in (
+        (r"Error parsing (--\S+): .* Argument helptext: \1 (.*?) [A-Z][a-z]", _wrong_value),
+        (r"Error parsing [A-Z]\w+: (.*?) For full helptext", _refused),
+        (r"Unrecognized options: ([^ ,]+)(?:.*? Perhaps you meant.*?: (--\S+))?", _unknown),
+        (r"invalid choice '(.*)' for argument '(--\S+)'. Expected one of \((.*?)\)", _no_choice),
+        (r"Missing value for argument '(--\S+)'", _no_value),
+        (r"Missing from .*?: (--\S+ \S+)", _missing),
+    ):
+        if match := re.match(pattern, text):
+            return told(match, words) + f"; `{program} --help` says what there is"
+    return text  # of another release of tyro: as it stands
+
+
+def _wrong_value(match: re.Match[str], words: list[str]) -> str:
+    option, takes = match.groups()
+    given = itertools.takewhile(
+        lambda word: not word.startswith("--"), words[words.index(option) + 1 :]
+    )
+    return f"{option} takes {_TAKES.get(takes, takes)}, not '{' '.join(given)}'"
+
+
+def _refused(match: re.Match[str], words: list[str]) -> str:
+    return match[1]
+
+
+def _unknown(match: re.Match[str], words: list[str]) -> str:
+    what = "option" if match[1].startswith("-") else "word"
+    return f"unknown {what} '{match[1]}'" + (f", did you mean '{match[2]}'?" if match[2] else "")
+
+
+def _no_choice(match: re.Match[str], words: list[str]) -> str:
+    choices = sorted(set(re.findall(r"'(.*?)'", match[3])) - {"None"})
+    return f"{match[2]} takes {', '.join(choices[:-1])} or {choices[-1]}, not '{match[1]}'"
+
+
+def _no_value(match: re.Match[str], words: list[str]) -> str:
+    return f"{match[1]} needs a value"
+
+
+def _missing(match: re.Match[str], words: list[str]) -> str:
+    return f"{match[1]} is missing"

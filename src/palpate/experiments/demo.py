@@ -1,0 +1,116 @@
+"""`palpate demo`: the whole loop once, small enough to watch.
+
+A rope is recorded, identified, a controller is trained through what was identified and tried in
+other ropes; the stages are the commands of the same names, each in a folder below the demo's.
+"""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from palpate.experiments import evaluate, folders, identify, record, train
+from palpate.experiments.options import Demo
+from palpate.experiments.rope_options import (
+    EvaluateRopeStabilization,
+    IdentifyRope,
+    RecordRope,
+    TrainRopeStabilization,
+)
+from palpate.report import build_report
+from palpate.result import Figure, Result, read_result
+from palpate.runs import RESULT
+from palpate.storage import read_json, write_json
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much work a demo is."""
+
+    trials: int = 6
+    duration: float = 5.0  # s of each
+    nodes: int = 11
+    substeps: int = 4
+    identification: tuple[int, ...] = (20, 20, 60)
+    training: int = 250  # gradient steps
+    batch: int = 64
+    starts: int = 2000
+    ropes: int = 3  # each from four poses
+    minutes: int = 5
+
+
+def run(options: Demo, size: Size = Size()) -> Path:
+    """All stages, what they found in three lines, one report; returns the folder.
+
+    A stage that is finished is not done again.
+    """
+    out = options.out or folders.RUNS / "demo"
+    print(f"demo: about {size.minutes} minutes on two cores, written to {out}", flush=True)
+    if options.fresh and out.is_dir():
+        folders.start_over(out)
+    began = time.monotonic()
+    seed = options.seed
+    recorded = RecordRope(out=out / "record", seed=seed, trials=size.trials, duration=size.duration)
+    recording = record.run(recorded)
+    identified = identify.run(
+        IdentifyRope(
+            recordings=(recording,),
+            out=out / "identify",
+            seed=seed,
+            mass=recorded.mass,
+            nodes=size.nodes,
+            substeps=size.substeps,
+            iterations=size.identification,
+        )
+    )
+    trained = train.run(
+        TrainRopeStabilization(
+            model=identified,
+            out=out / "train",
+            seed=seed,
+            iterations=size.training,
+            batch=size.batch,
+            starts=size.starts,
+        )
+    )
+    evaluated = evaluate.run(
+        EvaluateRopeStabilization(
+            policy=trained, out=out / "evaluate", seed=seed + 1, ropes=size.ropes
+        )
+    )
+    figures = _figures(identified, evaluated, recorded.length)
+    result = Result(
+        name="demo",
+        figures=figures,
+        settings=dataclasses.asdict(size),
+        seeds=[seed, seed + 1],
+        split={
+            "tip error": "motions of the recorded rope that were not fitted",
+            "time to 1 %": f"{size.ropes} other ropes from four poses each",
+        },
+        wall_time_s=time.monotonic() - began,
+    )
+    write_json(out / RESULT, result.to_dict())
+    stages = [recording.parent, identified, trained, evaluated]
+    build_report([out, *stages], out / folders.REPORT, "A rope, from recording to rest")
+    tip, success, periods, seconds, still = (figure.value for figure in figures)
+    print()
+    print(f"tip error {tip:.4f} m per metre of rope, {size.duration:g} s ahead, unseen motions")
+    if seconds is None:
+        print("time to 1 % energy: never; a longer training would help")
+    else:
+        print(f"time to 1 % energy {seconds:.2f} s, {periods:.2f} periods")
+    print(f"at rest in {success:.0%} of the trials; with the gripper held still in {still:.0%}")
+    print(f"report: {out / folders.REPORT}")
+    return out
+
+
+def _figures(identified: Path, evaluated: Path, length: float) -> list[Figure]:
+    tip = next(
+        figure["value"]
+        for figure in read_json(identified / RESULT)["figures"]
+        if figure["name"] == "tip_rmse_m"
+    )
+    known = {figure.name: figure for figure in read_result(evaluated / RESULT).figures}
+    names = ("success_rate", "time_to_1pct_periods", "time_to_1pct_s", "success_rate.held_still")
+    return [Figure("tip_rmse_per_length", tip / length, "m/m"), *(known[name] for name in names)]

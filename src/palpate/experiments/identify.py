@@ -1,0 +1,340 @@
+"""`palpate identify`: recordings in, a fitted model and how far to trust it out.
+
+Nothing here knows what was recorded: `options.prepare` and `options.start` do.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.experiments import folders
+from palpate.experiments.names import check_name
+from palpate.experiments.options import Identify
+from palpate.identification.gradient import Settings, check_shapes, identify
+from palpate.identification.least_squares import Intervals, intervals
+from palpate.identification.prediction import PredictionError, prediction_error
+from palpate.models.files import save_model
+from palpate.models.model import Model
+from palpate.parameters import (
+    FreeParameters,
+    declare,
+    describe,
+    format_value,
+    parameters_of,
+)
+from palpate.recording import Aligned, Recording, join
+from palpate.recording_files import read_recording
+from palpate.recording_markers import repair_markers
+from palpate.report import write_evidence
+from palpate.result import Figure, Result
+from palpate.runs import RESULT, Run
+from palpate.storage import read_json
+
+HELD_OUT = 0.25  # of the trials, where no recording for validation is given
+UNITS = {"m": (100.0, "cm")}  # a person reads these errors in another unit
+
+
+@dataclasses.dataclass(frozen=True)
+class Data:
+    """What there is to fit and to score: aligned trials, and the observation's unit."""
+
+    fitted: Recording
+    validation: Recording | None
+    fitted_aligned: Aligned
+    validation_aligned: Aligned
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Identified:
+    """A fitted model, its intervals, and its errors beside those of the model it started from."""
+
+    model: Model
+    intervals: Intervals
+    fit: PredictionError
+    validation: PredictionError
+    start: PredictionError
+
+
+def run(options: Identify) -> Path:
+    """Identify, print what a person wants to know, and return the folder everything is in.
+
+    Raises `PalpateError` for recordings, names and folders that cannot be used.
+    """
+    settings = _settings(options)
+    data = read(options)
+    start = with_declarations(
+        options.start(data.fitted_aligned), options.free, options.fixed, options.shared
+    )
+    check_shapes(start, data.fitted_aligned)
+    check_shapes(start, data.validation_aligned)
+    name = f"identify-{options.family}"
+    with folders.open_run(options, name, _configuration(options, settings), folders.MODEL) as run:
+        if not run.finished:
+            identified = fit(start, data, settings, run)
+            _write(run, name, options, data, identified)
+        result = read_json(run.path / RESULT)
+        _print(result)
+        title = f"What was found out about the {options.family}"
+        folders.hand_over(options, run, title, folders.MODEL, result["warnings"])
+        return run.path
+
+
+def read(options: Identify) -> Data:
+    """The recordings, prepared by the family, repaired where they are fitted, and split by trial.
+
+    What is scored is scored as it was recorded: only what is fitted is repaired.
+    """
+    if not options.recordings:
+        raise PalpateError("no recording is named: expected at least one .npz or .csv file")
+    raw = _read(options.recordings, options)
+    if options.validate:
+        fitted, validation = raw, _read(options.validate, options)
+    elif len(raw.trials) > 1:
+        fitted, validation = raw.split(HELD_OUT, options.seed)
+    else:
+        fitted, validation = raw, None
+    observation = options.observation
+    if fitted.trials[0][observation].values.ndim == 3:
+        fitted = repair_markers(fitted, observation)
+    for note in fitted.notes:
+        print(f"note: {note}")
+    fitted = options.prepare(fitted)
+    action = options.action(fitted)
+    period = _period(fitted, observation, options.rate)
+    aligned = fitted.align(period, observation, action)
+    if validation is None:
+        scored = aligned
+    else:
+        validation = options.prepare(validation)
+        scored = validation.align(period, observation, action)
+    unit = fitted.trials[0][observation].unit
+    return Data(fitted, validation, aligned, scored, unit)
+
+
+def with_declarations(
+    model: Model, free: tuple[str, ...], fixed: tuple[str, ...], shared: tuple[str, ...]
+) -> Model:
+    """The model with some parameters freed, fixed or shared by name.
+
+    Raises `PalpateError` for a name the model does not have, or one that is both free and fixed.
+    """
+    declared = parameters_of(model)
+    for name in (*free, *fixed, *shared):
+        check_name("parameter", name, declared)
+    if both := sorted(set(fixed) & {*free, *shared}):
+        raise PalpateError(f"'{both[0]}' cannot be fixed and identified at the same time")
+    changes: dict[str, dict[str, Any]] = {}
+    for names, change in (
+        (free, {"fixed": False}),
+        (fixed, {"fixed": True}),
+        (shared, {"shared": True}),
+    ):
+        for name in names:
+            changes.setdefault(name, {}).update(change)
+    return declare(model, **changes)
+
+
+def fit(start: Model, data: Data, settings: Settings, run: Run | None = None) -> Identified:
+    """Identify from `start`, and score the result on the trials held out."""
+    model = identify(start, data.fitted_aligned, settings, run)
+    coordinates = FreeParameters(model)
+    fitted = prediction_error(model, data.fitted_aligned)
+    held_out = data.validation is not None
+    return Identified(
+        model=model,
+        intervals=intervals(coordinates, coordinates.initial, data.fitted_aligned),
+        fit=fitted,
+        validation=prediction_error(model, data.validation_aligned) if held_out else fitted,
+        start=prediction_error(start, data.validation_aligned),
+    )
+
+
+def evidence(identified: Identified) -> dict[str, np.ndarray]:
+    """The errors over the horizon, and for a chain of points the median validation trial."""
+    error = identified.validation
+    arrays = {
+        "horizon.time": error.horizon,
+        "horizon.identified": error.rmse,
+        "horizon.start model": identified.start.rmse,
+    }
+    if is_chain(error):
+        each = np.sqrt(np.nanmean(chain_error(error) ** 2, axis=-1))
+        low, high = np.nanquantile(each, (0.1, 0.9), axis=0)
+        arrays |= {"horizon.identified.low": low, "horizon.identified.high": high}
+        trial = int(np.argsort(error.by_trial)[len(error.by_trial) // 2])
+        seen = np.asarray(error.windows.seen[trial])
+        arrays["motion.time"] = error.horizon
+        arrays["motion.observed"] = np.where(seen, error.windows.target[trial], np.nan)
+        arrays["motion.predicted"] = np.asarray(error.prediction[trial])
+    return arrays
+
+
+def is_chain(error: PredictionError) -> bool:
+    """Whether what is observed is points in space, the last of which is called the tip."""
+    return error.windows.target.ndim == 4 and error.windows.target.shape[-1] == 3
+
+
+def chain_error(error: PredictionError) -> np.ndarray:
+    """Distance (trials, times, points) of each point from where it was seen, NaN if it was not."""
+    apart = np.where(error.windows.seen, error.prediction - error.windows.target, np.nan)
+    return np.linalg.norm(apart, axis=-1)
+
+
+def rows(identified: Identified) -> list[dict[str, Any]]:
+    """The parameters for `result.json`: what `describe` says, with intervals and verdicts."""
+    found = identified.intervals
+    return [
+        row
+        | {
+            "lower": _listed(found.lower.get(row["name"])),
+            "upper": _listed(found.upper.get(row["name"])),
+            "verdict": found.verdict.get(row["name"]),
+        }
+        for row in describe(identified.model)
+    ]
+
+
+def _listed(value: Any) -> Any:
+    return None if value is None else np.asarray(value).tolist()
+
+
+def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
+    return join(
+        [
+            read_recording(path, rate=options.rate, unit=options.unit, up=options.up)
+            for path in paths
+        ]
+    )
+
+
+def _period(recording: Recording, observation: str, rate: float | None) -> float:
+    """The control period: that of the sensor, free of the last digits of its clock."""
+    if rate is not None:
+        return 1.0 / rate
+    periods = [trial[observation].nominal_period for trial in recording.trials]
+    return float(f"{np.median(periods):.5g}")
+
+
+def _settings(options: Identify) -> Settings:
+    settings = Settings(method=options.method, seed=options.seed)
+    if options.iterations:
+        settings = dataclasses.replace(settings, iterations=options.iterations)
+    return settings
+
+
+def _configuration(options: Identify, settings: Settings) -> dict[str, Any]:
+    return {
+        **folders.told(options, f"identify {options.family}"),
+        "recordings": [folders.fingerprint(path) for path in options.recordings],
+        "validate": [folders.fingerprint(path) for path in options.validate],
+        **dataclasses.asdict(settings),
+    }
+
+
+def _write(run: Run, name: str, options: Identify, data: Data, identified: Identified) -> None:
+    """The model, evidence and result into the run's folder; the result last."""
+    figures = _figures(identified, data, run.elapsed)
+    parameters = rows(identified)
+    save_model(
+        run.path / folders.MODEL,
+        identified.model,
+        {
+            "recordings": dict(data.fitted.provenance),
+            "figures": {figure.name: figure.value for figure in figures},
+            "parameters": [
+                {key: row[key] for key in ("name", "lower", "upper", "verdict")}
+                for row in parameters
+            ],
+        },
+    )
+    write_evidence(run.path, evidence(identified))
+    scored = data.validation_aligned
+    result = Result(
+        name=name,
+        figures=figures,
+        settings=run.configuration
+        | {
+            "scored_trials": len(scored.length),
+            "scored_duration_s": float(np.median(scored.length)) * scored.period,
+        },
+        seeds=[options.seed],
+        split={
+            "fitted": [trial.name for trial in data.fitted.trials],
+            "validation": [trial.name for trial in data.validation.trials]
+            if data.validation
+            else "none: the only trial was fitted, and the errors are those on it",
+        },
+        wall_time_s=run.elapsed,
+    )
+    warnings = list(identified.intervals.warnings)
+    run.finish(result.to_dict() | {"parameters": parameters, "warnings": warnings})
+
+
+def _figures(identified: Identified, data: Data, wall_time: float) -> list[Figure]:
+    scale, unit = UNITS.get(data.unit, (1.0, data.unit))
+
+    def last(error: PredictionError) -> float:
+        return float(error.rmse[-1]) * scale
+
+    figures = [
+        Figure(
+            f"l1_{unit}",
+            identified.validation.mean_absolute * scale,
+            unit,
+            rival=f"start model {identified.start.mean_absolute * scale:.3g} {unit}",
+        ),
+        Figure(
+            f"rmse_at_end_{unit}",
+            last(identified.validation),
+            unit,
+            rival=f"start model {last(identified.start):.3g} {unit}",
+        ),
+        Figure(f"l1_fitted_trials_{unit}", identified.fit.mean_absolute * scale, unit),
+        Figure("wall_time_s", wall_time, "s"),
+    ]
+    if is_chain(identified.validation):
+        miss = chain_error(identified.validation)[..., -1]
+        figures.append(Figure("tip_rmse_m", float(np.sqrt(np.nanmean(miss**2))), "m"))
+    return figures
+
+
+def _print(result: dict[str, Any]) -> None:
+    """Parameters, what the data cannot tell, and the error."""
+    free = [row for row in result["parameters"] if not row["fixed"]]
+    cells = [("parameter", "identified", "90 % interval", "")]
+    for row in free:
+        note = "one value for all elements" if row["shared"] and np.size(row["value"]) > 1 else ""
+        cells.append((row["name"], format_value(row["value"], row["unit"]), _interval(row), note))
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for line in cells:
+        print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
+    if fixed := [row["name"] for row in result["parameters"] if row["fixed"]]:
+        print(f"not identified: {', '.join(fixed)} (as given)")
+    for row in free:
+        if row["verdict"]:
+            print(f"warning: {row['name']}: {row['verdict']}")
+    for warning in result["warnings"]:
+        print(f"warning: {warning}")
+    error, settings = result["figures"][0], result["settings"]
+    on = "validation" if isinstance(result["split"]["validation"], list) else "the fitted trial"
+    count = settings["scored_trials"]
+    print(
+        f"mean absolute error (L1) {error['value']:.3f} {error['unit']} over "
+        f"{count} {'trial' if count == 1 else 'trials'} of "
+        f"{settings['scored_duration_s']:.3g} s ({on})"
+    )
+
+
+def _interval(row: dict[str, Any]) -> str:
+    """The interval of one value; of several, what is typical relative to their values."""
+    if str(row["verdict"]).startswith("not told by the data:"):
+        return "not told by the data"
+    value, low, high = (np.ravel(row[key]) for key in ("value", "lower", "upper"))
+    if low.size == 1 or (row["shared"] and np.ptp(low) <= 1e-6 * abs(low[0])):
+        return f"{low[0]:.3g} to {high[0]:.3g}"
+    below, above = (np.median((edge - value) / np.abs(value)) for edge in (low, high))
+    return f"typically {below:+.0%} to {above:+.0%}"

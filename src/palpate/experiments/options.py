@@ -1,0 +1,223 @@
+"""What each command can be told: frozen dataclasses that are its command line and configuration.
+
+Nothing here imports what computes, so that help is instant.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from tyro.conf import Positional, arg
+
+from palpate.errors import PalpateError
+
+if TYPE_CHECKING:
+    from palpate.models.model import Model
+    from palpate.networks import CommandPolicy
+    from palpate.recording import Aligned, Recording
+    from palpate.result import Figure
+    from palpate.runs import Run
+
+Number = Annotated[float | None, arg(metavar="NUMBER", help_behavior_hint="(default: none)")]
+Whole = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: as many as needed)")]
+Names = Annotated[tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="(default: none)")]
+Place = Annotated[
+    Path | None, arg(metavar="PATH", help_behavior_hint="(default: a folder below runs/)")
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What every command has."""
+
+    out: Place = None
+    """Where to write: a folder, or the file that is wanted."""
+    seed: int = 0
+    """Draws all randomness: the same seed gives the same result."""
+    fresh: bool = False
+    """Start over where an earlier run has left its work, instead of going on with it."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise PalpateError(f"a seed is a whole number, 0 or greater, not {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(Options, ABC):
+    """Recording from a simulated world; each family says in `record` how."""
+
+    family: ClassVar[str]
+
+    trials: int = 12
+    """Uninterrupted motions."""
+    duration: float = 5.0
+    """Seconds of each."""
+
+    @abstractmethod
+    def record(self) -> Recording:
+        """Run the world and keep what its sensors showed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identify(Options, ABC):
+    """Identification from recordings; each family says which channels, and from which model."""
+
+    family: ClassVar[str]
+    observation: ClassVar[str]  # the channel that is predicted
+
+    recordings: Positional[
+        Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
+    ]
+    """What to fit: .npz of palpate, .npz with `positions`, or .csv of a motion-capture system."""
+    validate: Annotated[
+        tuple[Path, ...],
+        arg(metavar="FILE ...", help_behavior_hint="(default: a quarter of the trials)"),
+    ] = ()
+    """Recordings to score on and not to fit."""
+    rate: Number = None
+    """Hz, for files that carry no time."""
+    unit: Annotated[
+        Literal["m", "cm", "mm"] | None,
+        arg(metavar="{m,cm,mm}", help_behavior_hint="(default: what the file says, else m)"),
+    ] = None
+    """Of positions."""
+    up: Annotated[
+        Literal["x", "y", "z"] | None,
+        arg(metavar="{x,y,z}", help_behavior_hint="(default: what the file says, else z)"),
+    ] = None
+    """The axis that points up."""
+    free: Names = ()
+    """Parameters to identify that otherwise would not be."""
+    fixed: Names = ()
+    """Parameters to leave as they are."""
+    shared: Names = ()
+    """Parameters to give one value for all elements."""
+    method: Literal["adam", "levenberg-marquardt"] = "adam"
+    """How to descend."""
+    iterations: Annotated[
+        tuple[int, ...], arg(metavar="N ...", help_behavior_hint="(default: as many as needed)")
+    ] = ()
+    """At each of the growing horizons; fewer are faster and fit worse."""
+
+    @abstractmethod
+    def prepare(self, recording: Recording) -> Recording:
+        """The recording with the channels that the model needs."""
+
+    @abstractmethod
+    def action(self, recording: Recording) -> str:
+        """The channel of a prepared recording that drives the model."""
+
+    @abstractmethod
+    def start(self, aligned: Aligned) -> Model:
+        """The model an identification starts from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Options, ABC):
+    """Training through an identified model; each task says in `prepare` how it needs the model."""
+
+    task: ClassVar[str]
+    action: ClassVar[str]  # what the policy's output is, for whoever reads its file
+
+    model: Annotated[Path, arg(metavar="MODEL")]
+    """What `palpate identify` wrote: its folder, or the model file in it."""
+    iterations: Whole = None
+    """Gradient steps; fewer are faster and train worse."""
+    batch: Whole = None
+    """Episodes in each of them."""
+    starts: Whole = None
+    """Start states to draw from."""
+    observation_noise: float = 0.0
+    """Standard deviation of what the policy will see, in the observation's unit."""
+
+    @abstractmethod
+    def prepare(self, model: Model) -> Model:
+        """The model as the task drives it."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found: figures, a table for a person, and how the trials were drawn."""
+
+    figures: list[Figure]
+    table: list[str]
+    settings: dict[str, Any]
+    split: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Options, ABC):
+    """A trained policy in a world; each task says in `evaluate` what is tried and counted."""
+
+    task: ClassVar[str]
+
+    policy: Annotated[Path, arg(metavar="POLICY")]
+    """What `palpate train` wrote: its folder, or the policy file in it."""
+    model: Annotated[Path | None, arg(metavar="MODEL", help_behavior_hint="(default: none)")] = None
+    """Try the policy in this identified model too, to compare."""
+
+    @abstractmethod
+    def prepare(self, model: Model) -> Model:
+        """The model as the task drives it."""
+
+    @abstractmethod
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """Try the policy in the world; leaves evidence and checkpoints in the run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Options):
+    """Write the page of one or several runs.
+
+    A run's page is RUN/report.html and opens without a network. Of a folder with runs in it, such
+    as that of `palpate demo`, one page tells all of them.
+
+    1. Of one run, finished or not:             palpate report runs/identify-rope-001
+    2. Of several, in the order to be told:     palpate report A B --out both.html
+    """
+
+    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN ...", help_behavior_hint="")]]
+    """Folders that other commands have written."""
+    title: Annotated[
+        str | None, arg(metavar="TEXT", help_behavior_hint="(default: the names of the runs)")
+    ] = None
+    """What the page is called."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Options):
+    """Record a simulated rope, identify it, train a controller through what was found, try it.
+
+    The controller is tried in other ropes than the one that was recorded, beside a gripper held
+    still. Everything is written to one folder, with one report. What was cut off goes on when the
+    command is given again.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce(Options):
+    """Repeat a headline experiment from nothing, and hold its figures against their bars.
+
+    It says first how long it takes, and goes on where it was cut off when it is called again.
+
+    1. In full:                                 palpate reproduce rope-model --out DIR
+    2. The same work at a smaller size:         palpate reproduce rope-model --quick
+    3. With motion capture of a real rope:      palpate reproduce rope-model --mocap FOLDER
+    4. Without training:                        palpate reproduce rope-stabilization
+                                                    --weights shipped
+    """
+
+    quick: bool = False
+    """At a smaller size, within five minutes."""
+    weights: Annotated[
+        Literal["trained", "shipped"] | None,
+        arg(metavar="{trained,shipped}", help_behavior_hint="(default: trained)"),
+    ] = None
+    """Train anew, or take what ships with palpate."""
+    mocap: Annotated[
+        Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: figures left out)")
+    ] = None
+    """With dlo1_train.npz and dlo1_eval.npz."""

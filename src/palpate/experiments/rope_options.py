@@ -1,0 +1,230 @@
+"""What the commands can be told about ropes, and what they then do."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from tyro.conf import arg
+
+from palpate.errors import PalpateError
+from palpate.experiments.options import (
+    Evaluate,
+    Evaluation,
+    Identify,
+    Number,
+    Record,
+    Train,
+)
+
+if TYPE_CHECKING:
+    from palpate.models.rope import Rope
+    from palpate.networks import CommandPolicy
+    from palpate.recording import Aligned, Recording
+    from palpate.runs import Run
+
+NOISE = 5e-4  # m, standard deviation of a marker's coordinate in the simulated world
+GRIP = "grip"  # the channel that is made of gripped markers
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordRope(Record):
+    """Record a simulated rope whose gripper moves at random, and then holds still.
+
+    The world is a MuJoCo cable. The file holds the markers as a camera sees them, the gripper's
+    position as its encoder shows it, and the velocity it was ordered.
+
+    1. The default rope, 1 m and 100 g:         palpate record rope --out R.npz
+    2. A heavier one, with fewer markers:       palpate record rope --mass 0.2 --markers 11
+    """
+
+    family: ClassVar[str] = "rope"
+
+    length: float = 1.0
+    """Of the rope, m."""
+    mass: float = 0.1
+    """Of the rope without tip mass, kg."""
+    tip_mass: float = 0.0
+    """A point at its end, kg."""
+    bending_stiffness: float = 1e-4
+    """E I, N m^2."""
+    joint_damping: float = 3e-3
+    """Against bending, N m s/rad at each of 40 joints."""
+    air_viscosity: float = 3e-3
+    """Effective viscosity of the air, Pa s."""
+    markers: int = 21
+    """Spread evenly, gripper and tip included."""
+    observation_noise: float = NOISE
+    """Standard deviation of a marker's coordinate, m."""
+
+    def record(self) -> Recording:
+        """Trials of smooth random motion and stillness, each from hanging."""
+        import numpy as np
+
+        from palpate.experiments.rope_recording import record_rope
+        from palpate.worlds.rope_configuration import RopeConfiguration
+
+        if self.trials < 1:
+            raise PalpateError(f"a recording has at least one trial, not {self.trials}")
+        constants = {field.name for field in dataclasses.fields(RopeConfiguration)}
+        told = {name: value for name, value in vars(self).items() if name in constants}
+        seeds = np.random.SeedSequence(self.seed).generate_state(self.trials)
+        return record_rope(RopeConfiguration(**told), seeds.tolist(), self.duration)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyRope(Identify):
+    """Identify a rope: stiffness, damping and drag from recorded markers.
+
+    A recording of `palpate record` says itself how the gripper moved. In any other, one or more
+    markers are gripped: their positions are given to the model and the others are predicted.
+
+    1. A recording of palpate:                  palpate identify rope R.npz
+    2. Motion capture, both ends gripped:       palpate identify rope train.npz
+                                                    --validate eval.npz
+                                                    --driven 0 1 -2 -1 --rate 100
+    3. A rope that was weighed, 120 g:          palpate identify rope R.npz --mass 0.12
+    4. One bending stiffness for all joints:    palpate identify rope R.npz
+                                                    --shared bend_stiffness
+    """
+
+    family: ClassVar[str] = "rope"
+    observation: ClassVar[str] = "markers"
+
+    driven: Annotated[
+        tuple[int, ...],
+        arg(metavar="N ...", help_behavior_hint="(default: the recorded gripper, else 0)"),
+    ] = ()
+    """Markers that are gripped; negative ones count from the end."""
+    mass: Number = None
+    """Of the whole rope, kg; unknown, a node has 4 g, and only what is found per mass counts."""
+    nodes: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: one for each marker)")
+    ] = None
+    """Of the model: at every marker, at every second one, and so on."""
+    substeps: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: of about 1 ms)")
+    ] = None
+    """Steps of the model in a control period; few are fast and bound the stiffness."""
+
+    def prepare(self, recording: Recording) -> Recording:
+        """Keep the markers that are nodes, and make those that are gripped a driven channel."""
+        from palpate.experiments.rope_recording import GRIPPER
+        from palpate.recording_markers import with_driven
+
+        recording = self._thinned(recording)
+        if self.driven or GRIPPER not in recording.trials[0].channels:
+            return with_driven(recording, self.driven or (0,), self.observation, GRIP)
+        return recording
+
+    def action(self, recording: Recording) -> str:
+        """The gripped markers where there are any, else the gripper that was recorded."""
+        from palpate.experiments.rope_recording import GRIPPER
+
+        return GRIP if GRIP in recording.trials[0].channels else GRIPPER
+
+    def start(self, aligned: Aligned) -> Rope:
+        """See `starting_rope`."""
+        from palpate.experiments.rope_recording import starting_rope
+        from palpate.recording import resolve_indices
+
+        driven = resolve_indices(self.driven or (0,), aligned.observation.shape[2], "marker")
+        rope = starting_rope(aligned, driven, self.mass)
+        if self.substeps is not None:
+            rope = dataclasses.replace(rope, substeps=self.substeps).constrain()
+        return rope
+
+    def _thinned(self, recording: Recording) -> Recording:
+        if self.nodes is None:
+            return recording
+        count = recording.trials[0][self.observation].values.shape[1]
+        every, rest = divmod(count - 1, max(self.nodes - 1, 1))
+        if rest or not every:
+            fitting = [n + 1 for n in range(3, count) if (count - 1) % n == 0]
+            raise PalpateError(
+                f"{self.nodes} nodes do not fall on {count} markers; "
+                f"{', '.join(map(str, fitting)) or 'no number of'} nodes do"
+            )
+        trials = []
+        for trial in recording.trials:
+            markers = trial[self.observation]
+            kept = dataclasses.replace(markers, values=markers.values[:, ::every], notes=())
+            channels = {**trial.channels, self.observation: kept}
+            trials.append(dataclasses.replace(trial, channels=channels))
+        return dataclasses.replace(recording, trials=tuple(trials))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRopeStabilization(Train):
+    """Train a controller that brings a swinging rope to rest by moving its gripper.
+
+    1. After `palpate identify rope R.npz`:     palpate train rope-stabilization
+                                                    --model runs/identify-rope-001
+    """
+
+    task: ClassVar[str] = "rope-stabilization"
+    action: ClassVar[str] = "gripper velocity, m/s"
+
+    observation_noise: float = NOISE
+    """Standard deviation of a marker's coordinate as the policy will see it, m."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRopeStabilization(Evaluate):
+    """Try a controller in MuJoCo ropes it was not trained for, from four start poses.
+
+    Beside it, in the same trials: a gripper held still, and a tuned swing damper.
+
+    1. After `palpate train`:                   palpate evaluate rope-stabilization
+                                                    --policy runs/train-rope-stabilization-001
+    """
+
+    task: ClassVar[str] = "rope-stabilization"
+
+    ropes: int = 10
+    """Drawn around the rope that `palpate record` has by default; each from four poses."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """See `rope_evaluation.evaluate`."""
+        from palpate.experiments import rope_evaluation
+        from palpate.experiments.rope_baselines import HeldStill, SwingDamper
+        from palpate.experiments.rope_recording import constants
+        from palpate.experiments.rope_trials import LearnedController
+        from palpate.tasks import RopeStabilization
+        from palpate.worlds.rope_configuration import RopeConfiguration
+
+        if self.ropes < 1:
+            raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
+        base = RopeConfiguration()
+        trials = rope_evaluation.evaluation_trials(base, self.ropes, self.seed)
+        controllers = {
+            "controlled": LearnedController(policy, RopeStabilization()),
+            "held still": HeldStill(),
+            "swing damper": SwingDamper(base),
+        }
+        evaluated = rope_evaluation.evaluate(controllers, trials, run)
+        rope_evaluation.write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
+        figures = []
+        for name, episodes in evaluated.items():
+            suffix = "" if name == "controlled" else f".{name.replace(' ', '_')}"
+            summary = rope_evaluation.summarise(trials, episodes)
+            figures += rope_evaluation.figures(summary, suffix)
+        return Evaluation(
+            figures=figures,
+            table=rope_evaluation.table(trials, evaluated),
+            settings={"trials": len(trials), **constants(base)},
+            split={"evaluated": f"{self.ropes} sampled ropes, seed {self.seed}"},
+        )
+
+
+def _driven_by_velocity(rope: Rope) -> Rope:
+    return dataclasses.replace(rope, drive="velocity")

@@ -1,0 +1,67 @@
+"""A policy and a model in closed loop."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PRNGKeyArray
+
+from palpate.models.model import Model
+from palpate.networks.policy import Policy
+from palpate.perception.velocity import VelocityEstimator
+from palpate.tasks.task import Start, Task
+
+
+def simulate(
+    task: Task,
+    models: Model,
+    policy: Policy,
+    start: Start,
+    steps: int,
+    key: PRNGKeyArray | None = None,
+    noise: float = 0.0,
+) -> tuple[Any, Array]:
+    """States after each of `steps` decisions in closed loop, and the actions: (batch, time, ...).
+
+    Without noise the policy sees the state. With it, the policy sees what a robot would: noisy
+    observations (standard deviation `noise`, in the observation's unit) and velocities estimated
+    from them.
+    """
+    key = jax.random.key(0) if key is None else key
+    estimator = VelocityEstimator(models.control_period)
+
+    def perceive(window: Array, state: Any, key: PRNGKeyArray) -> tuple[Array, Any]:
+        observed = models.observe(state)
+        observed = observed + noise * jax.random.normal(key, observed.shape, observed.dtype)
+        window, velocity = estimator.update(window, observed)
+        before = observed - models.control_period * velocity
+        return window, models.initial_state(jnp.stack([before, observed], axis=1))
+
+    def advance(loop: tuple[Any, Any, Array | None], index: Array) -> tuple[Any, Any]:
+        state, memory, window = loop
+        for_noise, for_policy = jax.random.split(jax.random.fold_in(key, index))
+        seen = state
+        if window is not None:
+            window, seen = perceive(window, state, for_noise)
+        memory, action = policy(memory, task.features(seen, start.goal), start.goal, for_policy)
+        state = models.step(state, action)
+        return (state, memory, window), (state, action)
+
+    window = None
+    if noise:
+        window = _past(models, start, estimator, noise, jax.random.fold_in(key, steps))
+    loop = start.state, policy.initial_carry(start.command), window
+    _, (states, actions) = jax.lax.scan(advance, loop, jnp.arange(steps))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (states, actions))
+
+
+def _past(
+    models: Model, start: Start, estimator: VelocityEstimator, noise: float, key: PRNGKeyArray
+) -> Array:
+    """What was seen before the first decision: the start's motion, continued backwards."""
+    observed = models.observe(start.state)
+    following = models.observe(models.step(start.state, start.command))
+    back = jnp.arange(-estimator.frames, 0, dtype=observed.dtype)
+    back = back.reshape(-1, *(1,) * observed.ndim)
+    window = observed + back * (following - observed)
+    return window + noise * jax.random.normal(key, window.shape, window.dtype)

@@ -1,0 +1,162 @@
+"""What was identified, as dots with whiskers; numbers with as many figures as mean something."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from palpate.report.charts import Chart, empty_layout, plain_text, titled_axis
+from palpate.report.evidence import Parameter
+
+_SURE, _FIXED, _UNSURE = "identified, 90 % interval", "fixed", "no interval"
+_SYMBOLS = {_SURE: "circle", _FIXED: "circle-open", _UNSURE: "x-thin-open"}
+_REACH = 10.0  # an interval that goes on beyond this factor is drawn to there, with an arrow
+_ARROWS = "triangle-left", "triangle-right"
+_TICKS = [0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0]
+_TICKS_OF_DECADES = [0.001, 0.01, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 100.0, 1000.0]
+_GAP = 15.0  # pixels above and below a parameter
+_COLOUR = "@series-1"
+
+
+class _Dot(NamedTuple):
+    """One element: its place and size in pixels, and its numbers relative to the median."""
+
+    kind: str
+    y: float
+    value: float
+    lower: float
+    upper: float
+    size: float
+    text: str
+
+
+def parameters(rows: Sequence[Parameter]) -> Chart | None:
+    """Dots with 90 % whiskers relative to each parameter's median, on a log axis; no unit.
+
+    A parameter of several elements has a dot for each, one under the other. Filled is what was
+    identified, hollow what was fixed, a cross what has no interval. Parameters that are not
+    positive have no place on the axis and are left to the table; None when there is no other.
+    """
+    drawn = [row for row in rows if row.value.size and np.all(row.value > 0)]
+    if not drawn:
+        return None
+    dots, ticks, top = [], [], 0.0
+    for row in drawn:
+        pitch = min(5.0, 110.0 / row.value.size)
+        ticks.append(top + _GAP + pitch * (row.value.size - 1) / 2)
+        dots += _dots(row, top + _GAP, pitch)
+        top = dots[-1].y + _GAP
+    least = min(dot.value for dot in dots) / _REACH
+    most = max(dot.value for dot in dots) * _REACH
+    intervals = [dot for dot in dots if dot.kind == _SURE]
+    shown = [(max(dot.lower, least), min(dot.upper, most)) for dot in intervals]
+    data = [_whiskers([(dot.y, *ends) for dot, ends in zip(intervals, shown, strict=True)])]
+    for kind, symbol in _SYMBOLS.items():
+        chosen = [(dot.value, dot.y, dot.size, dot.text) for dot in dots if dot.kind == kind]
+        if chosen:
+            data.append(_markers(kind, symbol, chosen, legend=True))
+    for side, symbol in enumerate(_ARROWS):
+        beyond = [
+            (ends[side], dot.y, dot.size, "the interval goes on")
+            for dot, ends in zip(intervals, shown, strict=True)
+            if ends[side] != (dot.lower, dot.upper)[side]
+        ]
+        if beyond:
+            data.append(_markers("beyond", symbol, beyond, legend=False))
+    limits = [0.8, 1.25, *(dot.value for dot in dots), *(end for ends in shown for end in ends)]
+    return {"data": data, "layout": _layout(drawn, ticks, top, min(limits), max(limits))}
+
+
+def number(value: float) -> str:
+    """To three figures, or all digits before the point: "1430", "0.0123", "2.2×10⁻⁴"."""
+    if math.isnan(value):
+        return "unknown"
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        digits = max(3, math.floor(math.log10(abs(value) or 1)) + 1)
+        text = np.format_float_positional(value, precision=digits, fractional=False, trim="-")
+    else:
+        mantissa, exponent = f"{value:.2e}".split("e")
+        text = f"{float(mantissa):g}×10{str(int(exponent)).translate(_RAISED)}"
+    return text.replace("-", "−")
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _dots(row: Parameter, top: float, pitch: float) -> Iterator[_Dot]:
+    middle = float(np.median(row.value))
+    for index, (value, lower, upper) in enumerate(
+        zip(row.value, row.lower, row.upper, strict=True)
+    ):
+        known = math.isfinite(upper - lower)
+        kind = _FIXED if row.fixed else _SURE if known else _UNSURE
+        element = f"[{index}]" if row.value.size > 1 else ""
+        text = f"{row.name}{element} = {number(value)} {row.unit}"
+        text += f" ({number(lower)} to {number(upper)})" if kind == _SURE else ""
+        yield _Dot(
+            kind=kind,
+            y=top + pitch * index,
+            value=float(value) / middle,
+            lower=float(lower) / middle,
+            upper=float(upper) / middle,
+            size=8.0 if row.value.size == 1 else max(3.0, pitch + 1.0),
+            text=plain_text(text),
+        )
+
+
+def _whiskers(intervals: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "x": [x for _, lower, upper in intervals for x in (lower, upper, None)],
+        "y": [y for top, _, _ in intervals for y in (-top, -top, None)],
+        "line": {"color": _COLOUR, "width": 2},
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
+
+
+def _markers(
+    name: str, symbol: str, dots: Sequence[tuple[float, float, float, str]], legend: bool
+) -> dict[str, Any]:
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": name,
+        "x": [x for x, _, _, _ in dots],
+        "y": [-y for _, y, _, _ in dots],
+        "text": [text for _, _, _, text in dots],
+        "marker": {
+            "symbol": symbol,
+            "size": [size for _, _, size, _ in dots],
+            "opacity": 1,
+            "color": _COLOUR,
+            "line": {"color": _COLOUR, "width": 1.5},
+        },
+        "hovertemplate": "%{text}<extra></extra>",
+        "showlegend": legend,
+        "cliponaxis": False,
+    }
+
+
+def _layout(
+    rows: Sequence[Parameter], ticks: Sequence[float], height: float, low: float, high: float
+) -> dict[str, Any]:
+    layout = empty_layout(round(height) + 110, left=10) | {"hovermode": "closest"}
+    along = _TICKS if high / low < 4 else _TICKS_OF_DECADES
+    layout["xaxis"] = titled_axis("value / its median (1)") | {
+        "type": "log",
+        "range": [math.log10(low / 1.15), math.log10(high * 1.15)],
+        "tickvals": along,
+        "ticktext": [f"{tick:g}×" for tick in along],
+        "tickangle": 0,
+    }
+    layout["yaxis"] = titled_axis("") | {
+        "tickvals": [-tick for tick in ticks],
+        "ticktext": [plain_text(row.name.replace("_", " ")) for row in rows],
+        "range": [-height, 0],
+        "automargin": True,
+        "showgrid": False,
+    }
+    return layout

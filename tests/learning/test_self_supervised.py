@@ -1,0 +1,157 @@
+"""Self-supervised training on a cart and a pendulum: it works, it resumes, it gives up in words."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.learning import Training, manifest, simulate, train
+from palpate.networks.policy import CommandPolicy
+from palpate.parameters import randomise
+from palpate.runs import Run
+from palpate.storage import plain
+from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
+
+CART, PENDULUM = Cart(1.0, 0.5), Pendulum(1.0, 0.2)
+SMALL = {"batch": 32, "starts": 256, "width": 16, "learning_rate": 3e-3}
+
+
+class Counting(CartToOrigin):
+    """Notes the length of every episode whose loss is traced."""
+
+    traced: ClassVar[list[int]] = []
+
+    def loss(self, models, start, states, actions):
+        self.traced.append(actions.shape[1])
+        return super().loss(models, start, states, actions)
+
+
+class Broken(CartToOrigin):
+    """Has a loss without finite gradient."""
+
+    def loss(self, models, start, states, actions):
+        return jnp.nan * super().loss(models, start, states, actions)
+
+
+def success(task, model, policy: CommandPolicy, noise: float = 0.0) -> float:
+    start = task.starts(model, jax.random.key(9), 200)
+    models = randomise(model, jax.random.key(8), 1.0, 200)
+    steps = round(1.5 * task.duration / model.control_period)
+    states, actions = simulate(task, models, policy, start, steps, jax.random.key(7), noise)
+    return float(task.outcome(models, start, states, actions)["success"].mean())
+
+
+def logged(folder: Path, task, training: Training, seed: int = 0):
+    with Run.open(folder, plain(training)) as run:
+        policy = train(task, CART, training, seed, run)
+        return policy, run.metrics()
+
+
+def same(a: CommandPolicy, b: CommandPolicy) -> bool:
+    return bool(eqx.tree_equal(eqx.filter(a, eqx.is_array), eqx.filter(b, eqx.is_array)))
+
+
+@pytest.mark.parametrize(
+    ("task", "model"), [(CartToOrigin(), CART), (PendulumDamping(), PENDULUM)], ids=["cart", "pen"]
+)
+def test_learns_to_control_what_it_was_not_told_about(task, model) -> None:
+    untrained = train(task, model, Training(iterations=1, **SMALL), 0)
+    policy = train(task, model, Training(iterations=150, **SMALL), 0)
+    assert success(task, model, untrained) < 0.3
+    assert success(task, model, policy) > 0.97
+
+
+def test_learns_from_noisy_observations() -> None:
+    training = Training(iterations=100, observation_noise=1e-3, **SMALL)
+    policy = train(CartToOrigin(), CART, training, 0)
+    assert success(CartToOrigin(), CART, policy, noise=1e-3) > 0.9
+
+
+def test_one_compilation_per_stage(tmp_path) -> None:
+    Counting.traced.clear()
+    training = Training(iterations=12, stages=(0.25, 0.5, 1.0), **SMALL)
+    _, lines = logged(tmp_path, Counting(), training)
+    assert Counting.traced == [15, 30, 60]
+    assert [line["horizon"] for line in lines] == [15] * 4 + [30] * 4 + [60] * 4
+
+
+def test_switches_of_the_curricula(tmp_path) -> None:
+    _, on = logged(tmp_path / "on", CartToOrigin(), Training(iterations=10, **SMALL))
+    amplitudes = [line["amplitude"] for line in on]
+    assert amplitudes == sorted(amplitudes)
+    assert amplitudes[0] < 0.5 < amplitudes[-1] == 1.0
+    off = Training(iterations=3, horizon_curriculum=False, noise_curriculum=False, **SMALL)
+    _, lines = logged(tmp_path / "off", CartToOrigin(), off)
+    assert {(line["horizon"], line["amplitude"]) for line in lines} == {(60, 1.0)}
+    none = Training(iterations=3, randomisation=False, augmentation=False, **SMALL)
+    _, lines = logged(tmp_path / "none", CartToOrigin(), none)
+    assert {line["amplitude"] for line in lines} == {0.0}
+
+
+def test_gives_up_without_finite_gradients(tmp_path) -> None:
+    with pytest.raises(PalpateError, match="not finite in 20 iterations in a row"):
+        logged(tmp_path, Broken(), Training(iterations=40, **SMALL))
+
+
+CHILD = """
+import os, signal, sys
+from pathlib import Path
+from palpate.runs import Run
+import test_self_supervised as here
+
+class Killed(Run):
+    def log(self, step, /, **metrics):
+        super().log(step, **metrics)
+        if step == 17:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+here.Run = Killed
+here.logged(Path(sys.argv[1]), here.CartToOrigin(), here.INTERRUPTED)
+"""
+INTERRUPTED = Training(iterations=24, checkpoint_every=5, **SMALL)
+
+
+def test_killed_training_resumes_to_the_same_weights(tmp_path) -> None:
+    whole, lines = logged(tmp_path / "whole", CartToOrigin(), INTERRUPTED)
+    here = Path(__file__).parent
+    paths = [str(here), str(here.parent), *sys.path]
+    child = subprocess.run(
+        [sys.executable, "-c", CHILD, str(tmp_path / "cut")],
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert child.returncode == -signal.SIGKILL, child.stderr
+    resumed, again = logged(tmp_path / "cut", CartToOrigin(), INTERRUPTED)
+    assert same(whole, resumed)
+    for line in (*lines, *again):
+        del line["time"]
+    assert lines == again
+
+
+def test_seed_decides() -> None:
+    training = Training(iterations=2, **SMALL)
+    first, again = (train(CartToOrigin(), CART, training, 0) for _ in range(2))
+    other = train(CartToOrigin(), CART, training, 1)
+    assert same(first, again)
+    assert not same(first, other)
+
+
+def test_manifest_says_what_the_policy_was_trained_on() -> None:
+    said = plain(manifest(CartToOrigin(), CART, Training(**SMALL), 3))
+    assert said["task"] == "cart-to-origin"
+    assert said["features"]["velocity"] == "(1,) m/s"
+    assert said["model"]["parameters"][0]["unit"] == "kg"
+    assert said["training"]["batch"] == 32
+    np.testing.assert_equal(said["seed"], 3)

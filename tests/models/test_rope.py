@@ -1,0 +1,255 @@
+"""The rope as a model: drives, energy, symmetries, and what it refuses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.models.model import rollout
+from palpate.models.rope import Rope, RopeState
+from rope_states import at_rest, bent, hanging, still
+
+NODES = 6
+PERIODS = 40
+run = jax.jit(rollout)
+energy = jax.jit(lambda rope, state: rope.energy(state))
+
+
+def rope(**settings) -> Rope:
+    return Rope.uniform(length=0.5, mass=0.06, nodes=NODES, **settings)
+
+
+def moving(rope, seed=0) -> RopeState:
+    rng = np.random.default_rng(seed)
+    return RopeState(bent(rope, rng, 0.4, 0.02), jnp.asarray(rng.normal(size=(rope.nodes, 3))))
+
+
+def shaken(rope, seed=1) -> jnp.ndarray:
+    """Gripper velocities (m/s) of a smooth random motion, (PERIODS, driven, 3)."""
+    rng = np.random.default_rng(seed)
+    time = rope.control_period * np.arange(1, PERIODS + 1)[:, None, None]
+    phase = rng.uniform(0, 2 * np.pi, rope.action_shape)
+    return jnp.asarray(np.sin(2 * np.pi * 1.5 * time + phase) - np.sin(phase))
+
+
+# Drives
+
+
+def test_driven_by_position_the_gripper_is_where_told_at_the_end_of_each_period(float64):
+    held = rope(drive="position", driven=(0, NODES - 1))
+    state = moving(held)
+    targets = state.position[jnp.asarray(held.driven)] + 0.02 * shaken(held)
+    states = run(held, state, targets)
+    np.testing.assert_allclose(states.position[:, [0, -1]], targets, atol=1e-14)
+    moved = jnp.diff(targets, axis=0) / held.control_period
+    np.testing.assert_allclose(states.velocity[1:, [0, -1]], moved, atol=1e-11)
+
+
+def test_driven_by_velocity_the_gripper_has_the_velocity_told_and_got_there_evenly(float64):
+    held = rope()
+    state, velocity = moving(held), shaken(held)
+    states = run(held, state, velocity)
+    np.testing.assert_allclose(states.velocity[:, :1], velocity, atol=1e-14)
+    before = jnp.concatenate([state.velocity[None, :1], velocity[:-1]])
+    # constant acceleration: the mean velocity, up to the half time step of symplectic Euler
+    path = (before + velocity) / 2 + (velocity - before) / (2 * held.substeps)
+    expected = state.position[0] + held.control_period * jnp.cumsum(path, axis=0)[:, 0]
+    np.testing.assert_allclose(states.position[:, 0], expected, atol=1e-13)
+
+
+def test_driven_by_acceleration_the_gripper_gains_it(float64):
+    held = rope(drive="acceleration")
+    state, acceleration = moving(held), 5 * shaken(held)
+    states = run(held, state, acceleration)
+    gained = held.control_period * jnp.cumsum(acceleration, axis=0)
+    np.testing.assert_allclose(states.velocity[:, :1], state.velocity[:1] + gained, atol=1e-13)
+
+
+def test_the_three_drives_agree_when_they_are_told_the_same(float64):
+    by_velocity = rope()
+    state, velocity = moving(by_velocity), shaken(by_velocity)
+    states = run(by_velocity, state, velocity)
+    before = jnp.concatenate([state.velocity[None, :1], velocity[:-1]])
+    acceleration = (velocity - before) / by_velocity.control_period
+    by_acceleration = run(rope(drive="acceleration"), state, acceleration)
+    np.testing.assert_allclose(by_acceleration.position, states.position, atol=1e-12)
+    # by position it moves at constant velocity within a period: near, not equal
+    by_position = run(rope(drive="position"), state, states.position[:, :1])
+    np.testing.assert_allclose(by_position.position[:, 0], states.position[:, 0], atol=1e-14)
+    assert 1e-6 < float(jnp.abs(by_position.position - states.position).max()) < 5e-3
+
+
+def test_forces_do_not_move_a_gripper_and_a_gripper_moves_the_rope():
+    held = rope()
+    states = run(held, moving(held), still(held, PERIODS))
+    np.testing.assert_array_equal(states.position[:, 0], states.position[:1, 0].repeat(PERIODS, 0))
+    resting = at_rest(jnp.asarray(hanging(held), jnp.float32))
+    pulled = run(held, resting, jnp.asarray(shaken(held), jnp.float32))
+    assert float(jnp.abs(pulled.position[:, -1, :2]).max()) > 0.01
+
+
+# Energy
+
+
+def test_hanging_at_rest_has_no_energy_and_everything_else_has(float64):
+    held = rope(bend_stiffness=0.02, twist_stiffness=1e-3)
+    resting = at_rest(hanging(held))
+    assert float(energy(held, resting)) == pytest.approx(0.0, abs=1e-14)
+    gradient = jax.grad(lambda position: held.energy(at_rest(position)))(resting.position)
+    np.testing.assert_allclose(gradient[1:], 0, atol=1e-12)  # an equilibrium
+    rng = np.random.default_rng(0)
+    for bending, stretching, speed in ((0.01, 0, 0), (0.5, 0, 0), (2, 0.2, 0), (0, 0, 0.1)):
+        position = bent(held, rng, bending, stretching) if bending else resting.position
+        velocity = jnp.asarray(speed * rng.normal(size=position.shape))
+        assert float(energy(held, RopeState(position, velocity))) > 1e-9
+
+
+def test_energy_counts_motion_height_and_bending_as_the_seed_does(float64):
+    held = rope(stretch_stiffness=800.0, bend_stiffness=0.02, twist_stiffness=0.0)
+    resting = jnp.asarray(hanging(held))
+    velocity = jnp.full((NODES, 3), 2.0)
+    assert float(energy(held, RopeState(resting, velocity))) == pytest.approx(0.5 * 0.06 * 12)
+    # horizontal and unstretched: five nodes of 10 g at the gripper's height
+    across = bent(held, np.random.default_rng(0), 0.0) @ jnp.asarray(
+        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]
+    )
+    lifted = -np.sum(0.01 * 9.81 * hanging(held)[1:, 2])
+    tension = 0.01 * 9.81 * np.arange(5, 0, -1)
+    stored = np.sum(tension**2) / 800 / 2
+    assert float(energy(held, at_rest(across))) == pytest.approx(lifted - stored)
+    corner = across.at[3:].add(across[2] - across[3]).at[3:, 2].add(-0.1 * jnp.arange(1, 4))
+    corner = corner.at[3:, 1].set(across[2, 1])
+    difference = float(held.elastic_energy(corner) - held.elastic_energy(across))
+    assert difference == pytest.approx(0.02)  # k (1 - cos 90 degrees)
+
+
+def test_carrying_the_rope_elsewhere_changes_no_energy_and_lowering_it_earns_nothing(float64):
+    held = rope()
+    state = moving(held)
+    before = float(energy(held, state))
+    for shift in ([1.0, -2.0, 0.0], [0.0, 0.0, -3.0]):
+        shifted = RopeState(state.position + jnp.asarray(shift), state.velocity)
+        assert float(energy(held, shifted)) == pytest.approx(before, abs=1e-12)
+    lowered = run(held, at_rest(hanging(held)), jnp.tile(jnp.asarray([0, 0, -0.5]), (40, 1, 1)))
+    assert float(lowered.position[-1, 0, 2]) < -0.19
+    assert float(jnp.min(energy(held, lowered))) > -1e-12
+
+
+def test_energy_of_a_batch_is_that_of_its_members():
+    held = rope()
+    states = run(held, moving(held), jnp.asarray(shaken(held), jnp.float32))
+    together = energy(held, states)
+    assert together.shape == (PERIODS,)
+    alone = energy(held, jax.tree.map(lambda leaf: leaf[7], states))
+    assert float(together[7]) == pytest.approx(float(alone), rel=1e-5)
+    doubled = jax.tree.map(lambda leaf: jnp.stack([leaf] * PERIODS), held)
+    np.testing.assert_allclose(energy(doubled, states), together, rtol=1e-5)
+
+
+# Symmetries used to multiply training states
+
+ANGLE = 1.1
+ROTATION = np.array(
+    [[np.cos(ANGLE), -np.sin(ANGLE), 0], [np.sin(ANGLE), np.cos(ANGLE), 0], [0, 0, 1]]
+)
+MIRROR = np.diag([1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize("drive", ["velocity", "position"])
+@pytest.mark.parametrize(
+    ("turn", "shift"),
+    [(ROTATION, [0.0] * 3), (MIRROR, [0.0] * 3), (np.eye(3), [0.3, -2.0, 5.0])],
+    ids=["rotation about z", "mirror", "translation"],
+)
+def test_turned_mirrored_or_shifted_the_same_happens(turn, shift, drive, float64):
+    held = rope(drive=drive, twist_stiffness=0.05)
+    turn, shift = jnp.asarray(turn), jnp.asarray(shift)
+    state, actions = moving(held), shaken(held)
+    if drive == "position":
+        actions = state.position[:1] + 0.05 * actions
+    states = run(held, state, actions)
+    start = RopeState(state.position @ turn.T + shift, state.velocity @ turn.T)
+    turned = run(held, start, actions @ turn.T + (shift if drive == "position" else 0.0))
+    np.testing.assert_allclose(turned.position, states.position @ turn.T + shift, atol=1e-9)
+    np.testing.assert_allclose(turned.velocity, states.velocity @ turn.T, atol=1e-7)
+
+
+def test_tilting_is_no_symmetry_because_of_gravity(float64):
+    held = rope()
+    state, actions = moving(held), shaken(held)
+    tilt = jnp.asarray([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    states = run(held, state, actions)
+    turned = run(
+        held, RopeState(state.position @ tilt.T, state.velocity @ tilt.T), actions @ tilt.T
+    )
+    assert float(jnp.abs(turned.position - states.position @ tilt.T).max()) > 0.05
+
+
+# Construction
+
+
+def test_a_rope_has_the_parameters_of_the_seed():
+    made = Rope.uniform(length=2.0, mass=0.3, nodes=21)
+    elements = {
+        "rest_length": 20, "stretch_stiffness": 20, "stretch_damping": 20,
+        "bend_stiffness": 19, "bend_damping": 19, "twist_stiffness": 18,
+    }  # fmt: skip
+    for name, count in elements.items():
+        assert getattr(made, name).shape == (count,)
+    assert float(made.rest_length.sum()) == pytest.approx(2.0)
+    assert float(made.node_mass.sum()) == pytest.approx(0.3)
+    assert made.action_shape == (1, 3)
+    assert made.observation_shape == (21, 3)
+    assert made.time_step == pytest.approx(1e-3)
+    own = Rope.from_rest_lengths(np.linspace(0.05, 0.1, 5), 0.1, bend_stiffness=np.arange(1, 5.0))
+    np.testing.assert_allclose(own.rest_length, np.linspace(0.05, 0.1, 5), rtol=1e-6)
+    assert float(own.bend_stiffness[0]) < float(own.bend_stiffness[-1])
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Rope.uniform(nodes=3), "a rope needs at least 4 nodes, got 3"),
+        (lambda: Rope.uniform(nodes=1), "a rope needs at least 4 nodes, got 1"),
+        (
+            lambda: rope(bend_stiffness=np.ones(2)),
+            "bend_stiffness of a rope of 6 nodes must have 4 elements, got shape (2,)",
+        ),
+        (
+            lambda: rope(driven=(0, 6)),
+            "driven nodes must lie in 0 to 5 and be at least one, got (0, 6)",
+        ),
+        (lambda: rope(driven=()), "driven nodes must lie in 0 to 5 and be at least one, got ()"),
+        (
+            lambda: rope(driven=(-1,)),
+            "driven nodes must lie in 0 to 5 and be at least one, got (-1,)",
+        ),
+        (lambda: rope(driven=(0, 0)), "driven nodes must differ from each other, got (0, 0)"),
+        (
+            lambda: rope(substeps=0),
+            "a rope needs at least one time step in a positive control period, got 0 in 0.01 s",
+        ),
+        (
+            lambda: Rope.from_rest_lengths(np.array([0.1, 0.0, 0.1]), 0.1),
+            "rest lengths must be positive, got [0.1 0.  0.1]",
+        ),
+        (
+            lambda: Rope.uniform(length=float("nan"), nodes=4),
+            "rest lengths must be positive, got [nan nan nan]",
+        ),
+        (lambda: Rope.uniform(mass=0.0), "the mass of a rope must be positive, got 0.0"),
+    ],
+)
+def test_a_rope_that_cannot_be_is_refused_with_a_sentence(make, text):
+    with pytest.raises(PalpateError) as error:
+        make()
+    assert str(error.value) == text
+
+
+def test_an_unknown_drive_is_refused_where_types_are_not_checked():
+    made = rope()
+    object.__setattr__(made, "drive", "force")  # what the type check of these tests would stop
+    with pytest.raises(PalpateError) as error:
+        made.__check_init__()
+    assert str(error.value) == "unknown drive 'force'; there are: position, velocity, acceleration"

@@ -1,0 +1,106 @@
+"""The policy network: limits, batches, gradients, and the file it is kept in."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.networks.policy import CommandPolicy, load_policy, save_policy
+from palpate.storage import save_arrays
+
+LIMIT, RATE, PERIOD = 1.5, 10.0, 0.01
+
+
+def policy(rate_limit: float | None = RATE, gain: float = 1.0) -> CommandPolicy:
+    key, examples = jax.random.split(jax.random.key(0))
+    made = CommandPolicy.create(
+        key,
+        3.0 + 2.0 * jax.random.normal(examples, (500, 5)),
+        (2, 3),
+        period=PERIOD,
+        limit=LIMIT,
+        rate_limit=rate_limit,
+        width=16,
+    )
+    last = lambda p: p.network.layers[-1].weight  # noqa: E731
+    return eqx.tree_at(last, made, replace_fn=lambda weight: gain * weight)
+
+
+def drive(pilot: CommandPolicy, steps: int) -> np.ndarray:
+    observation = jnp.linspace(-1.0, 7.0, 5)
+    carry, commands = pilot.initial_carry(jnp.zeros((2, 3))), []
+    for _ in range(steps):
+        carry, command = pilot(carry, observation, None, None)
+        commands.append(command)
+    return np.array(commands)
+
+
+def test_command_keeps_both_limits_and_reaches_them() -> None:
+    commands = drive(policy(gain=1e4), 40)
+    speed = np.linalg.norm(commands, axis=-1)
+    rate = np.linalg.norm(np.diff(commands, axis=0), axis=-1) / PERIOD
+    assert speed.max() == pytest.approx(LIMIT, rel=1e-5)
+    assert speed.max() <= LIMIT * (1 + 1e-6)
+    assert rate.max() == pytest.approx(RATE, rel=1e-3)
+    assert rate.max() <= RATE * (1 + 1e-4)
+
+
+def test_without_a_rate_limit_the_output_is_the_command() -> None:
+    speed = np.linalg.norm(drive(policy(None, gain=1e4), 2), axis=-1)
+    np.testing.assert_allclose(speed[0], LIMIT, rtol=1e-3)
+    assert speed.max() <= LIMIT * (1 + 1e-6)
+
+
+def test_untrained_policy_hardly_acts() -> None:
+    assert np.abs(drive(policy(), 1)).max() < 0.2 * RATE * PERIOD
+
+
+def test_batch_equals_one_by_one() -> None:
+    pilot = policy()
+    observation = jax.random.normal(jax.random.key(1), (4, 5))
+    command = 0.5 * jax.random.normal(jax.random.key(2), (4, 2, 3))
+    together, _ = pilot(command, observation, None, None)
+    single = jnp.stack([pilot(c, o, None, None)[1] for c, o in zip(command, observation)])  # noqa: B905
+    np.testing.assert_allclose(together, single, rtol=1e-5, atol=1e-6)
+
+
+def test_normalised_by_the_examples() -> None:
+    pilot = policy()
+    np.testing.assert_allclose(pilot.mean, 3.0, atol=0.3)
+    np.testing.assert_allclose(pilot.scale, 2.0, atol=0.2)
+
+
+@pytest.mark.parametrize("command", [0.0, 10.0])
+def test_gradients_are_finite_at_rest_and_beyond_the_limit(command: float) -> None:
+    arrays, static = eqx.partition(policy(), eqx.is_array)
+
+    def loss(arrays, command):
+        _, action = eqx.combine(arrays, static)(command, jnp.ones(5), None, None)
+        return jnp.sum(action**2) + jnp.sum(action)
+
+    for_arrays, for_command = jax.grad(loss, (0, 1))(arrays, jnp.full((2, 3), command))
+    leaves = jax.tree.leaves((for_arrays, for_command))
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
+    assert float(jnp.abs(for_arrays.network.layers[0].weight).max()) > 0
+    np.testing.assert_array_equal(for_arrays.mean, 0.0)  # normalisation is not trained
+
+
+def test_saved_policy_comes_back_the_same(tmp_path) -> None:
+    pilot, path = policy(), tmp_path / "policy.safetensors"
+    save_policy(path, pilot, {"task": "a task"})
+    loaded, manifest = load_policy(path)
+    assert manifest["task"] == "a task"
+    assert manifest["policy"]["rate_limit"] == RATE
+    observation, command = jnp.arange(5.0), jnp.zeros((2, 3))
+    np.testing.assert_array_equal(
+        loaded(command, observation, None, None)[1], pilot(command, observation, None, None)[1]
+    )
+
+
+def test_another_file_is_refused(tmp_path) -> None:
+    path = tmp_path / "model.safetensors"
+    save_arrays(path, {"a": np.zeros(3)}, {"kind": "model"})
+    with pytest.raises(PalpateError, match="holds no policy"):
+        load_policy(path)

@@ -1,0 +1,71 @@
+"""Figures for documents: drawn without a display, the same bytes every time, gaps left open."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from palpate.errors import PalpateError
+from palpate.report import Curves, Motion, motion_animation, motion_figure
+from synthetic_evidence import chain
+
+TIME, OBSERVED = chain(points=6, seconds=1.0)
+PREDICTED = chain(points=6, seconds=1.0, damping=1.0)[1]
+OBSERVED[20:30, 2] = np.nan
+MOTION = Motion("", TIME, {"observed": OBSERVED, "predicted": PREDICTED})
+ENERGY = Curves(TIME, {"controlled": np.exp(-3 * TIME) * np.ones((4, 1))})
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_a_figure_is_the_same_every_time(tmp_path, suffix):
+    drawn = [motion_figure(tmp_path / f"{n}{suffix}", MOTION, [0.0, 0.5], ENERGY) for n in "ab"]
+    assert drawn[0].read_bytes() == drawn[1].read_bytes()
+    assert drawn[0].stat().st_size > 5_000
+
+
+def test_energies_and_instants_each_have_their_panel(tmp_path):
+    sizes = []
+    for instants, energy in (([0.0], None), ([0.0, 0.5], None), ([0.0, 0.5], ENERGY)):
+        with Image.open(motion_figure(tmp_path / "a.png", MOTION, instants, energy)) as picture:
+            sizes.append(picture.size[0])
+    assert sizes[0] < sizes[1] < sizes[2]
+
+
+def test_a_figure_shows_the_motion(tmp_path):
+    still = Motion("", TIME, {"observed": np.repeat(OBSERVED[:1], len(TIME), axis=0)})
+    moved = Motion("", TIME, {"observed": PREDICTED})
+    pictures = [motion_figure(tmp_path / "x.png", m, [0.5]).read_bytes() for m in (still, moved)]
+    assert pictures[0] != pictures[1]
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_an_animation_moves_in_real_time(tmp_path, suffix):
+    out = motion_animation(tmp_path / f"swing{suffix}", MOTION, rate=5.0)
+    with Image.open(out) as picture:
+        assert picture.n_frames == 5
+        first = np.asarray(picture.convert("RGB")).copy()
+        picture.seek(3)
+        assert (np.asarray(picture.convert("RGB")) != first).any()
+        assert picture.info["duration"] == 200
+
+
+@pytest.mark.parametrize("points", [1, 3])
+def test_one_point_that_stands_still_can_be_drawn(tmp_path, points):
+    still = Motion("", TIME, {"cart": np.zeros((len(TIME), points, 3))})
+    assert motion_figure(tmp_path / "cart.png", still, [0.0]).exists()
+    assert motion_animation(tmp_path / "cart.gif", still, rate=2.0).exists()
+
+
+def test_what_cannot_be_drawn_is_refused(tmp_path):
+    with pytest.raises(PalpateError, match=r"suffix '\.jpg': expected \.png or \.svg"):
+        motion_figure(tmp_path / "a.jpg", MOTION, [0.0])
+    with pytest.raises(PalpateError, match=r"expected \.webp or \.gif"):
+        motion_animation(tmp_path / "a.mp4", MOTION)
+    with pytest.raises(PalpateError, match="at least one instant"):
+        motion_figure(tmp_path / "a.png", MOTION, [])
+    lost = Motion("", TIME, {"observed": OBSERVED * np.nan})
+    for draw in (
+        lambda: motion_figure(tmp_path / "a.png", lost, [0.0]),
+        lambda: motion_animation(tmp_path / "a.gif", lost),
+    ):
+        with pytest.raises(PalpateError, match="nothing but gaps"):
+            draw()

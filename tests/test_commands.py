@@ -1,0 +1,366 @@
+"""What commands do: the same code for a pendulum, a cart and a rope, in folders that resume."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.errors import PalpateError
+from palpate.experiments import folders, identify, reproduce, train
+from palpate.experiments.options import Identify, Options, Reproduce, Train
+from palpate.models import files
+from palpate.models.files import load_model
+from palpate.models.model import rollout
+from palpate.networks import load_policy
+from palpate.recording import Channel, Recording, Role, Trial
+from palpate.recording_files import read_recording, write_recording
+from palpate.report import read_evidence
+from palpate.result import Figure, Result, read_result
+from palpate.runs import Run
+from palpate.storage import read_json
+from palpate.tasks import TASKS
+from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
+
+TRUTH = {"cart": Cart(mass=2.0, friction=0.3), "pendulum": Pendulum(length=0.7, damping=0.4)}
+START = {"cart": Cart(mass=1.0, friction=0.5), "pendulum": Pendulum(length=1.0, damping=0.2)}
+TOY_TASKS = {"cart": CartToOrigin, "pendulum": PendulumDamping}
+UNIT = {"cart": "m", "pendulum": "rad"}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class IdentifyToy(Identify):
+    """As a family's file would say it."""
+
+    observation: ClassVar[str] = "sensor"
+    family: str = "cart"
+
+    def prepare(self, recording):
+        return recording
+
+    def action(self, recording):
+        return "motor"
+
+    def start(self, aligned):
+        return START[self.family]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainToy(Train):
+    """As a task's file would say it."""
+
+    action: ClassVar[str] = "force, N"
+    task: str = "cart-to-origin"
+
+    def prepare(self, model):
+        return model
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, task in TOY_TASKS.items():
+        monkeypatch.setitem(files.MODELS, name, type(START[name]))
+        monkeypatch.setitem(TASKS, task.name, task)
+
+
+def recorded(name, path, trials=5, steps=80):
+    """A file with trials of the true toy under random pushes, seen with a little noise."""
+    model, rng = TRUTH[name], np.random.default_rng(0)
+    actions = np.repeat(rng.normal(size=(trials, steps // 10, 1)), 10, axis=1)
+    start = model.initial_state(jnp.zeros((trials, 1, 1)))
+    states = rollout(model, start, jnp.asarray(actions, jnp.float32))
+    seen = np.concatenate([np.zeros((trials, 1, 1)), model.observe(states)], axis=1)
+    seen += 1e-4 * rng.normal(size=seen.shape)
+    time = model.control_period * np.arange(steps + 1)
+    write_recording(
+        path,
+        Recording(
+            tuple(
+                Trial(
+                    f"push {i}",
+                    {
+                        "sensor": Channel("sensor", Role.OBSERVATION, time, seen[i], UNIT[name]),
+                        "motor": Channel("motor", Role.COMMAND, time[:-1], actions[i], "N"),
+                    },
+                )
+                for i in range(trials)
+            ),
+            {},
+        ),
+    )
+    return path
+
+
+# --- every family goes through the same code ---------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["cart", "pendulum"])
+def test_a_toy_is_identified_trained_for_and_reported(name, tmp_path, capsys):
+    recording = recorded(name, tmp_path / "toy.npz")
+    folder = identify.run(
+        IdentifyToy(recordings=(recording,), family=name, iterations=(20, 20, 80))
+    )
+    assert folder.name == f"identify-{name}-001"
+    said = capsys.readouterr().out
+    assert "90 % interval" in said
+    assert "over 1 trial of 4.05 s (validation)" in said or "of 1.62 s (validation)" in said
+    model, about = load_model(folder / folders.MODEL)
+    result = read_json(folder / "result.json")
+    unit = {"cart": "cm", "pendulum": "rad"}[name]
+    assert [figure["name"] for figure in result["figures"]] == [
+        f"l1_{unit}",
+        f"rmse_at_end_{unit}",
+        f"l1_fitted_trials_{unit}",
+        "wall_time_s",
+    ]
+    assert about["figures"][f"l1_{unit}"] == result["figures"][0]["value"]
+    assert len(result["split"]["fitted"]) == 4
+    (held_out,) = result["split"]["validation"]
+    assert held_out not in result["split"]["fitted"]
+    for row in result["parameters"]:
+        true = float(getattr(TRUTH[name], row["name"]))
+        assert np.isclose(row["value"], true, rtol=0.15), row
+        assert row["lower"] < row["value"] < row["upper"]
+        assert row["value"] == pytest.approx(float(getattr(model, row["name"])))
+    shown = read_evidence(folder)
+    assert set(shown.horizon.values) == {"identified", "start model"}
+    assert shown.horizon.values["identified"][-1] < shown.horizon.values["start model"][-1]
+    assert not shown.motions  # a number is no chain of points
+    assert (folder / folders.REPORT).exists()
+
+    trained = train.run(
+        TrainToy(model=folder, task=TOY_TASKS[name].name, iterations=30, batch=8, starts=64)
+    )
+    policy, manifest = load_policy(trained / folders.POLICY)
+    assert manifest["task"] == TOY_TASKS[name].name
+    assert manifest["training"]["iterations"] == 30
+    assert policy.period == model.control_period
+    figures = {figure.name: figure.value for figure in read_result(trained / "result.json").figures}
+    assert 0.0 <= figures["in_model.success"] <= 1.0
+    assert len(read_evidence(trained).metrics) == 30
+    assert (trained / folders.REPORT).exists()
+
+
+def test_the_only_trial_is_fitted_and_said_to_be(tmp_path, capsys):
+    recording = recorded("cart", tmp_path / "toy.npz", trials=1)
+    folder = identify.run(IdentifyToy(recordings=(recording,), iterations=(1, 1, 1)))
+    assert "(the fitted trial)" in capsys.readouterr().out
+    assert "none" in read_json(folder / "result.json")["split"]["validation"]
+
+
+def test_validation_is_scored_as_recorded_and_not_fitted(tmp_path):
+    options = IdentifyToy(
+        recordings=(recorded("cart", tmp_path / "a.npz", trials=2),),
+        validate=(recorded("cart", tmp_path / "b.npz", trials=3),),
+    )
+    data = identify.read(options)
+    assert len(data.fitted.trials) == 2
+    assert len(data.validation.trials) == 3
+    both = identify.read(dataclasses.replace(options, validate=(), recordings=options.validate * 2))
+    assert {trial.name for trial in both.fitted.trials}.isdisjoint(
+        trial.name for trial in both.validation.trials
+    )
+    assert len(both.fitted.trials) + len(both.validation.trials) == 6
+
+
+def test_parameters_are_freed_fixed_and_shared_by_name():
+    cart = identify.with_declarations(START["cart"], (), ("mass",), ("friction",))
+    rows = {row["name"]: row for row in identify.describe(cart)}
+    assert rows["mass"]["fixed"]
+    assert rows["friction"]["shared"]
+    with pytest.raises(PalpateError, match=r"unknown parameter 'mas'; did you mean 'mass'\?"):
+        identify.with_declarations(cart, ("mas",), (), ())
+    with pytest.raises(PalpateError, match="'mass' cannot be fixed and identified"):
+        identify.with_declarations(cart, (), ("mass",), ("mass",))
+
+
+# --- folders ----------------------------------------------------------------------------------
+
+
+def finish(run):
+    run.finish({"wall_time_s": 1.0})
+    run.close()
+
+
+def test_runs_are_numbered_and_an_unfinished_one_is_taken_up():
+    def opened(seed, **told):
+        return folders.open_run(Options(**told), "work", {"seed": seed}, folders.MODEL)
+
+    first = opened(1)
+    assert first.path == folders.RUNS / "work-001"
+    first.close()
+    again = opened(1)
+    assert again.path == first.path
+    again.close()
+    other = opened(2)
+    assert other.path == folders.RUNS / "work-002"
+    other.close()
+    finish(opened(1))
+    anew = opened(1)
+    assert anew.path == folders.RUNS / "work-003"
+    anew.close()
+    fresh = opened(1, fresh=True)
+    assert fresh.path == folders.RUNS / "work-004"
+    fresh.close()
+
+
+def test_out_is_a_folder_or_the_file_that_is_wanted(tmp_path):
+    run = folders.open_run(Options(out=tmp_path / "here"), "work", {}, folders.MODEL)
+    assert run.path == tmp_path / "here"
+    run.close()
+    options = Options(out=tmp_path / "there" / "mine.json")
+    with folders.open_run(options, "work", {}, folders.MODEL) as run:
+        assert run.path == folders.RUNS / "work-001"
+        (run.path / folders.MODEL).write_text("{}")
+        assert folders.deliver(options, run, folders.MODEL) == options.out
+    assert options.out.read_text() == "{}"
+    for wrong in ("policy.safetensors", "recording.npz"):
+        with pytest.raises(PalpateError, match=r"has to be a folder, or a file that ends in \.json"):
+            folders.open_run(Options(out=tmp_path / wrong), "work", {}, folders.MODEL)
+    with pytest.raises(PalpateError, match="has to be a folder$"):
+        folders.open_run(Options(out=tmp_path / "model.json"), "work", {})
+
+
+def test_an_input_that_changes_is_another_configuration(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(b"one")
+    before = folders.fingerprint(path)
+    path.write_bytes(b"two")
+    assert folders.fingerprint(path) != before
+    with pytest.raises(PalpateError, match="there is no file"):
+        folders.fingerprint(tmp_path / "none")
+
+
+def test_starting_over_empties_the_runs_of_a_folder_and_nothing_else(tmp_path):
+    finish(Run.open(tmp_path / "deep" / "stage", {"seed": 1}))
+    (tmp_path / "deep" / "stage" / "notes.txt").write_text("mine")
+    folders.start_over(tmp_path)
+    with Run.open(tmp_path / "deep" / "stage", {"seed": 2}) as run:
+        assert not run.finished
+    assert (tmp_path / "deep" / "stage" / "notes.txt").read_text() == "mine"
+
+
+# --- recording --------------------------------------------------------------------------------
+
+SHORT = ["--trials", "2", "--duration", "0.5", "--markers", "5"]
+
+
+def test_a_recording_holds_what_the_world_shows_and_how_it_was_made(tmp_path, capsys):
+    assert main(["record", "rope", "--out", "R.npz", "--seed", "3", *SHORT]) == 0
+    assert capsys.readouterr().out == "recording: R.npz (2 trials of 0.5 s)\n"
+    recording = read_recording("R.npz")
+    assert [channel.role for channel in recording.trials[0].channels.values()] == [
+        Role.OBSERVATION,
+        Role.DRIVEN,
+        Role.COMMAND,
+    ]
+    assert recording.trials[0]["markers"].values.shape == (51, 5, 3)
+    assert recording.trials[0]["gripper"].values.shape == (51, 1, 3)
+    assert recording.provenance["seed"] == 3
+    assert recording.provenance["markers"] == 5
+    result = read_result(tmp_path / "runs" / "record-rope-001" / "result.json")
+    assert result.seeds == [3]
+    # the same again is no harm; another one is not written over it
+    assert main(["record", "rope", "--out", "R.npz", "--seed", "3", *SHORT]) == 0
+    assert "it was there already" in capsys.readouterr().out
+    assert main(["record", "rope", "--out", "R.npz", "--seed", "4", *SHORT]) == 2
+    assert "R.npz holds another recording: give another --out" in capsys.readouterr().err
+    assert main(["record", "rope", "--out", "R.npz", "--seed", "4", "--fresh", *SHORT]) == 0
+    assert read_recording("R.npz").provenance["seed"] == 4
+
+
+def test_two_seeds_make_two_recordings():
+    for seed in ("0", "1", "0"):
+        main(["record", "rope", "--seed", seed, "--fresh", *SHORT])
+    first, other, same = (
+        read_recording(f"runs/record-rope-00{i}/recording.npz").trials[0]["markers"].values
+        for i in (1, 2, 3)
+    )
+    assert np.array_equal(first, same)
+    assert not np.allclose(first, other)
+
+
+# --- reproduce and report ---------------------------------------------------------------------
+
+
+class Experiment:
+    """Stands in for the module of an experiment."""
+
+    def __init__(self):
+        self.given = None
+
+    def reproduce(self, out, *, quick, seed, mocap=None):
+        self.given = {"out": out, "quick": quick, "seed": seed, "mocap": mocap}
+        with Run.open(out / "stage", {"seed": seed}) as run:
+            if not run.finished:
+                run.finish({"wall_time_s": 1.0})
+        figures = [Figure("error", 0.2, "m", bar=0.3), Figure("rate", 0.5, "")]
+        return Result("rope-model", figures, {}, [seed], None, 1.0)
+
+
+@pytest.fixture
+def experiment(monkeypatch):
+    experiment = Experiment()
+    monkeypatch.setitem(sys.modules, "palpate.experiments.rope_model", experiment)
+    return experiment
+
+
+def test_reproduce_writes_the_result_and_prints_a_line_for_each_figure(
+    experiment, tmp_path, capsys
+):
+    assert main(["reproduce", "rope-model", "--out", "here", "--seed", "5", "--mocap", "m"]) == 0
+    assert experiment.given["seed"] == 5
+    assert str(experiment.given["mocap"]) == "m"
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("error | 0.2 m | bar <= 0.3 | met")
+    assert lines[1].startswith("rate ")
+    assert read_result(tmp_path / "here" / "result.json").figures[0].met
+    assert (tmp_path / "here" / "report.html").exists()
+    # another seed in the same folder is another run, until it is started over
+    assert main(["reproduce", "rope-model", "--out", "here", "--seed", "6"]) == 2
+    assert "seed was 5, now 6" in capsys.readouterr().err
+    assert main(["reproduce", "rope-model", "--out", "here", "--seed", "6", "--fresh"]) == 0
+
+
+def test_a_quick_run_is_held_against_the_kept_one(experiment, tmp_path, monkeypatch, capsys):
+    kept = Result("rope-model", [Figure("error", 0.1, "m", spread=0.05)], {}, [0], None, 1.0)
+    assert reproduce.beside(experiment.reproduce(tmp_path, quick=True, seed=0), kept) == [
+        "error: 0.2 is outside the full run's 0.1 +- 0.05"
+    ]
+    near = Result("rope-model", [Figure("error", 0.19, "m", spread=0.05)], {}, [0], None, 1.0)
+    assert "within" in reproduce.beside(experiment.reproduce(tmp_path, quick=True, seed=0), near)[0]
+
+
+def test_report_tells_the_runs_below_a_folder(experiment, tmp_path, capsys):
+    reproduce.run(Reproduce(out=tmp_path / "here"), "rope-model")
+    assert main(["report", "here", "--out", "page.html", "--title", "A <page>"]) == 0
+    assert capsys.readouterr().out.endswith("report: page.html\n")
+    assert "A &lt;page&gt;" in (tmp_path / "page.html").read_text()
+
+
+# --- interruption -----------------------------------------------------------------------------
+
+
+def test_ctrl_c_says_how_to_go_on(tmp_path):
+    recorded("cart", tmp_path / "toy.npz")
+    words = [sys.executable, "-m", "palpate", "record", "rope", "--trials", "500"]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=os.environ)
+    folder = tmp_path / "runs" / "record-rope-001" / "configuration.json"
+    while not folder.exists() and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.splitlines()[-1] == (
+        "palpate: interrupted; `palpate record rope --trials 500` goes on where it stopped"
+    )
+    assert "Traceback" not in said

@@ -137,6 +137,15 @@ def test_summary_counts_successes_and_failures():
     assert 0.3 < summary.interval[0] < 0.75 < summary.interval[1] < 1.0
 
 
+def test_trembling_of_the_gripper_is_told():
+    episodes = episodes_of(50, 100, None, 150)
+    episodes.gripper_speed[0, 150] = 0.03
+    episodes.gripper_speed[:, -100:] += 0.01
+    summary = summarise(four_trials(), episodes)
+    assert (summary.successes, summary.at_rest_at_once) == (3, 2)
+    assert summary.final_speed == pytest.approx(0.01)
+
+
 def test_a_rope_that_rises_again_is_counted():
     episodes = episodes_of(50, 100, None, 150)
     episodes.energy[0, 170] = 0.02

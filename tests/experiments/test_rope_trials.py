@@ -79,6 +79,15 @@ def test_gripper_must_be_at_rest_at_the_end_of_the_second():
     assert np.isnan(settled(shares, 0.021))
 
 
+def test_only_the_first_second_counts_if_asked():
+    shares = energy((4, 0.5), (20, 0.009))
+    speed = np.zeros_like(shares)
+    assert settling_time(shares, speed, 0.1, first=True) == pytest.approx([0.5])
+    speed[:, 15] = 0.021
+    assert np.isnan(settling_time(shares, speed, 0.1, first=True))
+    assert settling_time(shares, speed, 0.1) == pytest.approx([0.6])
+
+
 def test_a_diverged_simulation_never_settles():
     shares = energy((20, 0.001))
     shares[:, 12:] = np.nan

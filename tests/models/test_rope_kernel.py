@@ -38,8 +38,13 @@ elastic_energy = jax.jit(lambda rope, position: rope.elastic_energy(position))
 
 @jax.jit
 def internal_forces(rope, position, velocity):
+    rest_bend = rope._rest_bend(position)
     edge = rope_kernel.edge_forces(
-        tuple(position.T), tuple(velocity.T), rope._coefficients(), lanes=1
+        tuple(position.T),
+        tuple(velocity.T),
+        None if rest_bend is None else tuple(rest_bend.T),
+        rope._coefficients(),
+        lanes=1,
     )
     edge = jnp.stack(edge, axis=-1)
     return jnp.pad(edge, ((0, 1), (0, 0))) - jnp.pad(edge, ((1, 0), (0, 0)))
@@ -51,8 +56,8 @@ def rayleigh(rope, position, velocity):
 
     def lengths_and_directions(position):
         edge = jnp.diff(position, axis=0)
-        length = jnp.linalg.norm(edge, axis=1)
-        return length, edge / length[:, None]
+        length = jnp.sqrt(jnp.sum(edge**2, axis=1) + rope_kernel.COINCIDENT)
+        return length, edge / rope.rest_length[:, None]
 
     (_, direction), (stretching, turning) = jax.jvp(
         lengths_and_directions, (position,), (velocity,)
@@ -70,6 +75,7 @@ def independent_energy(rope, position) -> float:
     """Stretch, bend and twist from lengths, angles and dihedral angles, in NumPy."""
     edge = np.diff(np.asarray(position), axis=0)
     length = np.linalg.norm(edge, axis=1)
+    relative = length / np.asarray(rope.rest_length)
     u = edge / length[:, None]
     angle = np.arccos(np.clip(np.sum(u[1:] * u[:-1], axis=1), -1, 1))
     normal = np.cross(u[:-1], u[1:])
@@ -78,12 +84,22 @@ def independent_energy(rope, position) -> float:
         np.sum(normal[:-1] * normal[1:], axis=1),
     )
     torsion = np.arctan2(sine, cosine)
-    fade = np.sin(angle) ** 2 / (np.sin(angle) ** 2 + rope_kernel.TWIST_FADE)
+    product = relative[1:] * relative[:-1]
+    sine_squared = (product * np.sin(angle)) ** 2
+    fade = 1 / (sine_squared + rope_kernel.TWIST_FADE)
+    # the box of three directions: their lengths and the sines between them
+    box = relative[:-2] * relative[1:-1] * relative[2:] * np.sin(angle[:-1]) * np.sin(angle[1:])
+    # the difference of two directions by the law of cosines: 2 - 2 cos(angle) where none stretches
+    bend_squared = relative[1:] ** 2 + relative[:-1] ** 2 - 2 * product * np.cos(angle)
     return float(
         np.sum(0.5 * np.asarray(rope.stretch_stiffness) * (length - rope.rest_length) ** 2)
-        + np.sum(np.asarray(rope.bend_stiffness) * (1 - np.cos(angle)))
+        + np.sum(0.5 * np.asarray(rope.bend_stiffness) * bend_squared)
         + np.sum(
-            0.5 * np.asarray(rope.twist_stiffness) * np.sin(torsion) ** 2 * fade[1:] * fade[:-1]
+            0.5
+            * np.asarray(rope.twist_stiffness)
+            * (box * np.sin(torsion)) ** 2
+            * fade[1:]
+            * fade[:-1]
         )
     )
 
@@ -95,7 +111,7 @@ def test_the_energy_is_that_of_lengths_angles_and_torsions(bending, stretching, 
     for _ in range(5):
         position = bent(rope, rng, bending, stretching)
         ours = float(elastic_energy(rope, position))
-        assert ours == pytest.approx(independent_energy(rope, position), rel=1e-10)
+        assert ours == pytest.approx(independent_energy(rope, position), rel=1e-9)
 
 
 @shapes
@@ -108,6 +124,43 @@ def test_forces_are_minus_the_gradient_of_the_energy(bending, stretching, float6
         expected = -gradient(rope, position)
         ours = internal_forces(rope, position, jnp.zeros_like(position))
         np.testing.assert_allclose(ours, expected, atol=1e-11 * np.abs(expected).max())
+
+
+@shapes
+def test_a_rope_bent_at_rest_is_drawn_to_its_bends(bending, stretching, float64):
+    """Its ends are held, and the frame of its bends with them: the nodes between feel the energy."""
+    rng = np.random.default_rng(9)
+    rope = uneven_rope(
+        rng, driven=(0, NODES - 1), rest_bend=0.3 * rng.normal(size=(NODES - 2, 3))
+    )
+    straight = eqx.tree_at(lambda r: r.rest_bend, rope, jnp.zeros((NODES - 2, 3)))
+    gradient = jax.jit(jax.grad(elastic_energy, argnums=1))
+    for _ in range(5):
+        position = bent(rope, rng, bending, stretching)
+        expected = -gradient(rope, position)[1:-1]
+        ours = internal_forces(rope, position, jnp.zeros_like(position))[1:-1]
+        np.testing.assert_allclose(ours, expected, atol=1e-11 * np.abs(expected).max())
+        without = internal_forces(straight, position, jnp.zeros_like(position))[1:-1]
+        assert np.abs(without - ours).max() > 0.1
+
+
+def test_bending_is_linear(float64):
+    """Twice as far from straight, twice the force, however far: a crumpled rope is no stiffer."""
+    rng = np.random.default_rng(10)
+    rope = uneven_rope(rng)
+    names = ("stretch_stiffness", "twist_stiffness")
+    rope = eqx.tree_at(
+        lambda r: [getattr(r, name) for name in names],
+        rope,
+        [jnp.zeros_like(getattr(rope, name)) for name in names],
+    )
+    straight = bent(rope, rng, 0.0)
+    away = jnp.asarray(rng.normal(size=(NODES, 3)))
+    force = [
+        internal_forces(rope, straight + size * away, jnp.zeros_like(straight))
+        for size in (0.001, 1.0)
+    ]
+    np.testing.assert_allclose(1000 * force[0], force[1], atol=1e-10 * np.abs(force[1]).max())
 
 
 @shapes
@@ -147,7 +200,10 @@ def test_internal_forces_have_no_sum_and_no_torque(bending, stretching, float64)
 def test_a_bent_rope_that_turns_as_a_whole_in_its_plane_is_not_damped(float64):
     rng = np.random.default_rng(8)
     rope = uneven_rope(rng)
-    position = bent(rope, rng, 0.5, 0.1).at[:, 1].set(0.0)
+    position = np.asarray(bent(rope, rng, 0.5)) * [1.0, 0.0, 1.0]
+    edge = np.diff(position, axis=0)  # at rest length: a stretch that turns along also damps
+    edge *= np.asarray(rope.rest_length / np.linalg.norm(edge, axis=1))[:, None]
+    position = jnp.asarray(np.concatenate([np.zeros((1, 3)), np.cumsum(edge, axis=0)]))
     across, tangent = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, 1.0])
 
     def lost(velocity):
@@ -175,7 +231,7 @@ def test_a_rope_that_nothing_holds_keeps_both_momenta(float64):
         (nothing, nothing, nothing, 1e-3 / mass),
     )
     later = rope_kernel.integrate(
-        tuple(position.T), tuple(velocity.T), (nothing,) * 3, coefficients,
+        tuple(position.T), tuple(velocity.T), (nothing,) * 3, None, coefficients,
         lanes=1, steps=500, time_step=1e-3,
     )  # fmt: skip
     later_position, later_velocity = (jnp.stack(axes, axis=-1) for axes in later)
@@ -209,7 +265,10 @@ def test_every_gradient_matches_finite_differences(drive, float64):
     """Each element of each parameter, of the state and of the actions, over several periods."""
     rng = np.random.default_rng(7)
     driven = (0,) if drive == "velocity" else (0, NODES - 1)
-    rope = uneven_rope(rng, drive=drive, driven=driven, control_period=0.012, substeps=6)
+    rest_bend = 0.2 * rng.normal(size=(NODES - 2, 3))
+    rope = uneven_rope(
+        rng, drive=drive, driven=driven, control_period=0.012, substeps=6, rest_bend=rest_bend
+    )
     state = RopeState(bent(rope, rng, 0.4, 0.05), jnp.asarray(rng.normal(size=(NODES, 3))))
     actions = rng.normal(size=(4, *rope.action_shape))
     if drive == "position":
@@ -231,7 +290,10 @@ def test_every_gradient_matches_finite_differences(drive, float64):
     rounding = 1e-14 / step
     errors = np.abs(gradient - expected) / (1e-6 * np.abs(expected) + rounding)
     assert np.max(errors) < 1, unravel(jnp.asarray(errors))
-    for leaf in jax.tree.leaves(unravel(gradient)):
+    by_rope, *others = unravel(gradient)
+    assert np.any(by_rope.rest_bend != 0) == rope.held_at_both_ends
+    by_rope = eqx.tree_at(lambda r: r.rest_bend, by_rope, None)
+    for leaf in jax.tree.leaves((by_rope, others)):
         assert np.any(leaf != 0)
 
 
@@ -249,23 +311,29 @@ def crumpled(rope):
     return bent(rope, np.random.default_rng(1), 9.0, 0.5)
 
 
+def coincident(rope):
+    """Three nodes in one place, the next one back on the first."""
+    return straight(rope).at[2].set(straight(rope)[1]).at[3].set(straight(rope)[1]).at[4].set(0.0)
+
+
 @jax.jit
 def loss_gradient(rope, state, actions):
     def loss(arguments):
         states = rollout(*arguments)
-        return jnp.sum(states.position**2) + jnp.sum(states.velocity**2)
+        stored = arguments[0].elastic_energy(arguments[1].position)
+        return jnp.sum(states.position**2) + jnp.sum(states.velocity**2) + stored
 
     return jax.grad(loss)((rope, state, actions))
 
 
-@pytest.mark.parametrize("shape", [straight, folded, crumpled])
+@pytest.mark.parametrize("shape", [straight, folded, crumpled, coincident])
 def test_forces_and_gradients_are_finite_in_float32_however_the_rope_lies(shape):
-    """180 degrees is an unstable equilibrium of bending, and singular for nobody."""
+    """Joints of 0 and 180 degrees and segments without length are singular for nobody."""
     rope = Rope.uniform(length=0.6, mass=0.07, nodes=NODES, twist_stiffness=1e-3)
     state = at_rest(jnp.asarray(shape(rope), jnp.float32))
     gradient = loss_gradient(rope, state, jnp.zeros((20, 1, 3)))
     force = internal_forces(rope, state.position, state.velocity)
     for leaf in jax.tree.leaves((gradient, force)):
         assert np.all(np.isfinite(leaf))
-    if shape is not crumpled:  # straight is an equilibrium, folded too
+    if shape is straight:
         assert float(jnp.abs(force).max()) < 1e-4

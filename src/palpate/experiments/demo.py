@@ -32,11 +32,11 @@ class Size:
     nodes: int = 11
     substeps: int = 4
     identification: tuple[int, ...] = (20, 20, 60)
-    training: int = 250  # gradient steps
-    batch: int = 64
+    training: int = 150  # gradient steps
+    batch: int = 128
     starts: int = 2000
     ropes: int = 3  # each from four poses
-    minutes: int = 5
+    minutes: int = 4
 
 
 def run(options: Demo, size: Size = Size()) -> Path:

@@ -5,12 +5,11 @@ from pathlib import Path
 from palpate.errors import PalpateError
 from palpate.experiments import folders
 from palpate.experiments.options import Evaluate
-from palpate.experiments.train import figures_in_model
+from palpate.experiments.train import figures_in_model, named_task
 from palpate.models.files import load_model
 from palpate.networks import load_policy
 from palpate.result import Figure, Result
 from palpate.storage import write_text
-from palpate.tasks import task_named
 
 TABLE = "table.txt"
 
@@ -39,7 +38,7 @@ def run(options: Evaluate) -> Path:
             found = options.evaluate(policy, run)
             figures = [*found.figures]
             if model is not None:
-                figures += figures_in_model(task_named(options.task)(), model, policy, options.seed)
+                figures += figures_in_model(named_task(options.task), model, policy, options.seed)
             result = Result(
                 name=name,
                 figures=[*figures, Figure("wall_time_s", run.elapsed, "s")],

@@ -259,7 +259,7 @@ def _write(run: Run, name: str, options: Identify, data: Data, identified: Ident
         settings=run.configuration
         | {
             "scored_trials": len(scored.length),
-            "scored_duration_s": float(np.median(scored.length)) * scored.period,
+            "scored_duration_s": float(np.median(scored.length) - 1) * scored.period,
         },
         seeds=[options.seed],
         split={
@@ -325,7 +325,7 @@ def _print(result: dict[str, Any]) -> None:
     print(
         f"mean absolute error (L1) {error['value']:.3f} {error['unit']} over "
         f"{count} {'trial' if count == 1 else 'trials'} of "
-        f"{settings['scored_duration_s']:.3g} s ({on})"
+        f"{round(settings['scored_duration_s'], 1):g} s ({on})"
     )
 
 

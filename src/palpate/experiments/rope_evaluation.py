@@ -18,7 +18,7 @@ from palpate.experiments.rope_trials import (
 from palpate.report.evidence import write_evidence
 from palpate.result import Figure
 from palpate.runs import Run, interruptible, progress
-from palpate.tasks.rope_stabilization import STABILISED
+from palpate.tasks.rope_stabilization import STABILISED, STAY
 from palpate.worlds.rope import START_POSES, RopeConfiguration, sample_configurations
 
 TRIAL_PERIODS = 4.0  # length of a trial, in first periods of the longest rope
@@ -115,10 +115,10 @@ def _arrays(done: Mapping[str, Episodes]) -> dict[str, dict[str, np.ndarray]]:
     return {name: {part: getattr(whole, part) for part in parts} for name, whole in done.items()}
 
 
-def settling_times(trials: Sequence[Trial], episodes: Episodes) -> np.ndarray:
-    """When each rope came to rest for good, (trials,) in s; see `settling_time`."""
+def settling_times(trials: Sequence[Trial], episodes: Episodes, first: bool = False) -> np.ndarray:
+    """When each rope came to rest, (trials,) in s; see `settling_time`."""
     period = trials[0].configuration.control_period
-    return settling_time(episodes.energy, episodes.gripper_speed, period)
+    return settling_time(episodes.energy, episodes.gripper_speed, period, first)
 
 
 @dataclass(frozen=True)
@@ -128,6 +128,8 @@ class Summary:
     `time` (s) and `periods` (of each rope) are means over the successes, None without one;
     `periods_with_failures` counts a failure with the length of its trial. `interval`: of the
     success rate, 95 %. `margin` and `time_margin`: 95 % half-widths of `periods` and `time`.
+    `at_rest_at_once`: successes whose gripper is at rest when the first second of low energy has
+    passed. `final_speed`: of the gripper over the last second of all trials, mean, m/s.
     `relapsed`: successes whose energy rose above 1 % again before the trial ended. `diverged`:
     trials whose simulation ended early, which are failures.
     """
@@ -140,6 +142,8 @@ class Summary:
     periods: float | None
     margin: float | None
     periods_with_failures: float
+    at_rest_at_once: int
+    final_speed: float
     relapsed: int
     diverged: int
 
@@ -156,7 +160,8 @@ class Summary:
         return (
             f"{name:28s} {self.successes:4d} of {self.trials} at rest, 95 % interval "
             f"{low:.3f} to {high:.3f}; 1 % energy after {periods}{time}; failures counted as whole "
-            f"trials: {self.periods_with_failures:.3f}"
+            f"trials: {self.periods_with_failures:.3f}; gripper at rest at once in "
+            f"{self.at_rest_at_once}, {self.final_speed:.3f} m/s in the end"
             + (f"; {self.relapsed} rose above 1 % again" if self.relapsed else "")
         )
 
@@ -166,7 +171,8 @@ def summarise(trials: Sequence[Trial], episodes: Episodes) -> Summary:
     time = settling_times(trials, episodes)
     period = np.array([trial.period for trial in trials])
     settled = np.isfinite(time)
-    length = (episodes.energy.shape[1] - 1) * trials[0].configuration.control_period
+    step = trials[0].configuration.control_period
+    length = (episodes.energy.shape[1] - 1) * step
     successes = int(settled.sum())
 
     def mean(values: np.ndarray) -> tuple[float | None, float | None]:
@@ -186,6 +192,8 @@ def summarise(trials: Sequence[Trial], episodes: Episodes) -> Summary:
         periods=periods[0],
         margin=periods[1],
         periods_with_failures=float((np.where(settled, time, length) / period).mean()),
+        at_rest_at_once=int(np.isfinite(settling_times(trials, episodes, first=True)).sum()),
+        final_speed=float(np.nanmean(episodes.gripper_speed[:, -round(STAY / step) :])),
         relapsed=int((settled & (_last_above(trials, episodes) > time)).sum()),
         diverged=len(episodes.failures),
     )

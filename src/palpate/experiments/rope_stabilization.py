@@ -74,9 +74,9 @@ _NOISE = BASE.observation_noise
 FULL = Size(
     RECORDED_TRIALS,
     Settings().iterations,
-    Training(observation_noise=_NOISE),
+    Training(iterations=4000, observation_noise=_NOISE),
     ROPES,
-    {"recording": 1, "identification": 3, "training": 30, "evaluation": 30},
+    {"recording": 1, "identification": 3, "training": 20, "evaluation": 25},
 )
 QUICK = Size(
     4,
@@ -278,6 +278,11 @@ def _figures(trials: list[Trial], evaluated: dict[str, Episodes]) -> list[Figure
         rows += figures(summary, f".{pose}")
     for name in ("held still", "swing damper"):
         rows += figures(summaries[name], f".{name.replace(' ', '_')}")
+    # Success asks for an instant of rest; these say how much the gripper trembles otherwise.
+    for name, suffix in (("controlled", ""), ("swing damper", ".swing_damper")):
+        at_once = summaries[name].at_rest_at_once / len(trials)
+        rows.append(Figure(f"gripper_at_rest_at_once{suffix}", at_once, "", better="higher"))
+        rows.append(Figure(f"gripper_speed_at_end{suffix}", summaries[name].final_speed, "m/s"))
     rows.append(_left_when_still(trials, evaluated["held still"]))
     return rows
 

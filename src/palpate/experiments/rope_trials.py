@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -22,13 +22,15 @@ from palpate.models.rope import RopeState
 from palpate.networks import CommandPolicy
 from palpate.perception.velocity import VelocityEstimator
 from palpate.tasks.rope_stabilization import (
-    AT_REST,
     FIRST_ROOT,
     STABILISED,
     STAY,
     RopeStabilization,
 )
 from palpate.worlds.rope import RopeConfiguration, RopeWorld
+
+# Here and not in the task: what a policy is judged by must not follow what it is trained for.
+GRIPPER_AT_REST = 0.02  # m/s, the gripper's true speed when the second of low energy has passed
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class Seen:
     gripper_position: np.ndarray  # (worlds, 3) m
 
 
+@runtime_checkable
 class Controller(Protocol):
     """What moves the grippers of several worlds at once."""
 
@@ -196,18 +199,23 @@ class _Recorder:
 
 
 def settling_time(
-    energy: np.ndarray, gripper_speed: np.ndarray, control_period: float
+    energy: np.ndarray, gripper_speed: np.ndarray, control_period: float, first: bool = False
 ) -> np.ndarray:
     """When each rope was at rest (trials,) in s; NaN if it never was.
 
     The first instant from which on the energy stays below 1 % of its start for one second, at the
     end of which the gripper is at rest (slower than 0.02 m/s). Both arrays are (trials, times).
+
+    A gripper that trembles about 0.02 m/s finds such an instant soon, and one that is at rest needs
+    none: `first` only looks at the first second of low energy, and tells the two apart.
     """
     stay = round(STAY / control_period)
     above = ~(energy < STABILISED * energy[:, :1])  # NaN is above
     passed = np.cumsum(np.pad(above, ((0, 0), (1, 0))), axis=1)
     stays = passed[:, stay + 1 :] == passed[:, : -stay - 1]
-    settled = stays & (gripper_speed[:, stay:] < AT_REST)
+    if first:
+        stays &= np.cumsum(stays, axis=1) == 1
+    settled = stays & (gripper_speed[:, stay:] < GRIPPER_AT_REST)
     settled = np.pad(settled, ((0, 0), (0, 1)))  # a trial may be shorter than that second
     return np.where(settled.any(1), settled.argmax(1) * control_period, np.nan)
 

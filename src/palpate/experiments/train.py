@@ -33,7 +33,7 @@ def run(options: Train) -> Path:
     """
     file = folders.product_of(options.model, folders.MODEL, "identify")
     model = options.prepare(load_model(file)[0])
-    task = task_named(options.task)()
+    task = named_task(options.task)
     training = settings(options)
     name = f"train-{options.task}"
     configuration = {
@@ -66,10 +66,17 @@ def run(options: Train) -> Path:
                 wall_time_s=run.elapsed,
             )
             run.finish(result.to_dict())
-        print("\n".join(read_result(run.path / RESULT).lines()))
+        for figure in read_result(run.path / RESULT).figures:
+            value = "none" if figure.value is None else f"{figure.value:.4g} {figure.unit}"
+            print(f"{figure.name.replace('_', ' ').replace('.', ': ')} {value}".rstrip())
         title = f"How a controller was trained for {options.task}"
         folders.hand_over(options, run, title, folders.POLICY)
         return run.path
+
+
+def named_task(name: str) -> Task:
+    """The task of that name, as it is by default."""
+    return task_named(name)()  # type: ignore[call-arg]  # a task has defaults for all its fields
 
 
 def settings(options: Train) -> Training:

@@ -44,7 +44,7 @@ class Training:
     noise_curriculum: bool = True
     randomisation: bool = True
     augmentation: bool = True
-    iterations: int = 1000
+    iterations: int = 4000
     batch: int = 128  # episodes per iteration
     starts: int = 10_000  # K, the pool of start states
     stages: tuple[float, ...] = (0.5, 1.0)  # episode length, as shares of the task's duration
@@ -53,7 +53,9 @@ class Training:
     final_learning_rate: float = 0.02  # share of it left in the end (cosine)
     warm_up: int = 20  # iterations until the learning rate is reached
     clip: float = 1.0  # bound on the global norm of a gradient
-    observation_noise: float = 0.0  # of what the policy sees, in the observation's unit
+    # Standard deviation, in the observation's unit, of what the policy sees; velocities are then
+    # estimated as on a robot. 0: it sees the model's state itself, and trembles in noise later.
+    observation_noise: float = 5e-4
     width: int = 256
     depth: int = 2
     checkpoint_every: int = 100

@@ -120,6 +120,11 @@ class Rope(Model):
                     f"{name} of a rope of {nodes} nodes must have {count} elements, "
                     f"got shape {shape}"
                 )
+        if self.rest_bend.shape[-2:] != (nodes - 2, 3):
+            raise PalpateError(
+                f"rest_bend of a rope of {nodes} nodes must have the shape ({nodes - 2}, 3), "
+                f"got {self.rest_bend.shape}"
+            )
         if self.drive not in ("position", "velocity", "acceleration"):
             raise PalpateError(
                 f"unknown drive '{self.drive}'; there are: position, velocity, acceleration"
@@ -220,12 +225,13 @@ class Rope(Model):
         batch = state.position.shape[:-2]
         if not batch:
             batch = jnp.broadcast_shapes(
-                *(leaf.shape[:-1] for leaf in jax.tree.leaves(coefficients))
+                *(leaf.shape[:-1] for leaf in jax.tree.leaves(coefficients)),
+                *(leaf.shape[:-2] for leaf in jax.tree.leaves(rest_bend)),
             )
             if not batch:
                 return self._integrate((state, increment, rest_bend), coefficients, 1)
             state, increment, rest_bend = jax.tree.map(
-                lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape),
+                lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape[-2:]),
                 (state, increment, rest_bend),
             )
         return self._integrate_blocks((state, increment, rest_bend), coefficients, *batch)
@@ -420,7 +426,8 @@ class Rope(Model):
 
         Gravity, motion, stretch, bend and twist (seed 1: E_rope), minus the same of the rope
         hanging still, stretched by its own weight, from where the gripper is now: lowering the
-        gripper earns nothing. Raises `PalpateError` for a rope that is not held at its first end
+        gripper earns nothing. Never negative; what bending takes from a hanging rope's uneven
+        stretch is left out of that rest, some 1e-6 of a swing. Raises `PalpateError` for a rope that is not held at its first end
         alone: it has no such rest.
         """
         if self.driven != (0,):
@@ -445,7 +452,7 @@ class Rope(Model):
     def elastic_energy(self, position: Float[Array, "*batch nodes 3"]) -> Float[Array, "*batch"]:
         """Energy of stretch, bend and twist, J."""
         edge = jnp.diff(position, axis=-2)
-        length = jnp.linalg.norm(edge, axis=-1)
+        length = jnp.sqrt(jnp.sum(jnp.square(edge), axis=-1) + rope_kernel.COINCIDENT)
         direction = edge / self.rest_length[..., None]
         bend = jnp.diff(direction, axis=-2)
         binormal = jnp.cross(direction[..., 1:, :], bend)

@@ -6,6 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
@@ -15,13 +16,15 @@ from palpate.tasks.task import Start, Task
 
 STABILISED = 0.01  # of the start's energy: the seed's bar
 STAY = 1.0  # s that the energy has to stay below it
-AT_REST = 0.02  # m/s, the gripper's speed at the end of a success
+AT_REST = 0.05  # m/s, the gripper's mean speed in the last second of a success
 LEAST_ENERGY = 0.02  # of mass x gravity x length: a start that is all but at rest counts as this
 
 FIRST_ROOT = 1.2024  # of J0(2 x): a hanging chain's first frequency is 1.2024 sqrt(g / L)
 
 MOTION = 3.0  # s of random gripper motion, of which the last part is free swing
 STATES_PER_MOTION = 16
+
+_HANGING = np.array([0.0, 0.0, -1.0], np.float32)
 
 
 class RopeStabilization(Task):
@@ -217,14 +220,16 @@ class RopeStabilization(Task):
         """Gives "success", "settling_time" (s), "settling_periods" and "final_speed" (m/s).
 
         Success: the energy falls below 1 % of the start's and stays there for one second, and the
-        gripper is at rest in the end. The time is that of the first sample from which the energy
-        stays below, NaN without success. Periods are the rope's first, 2 pi / (1.2024 sqrt(g / L)).
+        gripper is at rest in the end: its "final_speed", the mean over the last second, is below
+        0.05 m/s, because 0.5 mm of noise in what a policy sees makes it tremble by 0.02 m/s. The
+        time is that of the first sample from which the energy stays below, NaN without success.
+        Periods are the rope's first, 2 pi / (1.2024 sqrt(g / L)).
         """
         share = self.energy_share(models, start, states)
         period, stay = models.control_period, round(STAY / models.control_period)
         below = jnp.cumsum(jnp.pad(share < STABILISED, ((0, 0), (1, 0))), axis=1, dtype=int)
         stays = below[:, stay:] - below[:, :-stay] == stay
-        speed = jnp.linalg.norm(states.velocity[:, -1, 0], axis=-1)
+        speed = jnp.mean(jnp.linalg.norm(states.velocity[:, -stay:, 0], axis=-1), axis=1)
         success = jnp.any(stays, axis=1) & (speed < AT_REST)
         time = jnp.where(success, (jnp.argmax(stays, axis=1) + 1) * period, jnp.nan)
         length = jnp.sum(models.rest_length, axis=-1)
@@ -235,9 +240,6 @@ class RopeStabilization(Task):
             "settling_periods": time / swing,
             "final_speed": speed,
         }
-
-
-_HANGING = jnp.array([0.0, 0.0, -1.0])
 
 
 def vertical_symmetry(

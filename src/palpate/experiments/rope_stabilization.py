@@ -74,9 +74,9 @@ _NOISE = BASE.observation_noise
 FULL = Size(
     RECORDED_TRIALS,
     Settings().iterations,
-    Training(iterations=4000, observation_noise=_NOISE),
+    Training(iterations=2000, observation_noise=_NOISE),
     ROPES,
-    {"recording": 1, "identification": 3, "training": 20, "evaluation": 25},
+    {"recording": 1, "identification": 3, "training": 10, "evaluation": 25},
 )
 QUICK = Size(
     4,

@@ -24,6 +24,7 @@ from palpate.result import Figure, Result, read_result
 from palpate.runs import Run, read_metrics
 from palpate.storage import read_json
 from palpate.tasks import TASKS
+from palpate.worlds.rope import RopeWorld
 from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
 
 TRUTH = {"cart": Cart(mass=2.0, friction=0.3), "pendulum": Pendulum(length=0.7, damping=0.4)}
@@ -393,7 +394,11 @@ def test_a_stopped_identification_goes_on_to_the_same_result(tmp_path, monkeypat
 
 
 def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
+    def blind(world, width, height):
+        raise PalpateError("no OpenGL here; install libegl1")
+
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.7)
+    monkeypatch.setattr(RopeWorld, "render", blind)
     tiny = demo.Size(
         trials=2, duration=0.6, identification=(1, 1, 1), training=2, batch=2, starts=32, ropes=1
     )
@@ -405,7 +410,9 @@ def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
     assert "m per metre of rope" in said
     figures = {figure.name: figure.value for figure in read_result(folder / "result.json").figures}
     assert 0.0 < figures["tip_rmse_per_length"] < 0.2
+    assert "note: the rope is drawn, not rendered: no OpenGL here; install libegl1\n" in said
     page = (folder / folders.REPORT).read_text()
+    assert "the rope is drawn, not rendered" in page
     assert all(name in page for name in ("identify-rope", "held still", "bend stiffness"))
     model, _ = load_model(folder / "identify" / folders.MODEL)
     assert model.nodes == 6

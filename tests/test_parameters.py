@@ -191,6 +191,42 @@ def test_build_sets_free_values_keeps_the_rest_and_constrains():
     assert np.allclose(free.unconstrained(beyond).stiffness, 10.0 * np.exp(3.0))
 
 
+def test_projecting_gives_back_what_is_legal_and_moves_the_rest_to_the_limit():
+    free = FreeParameters(chain())
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        values = {
+            path: jnp.asarray(rng.normal(size=value.shape), jnp.float32)
+            for path, value in free.initial.items()
+        }
+        values["stiffness"] = jnp.minimum(values["stiffness"], 1.6)  # 50 N/m is log(5)
+        projected = free.project(values)
+        assert projected.keys() == values.keys()
+        for path, value in values.items():
+            assert projected[path].shape == value.shape
+            np.testing.assert_allclose(projected[path], value, atol=1e-5)
+    beyond = free.initial | {"stiffness": jnp.asarray(3.0), "offset": jnp.asarray(2.0)}
+    projected = free.project(beyond)
+    assert float(projected["stiffness"]) == pytest.approx(np.log(5.0))
+    assert float(projected["offset"]) == pytest.approx(2.0)
+    ours = free.unconstrained(projected)
+    for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(free.build(beyond)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5)
+    again = free.project(projected)
+    np.testing.assert_allclose(again["stiffness"], projected["stiffness"], atol=1e-6)
+
+
+def test_projected_a_descent_comes_back_from_the_limit():
+    free = FreeParameters(declare(chain(), stiffness={"shared": False}))
+    beyond = free.initial | {"stiffness": jnp.asarray([3.0, 4.0, 0.0])}
+
+    def slope(values):
+        return jax.grad(lambda x: free.build(x).stiffness.sum())(values)["stiffness"]
+
+    assert np.array_equal(slope(beyond), [0.0, 0.0, 10.0])
+    assert np.all(slope(free.project(beyond)) >= 10.0)
+
+
 @pytest.mark.parametrize("model", [Cart(1.7, 0.2), Pendulum(0.8, 0.3)], ids=["cart", "pendulum"])
 def test_the_initial_free_values_build_the_reference(model):
     free = FreeParameters(model)
@@ -261,6 +297,7 @@ def test_float64_is_kept_throughout(float64):
 def test_no_operation_promotes_a_dtype(strict):
     free = FreeParameters(chain())
     jax.grad(lambda x: free.build(x).stiffness.sum() + free.penalty(x))(free.initial)
+    free.project(free.initial)
     sample_prior(chain(), jax.random.key(0))
     randomise(chain(), jax.random.key(0), jnp.asarray(0.5), 2)
 

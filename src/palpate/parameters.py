@@ -54,6 +54,11 @@ class LogNormal:
         """Value at a whitened coordinate."""
         return self._centre(reference) * jnp.exp(self.sigma * free)
 
+    @property
+    def centre(self) -> float | None:
+        """The median, None where it is the instance's own value."""
+        return self.median
+
     def _centre(self, reference: Array) -> Array | float:
         return reference if self.median is None else self.median
 
@@ -70,6 +75,11 @@ class Normal:
     def __post_init__(self) -> None:
         if self.sigma <= 0:
             raise PalpateError(f"a Normal needs a positive sigma, got {self}")
+
+    @property
+    def centre(self) -> float | None:
+        """The mean, None where it is the instance's own value."""
+        return self.mean
 
     def to_free(self, value: Array, reference: Array) -> Array:
         """Whitened coordinate of a value; `reference` is the instance's value."""
@@ -92,6 +102,11 @@ class Uniform:
     def __post_init__(self) -> None:
         if not self.lower < self.upper:
             raise PalpateError(f"a Uniform needs lower < upper, got {self}")
+
+    @property
+    def centre(self) -> float:
+        """The middle."""
+        return 0.5 * (self.lower + self.upper)
 
     def to_free(self, value: Array, reference: Array) -> Array:
         """Whitened coordinate of a value inside the bounds."""

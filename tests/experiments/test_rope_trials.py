@@ -59,6 +59,8 @@ def test_time_counts_from_the_instant_after_which_energy_stays_low():
 
 def test_a_second_is_needed():
     assert np.isnan(settled(energy((4, 0.5), (10, 0.009))))
+    assert np.isnan(settled(energy((4, 0.5), (10, 0.009), (5, 0.5))))
+    assert settled(energy((4, 0.5), (11, 0.009), (5, 0.5))) == pytest.approx(0.5)
 
 
 def test_one_instant_above_starts_the_second_anew():

@@ -21,7 +21,7 @@ from palpate.recording import Aligned
 from palpate.runs import Run
 from toys import Cart, Pendulum
 
-SHORT = Settings(iterations=(20, 20, 80), windows=8)
+SHORT = Settings(horizons=(0.3, 1.0), iterations=(30, 80), windows=8)
 
 
 def recorded(model, start, actions, noise=0.0, seed=0):
@@ -130,7 +130,7 @@ def test_a_rope_is_recovered():
     found = identify(start, aligned, SHORT)
     after = prediction_error(found, aligned).mean_absolute
     assert after < 0.2 * before
-    assert after < 2e-4  # the noise is 5e-5
+    assert after < 3e-4  # the noise is 5e-5, and makes the start's velocity uncertain
     assert float(found.bend_stiffness[0]) == pytest.approx(4e-3, rel=0.2)
 
 

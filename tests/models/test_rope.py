@@ -94,13 +94,13 @@ def test_forces_do_not_move_a_gripper_and_a_gripper_moves_the_rope():
 
 
 def test_hanging_at_rest_has_no_energy_and_everything_else_has(float64):
-    limp = rope(bend_stiffness=0.0, twist_stiffness=1e-3)
+    limp = rope(bend_stiffness=0.0, twist_stiffness=1e-3, grip_stiffness=0.0)
     resting = at_rest(hanging(limp))
     assert float(energy(limp, resting)) == pytest.approx(0.0, abs=1e-10)
     gradient = jax.grad(lambda position: limp.energy(at_rest(position)))(resting.position)
     np.testing.assert_allclose(gradient[1:], 0, atol=1e-8)  # an equilibrium
     # bending shares the weight among neighbours: hanging keeps what that costs, far below a swing
-    held = rope(bend_stiffness=0.02, twist_stiffness=1e-3)
+    held = rope(bend_stiffness=0.02, twist_stiffness=1e-3, grip_stiffness=0.0)
     stretch = -np.diff(hanging(held)[:, 2]) / np.asarray(held.rest_length)
     shared = 0.5 * 0.02 * np.sum(np.diff(stretch) ** 2)
     assert float(energy(held, resting)) == pytest.approx(shared, abs=1e-10)
@@ -113,7 +113,8 @@ def test_hanging_at_rest_has_no_energy_and_everything_else_has(float64):
 
 
 def test_energy_counts_motion_height_and_bending_as_the_seed_does(float64):
-    held = rope(stretch_stiffness=800.0, bend_stiffness=0.02, twist_stiffness=0.0)
+    none = {"twist_stiffness": 0.0, "grip_stiffness": 0.0}
+    held = rope(stretch_stiffness=800.0, bend_stiffness=0.02, **none)
     resting = jnp.asarray(hanging(held))
     velocity = jnp.full((NODES, 3), 2.0)
     assert float(energy(held, RopeState(resting, velocity))) == pytest.approx(0.5 * 0.06 * 12)
@@ -130,6 +131,9 @@ def test_energy_counts_motion_height_and_bending_as_the_seed_does(float64):
     corner = corner.at[3:, 1].set(across[2, 1])
     difference = float(held.elastic_energy(corner) - held.elastic_energy(across))
     assert difference == pytest.approx(0.02)  # k (1 - cos 90 degrees)
+    gripped = eqx.tree_at(lambda r: r.grip_stiffness, held, jnp.asarray(0.03))
+    difference = float(gripped.elastic_energy(across) - held.elastic_energy(across))
+    assert difference == pytest.approx(0.03)  # the first segment lies at 90 degrees from down
 
 
 @pytest.mark.parametrize("driven", [(0, 5), (5,), (0, 1)])
@@ -233,7 +237,7 @@ def test_a_rope_between_two_hands_comes_to_lie_in_its_bends_at_rest(float64):
     length = np.linalg.norm(edge, axis=1)
     made = Rope.from_rest_lengths(
         length, 0.06, driven=(0, NODES - 1), gravity=0.0, rest_bend=np.zeros((NODES - 2, 3)),
-        bend_stiffness=0.05, air_drag=0.02, twist_stiffness=0.0,
+        bend_stiffness=0.05, air_drag=0.02, twist_stiffness=0.0, grip_stiffness=0.0,
     )  # fmt: skip
     rest_bend = np.diff(edge / length[:, None], axis=0)
     made = eqx.tree_at(lambda r: r.rest_bend, made, jnp.asarray(rest_bend))

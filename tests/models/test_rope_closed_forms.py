@@ -20,13 +20,17 @@ NODES = 11
 run = jax.jit(rollout)
 energy = jax.jit(lambda rope, states: rope.energy(states))
 WITHOUT_DAMPING = {
-    "stretch_damping": 0.0, "bend_damping": 0.0, "air_drag": 0.0, "quadratic_drag": 0.0
+    "stretch_damping": 0.0, "bend_damping": 0.0, "grip_damping": 0.0, "air_drag": 0.0,
+    "quadratic_drag": 0.0,
 }  # fmt: skip
 
 
 def rope(nodes=NODES, length=1.0, **fields) -> Rope:
     """Soft enough for coarse steps; without damping unless some is given."""
-    values = {"stretch_stiffness": 300.0, "bend_stiffness": 0.0, "twist_stiffness": 0.0}
+    values = {
+        "stretch_stiffness": 300.0, "bend_stiffness": 0.0, "twist_stiffness": 0.0,
+        "grip_stiffness": 0.0,
+    }  # fmt: skip
     return Rope.uniform(
         length=length, mass=0.1, nodes=nodes, **{**WITHOUT_DAMPING, **values, **fields}
     )
@@ -182,7 +186,13 @@ def test_energy_is_kept_without_damping():
 
 @pytest.mark.parametrize(
     "damping",
-    [{"stretch_damping": 0.1}, {"bend_damping": 1e-3}, {"air_drag": 5e-3}, {"quadratic_drag": 0.1}],
+    [
+        {"stretch_damping": 0.1},
+        {"bend_damping": 1e-3},
+        {"grip_damping": 1e-2},
+        {"air_drag": 5e-3},
+        {"quadratic_drag": 0.1},
+    ],
     ids=lambda damping: next(iter(damping)),
 )
 def test_energy_only_falls_with_damping_and_a_still_gripper(damping):

@@ -27,6 +27,8 @@ def uneven_rope(rng, **settings) -> Rope:
         bend_stiffness=rng.uniform(0.05, 0.2, NODES - 2),
         bend_damping=rng.uniform(1e-3, 2e-3, NODES - 2),
         twist_stiffness=rng.uniform(0.05, 0.2, NODES - 3),
+        grip_stiffness=0.1,
+        grip_damping=2e-3,
         air_drag=0.02,
         quadratic_drag=0.01,
         **settings,
@@ -67,12 +69,13 @@ def rayleigh(rope, position, velocity):
     square = jnp.sum(tangent**2, axis=1) + rope_kernel.FOLDED
     return 0.5 * (
         jnp.sum(rope.stretch_damping * stretching**2)
+        + rope.grip_damping * jnp.sum(turning[0] ** 2)
         + jnp.sum(rope.bend_damping * (jnp.sum(bending**2, axis=1) - along**2 / square))
     )
 
 
 def independent_energy(rope, position) -> float:
-    """Stretch, bend and twist from lengths, angles and dihedral angles, in NumPy."""
+    """Stretch, bend, twist and grip from lengths, angles and dihedral angles, in NumPy."""
     edge = np.diff(np.asarray(position), axis=0)
     length = np.linalg.norm(edge, axis=1)
     relative = length / np.asarray(rope.rest_length)
@@ -91,8 +94,11 @@ def independent_energy(rope, position) -> float:
     box = relative[:-2] * relative[1:-1] * relative[2:] * np.sin(angle[:-1]) * np.sin(angle[1:])
     # the difference of two directions by the law of cosines: 2 - 2 cos(angle) where none stretches
     bend_squared = relative[1:] ** 2 + relative[:-1] ** 2 - 2 * product * np.cos(angle)
+    # the first direction against down, by the law of cosines too
+    grip_squared = 1 + relative[0] ** 2 + 2 * relative[0] * u[0, 2]
     return float(
-        np.sum(0.5 * np.asarray(rope.stretch_stiffness) * (length - rope.rest_length) ** 2)
+        0.5 * float(rope.grip_stiffness) * grip_squared
+        + np.sum(0.5 * np.asarray(rope.stretch_stiffness) * (length - rope.rest_length) ** 2)
         + np.sum(0.5 * np.asarray(rope.bend_stiffness) * bend_squared)
         + np.sum(
             0.5
@@ -128,11 +134,9 @@ def test_forces_are_minus_the_gradient_of_the_energy(bending, stretching, float6
 
 @shapes
 def test_a_rope_bent_at_rest_is_drawn_to_its_bends(bending, stretching, float64):
-    """Its ends are held, and the frame of its bends with them: the nodes between feel the energy."""
+    """Its ends are held, and the frame of its bends with them: nodes between feel the energy."""
     rng = np.random.default_rng(9)
-    rope = uneven_rope(
-        rng, driven=(0, NODES - 1), rest_bend=0.3 * rng.normal(size=(NODES - 2, 3))
-    )
+    rope = uneven_rope(rng, driven=(0, NODES - 1), rest_bend=0.3 * rng.normal(size=(NODES - 2, 3)))
     straight = eqx.tree_at(lambda r: r.rest_bend, rope, jnp.zeros((NODES - 2, 3)))
     gradient = jax.jit(jax.grad(elastic_energy, argnums=1))
     for _ in range(5):
@@ -148,7 +152,7 @@ def test_bending_is_linear(float64):
     """Twice as far from straight, twice the force, however far: a crumpled rope is no stiffer."""
     rng = np.random.default_rng(10)
     rope = uneven_rope(rng)
-    names = ("stretch_stiffness", "twist_stiffness")
+    names = ("stretch_stiffness", "twist_stiffness", "grip_stiffness")
     rope = eqx.tree_at(
         lambda r: [getattr(r, name) for name in names],
         rope,
@@ -182,14 +186,20 @@ def test_damping_is_minus_the_gradient_of_the_dissipation_and_takes_power(
         assert power < 0
 
 
-def without_bend_damping(rope):
-    return eqx.tree_at(lambda r: r.bend_damping, rope, jnp.zeros(NODES - 2))
+def without_grip(rope):
+    nothing = jnp.zeros_like(rope.grip_stiffness)
+    return eqx.tree_at(lambda r: (r.grip_stiffness, r.grip_damping), rope, (nothing, nothing))
+
+
+def free_to_turn(rope):
+    """Without the torques from outside: the grip's, and bend damping's about the tangent."""
+    return eqx.tree_at(lambda r: r.bend_damping, without_grip(rope), jnp.zeros(NODES - 2))
 
 
 @shapes
 def test_internal_forces_have_no_sum_and_no_torque(bending, stretching, float64):
     rng = np.random.default_rng(4)
-    rope = without_bend_damping(uneven_rope(rng))
+    rope = free_to_turn(uneven_rope(rng))
     position = bent(rope, rng, bending, stretching)
     force = internal_forces(rope, position, jnp.asarray(rng.normal(size=position.shape)))
     scale = np.abs(force).max()
@@ -199,7 +209,7 @@ def test_internal_forces_have_no_sum_and_no_torque(bending, stretching, float64)
 
 def test_a_bent_rope_that_turns_as_a_whole_in_its_plane_is_not_damped(float64):
     rng = np.random.default_rng(8)
-    rope = uneven_rope(rng)
+    rope = without_grip(uneven_rope(rng))
     position = np.asarray(bent(rope, rng, 0.5)) * [1.0, 0.0, 1.0]
     edge = np.diff(position, axis=0)  # at rest length: a stretch that turns along also damps
     edge *= np.asarray(rope.rest_length / np.linalg.norm(edge, axis=1))[:, None]
@@ -220,7 +230,7 @@ def test_a_bent_rope_that_turns_as_a_whole_in_its_plane_is_not_damped(float64):
 def test_a_rope_that_nothing_holds_keeps_both_momenta(float64):
     """Without gravity, drag and gripper. Symplectic Euler keeps angular momentum exactly."""
     rng = np.random.default_rng(5)
-    rope = without_bend_damping(uneven_rope(rng))
+    rope = free_to_turn(uneven_rope(rng))
     position = bent(rope, rng, 0.5, 0.1)
     velocity = jnp.asarray(rng.normal(size=position.shape))
     mass = rng.uniform(0.5, 1.5, NODES) * rope.node_mass
@@ -260,7 +270,7 @@ def test_lanes_do_not_touch_each_other(float64):
         np.testing.assert_allclose(together.velocity[lane], alone.velocity, atol=1e-12)
 
 
-@pytest.mark.parametrize("drive", ["velocity", pytest.param("position", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("drive", [pytest.param("velocity", marks=pytest.mark.slow), "position"])
 def test_every_gradient_matches_finite_differences(drive, float64):
     """Each element of each parameter, of the state and of the actions, over several periods."""
     rng = np.random.default_rng(7)

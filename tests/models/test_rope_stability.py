@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.models.model import rollout
-from palpate.models.rope import STABILITY_LIMIT, Rope
-from palpate.parameters import FreeParameters, declare, randomise, sample_prior
+from palpate.models.rope import Rope
+from palpate.models.rope_stability import LIMIT
+from palpate.parameters import FreeParameters, declare, randomise, sample_prior, value_of
 from rope_states import at_rest, bent, hanging, still
 
 NODES = 8
@@ -22,6 +23,10 @@ coordinates = FreeParameters(
     declare(reference, node_mass={"fixed": False}, gravity={"fixed": False})
 )
 build = jax.jit(jax.vmap(coordinates.build))
+project = jax.jit(jax.vmap(coordinates.project))
+load_of = jax.jit(jax.vmap(lambda rope: rope.stability_load()))
+elastic_energy = jax.jit(jax.vmap(lambda rope, position: rope.elastic_energy(position)))
+LEGAL = LIMIT * 1.0002  # up to rounding
 
 
 def random_free(rng, deviation, batch=BATCH):
@@ -31,46 +36,113 @@ def random_free(rng, deviation, batch=BATCH):
     }
 
 
+def crumpled(ropes, rng):
+    """Every segment at rest length in a direction of its own, at rest."""
+    members = [jax.tree.map(lambda leaf, i=i: leaf[i], ropes) for i in range(BATCH)]
+    starts = jnp.stack([bent(member, rng, 9.0) for member in members])
+    return at_rest(starts.astype(jnp.float32))
+
+
+def whirled(rng):
+    """Velocities (m/s) of a gripper on an ellipse at 0.3 to 3 Hz, at most 1.5 along each axis."""
+    time = 0.01 * np.arange(1, 301)[None, :, None]
+    frequency, phase = rng.uniform(0.3, 3, (BATCH, 1, 1)), rng.uniform(0, 6, (BATCH, 1, 3))
+    velocity = 1.5 * np.sin(2 * np.pi * frequency * time + phase)
+    return jnp.asarray(velocity[:, :, None], jnp.float32)
+
+
 @given(seed=st.integers(0, 2**32 - 1), deviation=st.floats(0.0, 10.0))
 @settings(deadline=None, max_examples=25)
-def test_any_free_values_build_a_stable_rope_that_stays_finite(seed, deviation):
-    """Three seconds from a violently bent start, the gripper moving at up to 2.6 m/s."""
+def test_any_free_values_build_a_stable_rope_however_crumpled_and_shaken(seed, deviation):
+    """Three seconds from a crumpled start; let alone, it gains no energy.
+
+    At load L symplectic Euler keeps an ellipse around the energy, of which it shows up to
+    1 / (1 - sqrt(L) / 2) = 20 times the start's at `LIMIT`; an instability shows e^100.
+    """
     rng = np.random.default_rng(seed)
     ropes = build(random_free(rng, deviation))
     load = np.asarray(ropes.stability_load())
     assert load.shape == (BATCH, NODES)
-    assert np.all(load < 4.0)
-    members = [jax.tree.map(lambda leaf, i=i: leaf[i], ropes) for i in range(BATCH)]
-    starts = jnp.stack([bent(member, rng, 9.0) for member in members])
-    time = 0.01 * np.arange(1, 301)[None, :, None]
-    frequency, phase = rng.uniform(0.3, 3, (BATCH, 1, 1)), rng.uniform(0, 6, (BATCH, 1, 3))
-    velocity = 1.5 * np.sin(2 * np.pi * frequency * time + phase)
-    states = run(
-        ropes, at_rest(starts.astype(jnp.float32)), jnp.asarray(velocity[:, :, None], jnp.float32)
+    assert np.all(load <= LEGAL)
+    start = crumpled(ropes, rng)
+    shaken = run(ropes, start, whirled(rng))
+    assert np.all(np.isfinite(shaken.position))
+    assert np.all(np.isfinite(shaken.velocity))
+    alone = run(ropes, start, jnp.zeros((BATCH, 300, 1, 3)))
+    mass, gravity = np.asarray(ropes.node_mass)[:, None], np.asarray(ropes.gravity)[:, None]
+    motion = 0.5 * np.sum(mass * np.sum(np.asarray(alone.velocity) ** 2, axis=-1), axis=-1)
+    fall = np.asarray(start.position)[:, None, :, 2] - np.asarray(alone.position)[..., 2]
+    work = gravity * np.sum(mass * fall, axis=-1)
+    stored = elastic_energy(ropes, start.position)
+    weight = gravity[:, 0] * np.sum(mass[:, 0] * np.sum(ropes.rest_length, axis=-1)[:, None], -1)
+    energy = motion + elastic_energy(ropes, alone.position) - np.maximum(work, 0)
+    assert np.all(energy <= 20 * (stored + weight)[:, None])
+
+
+@pytest.mark.parametrize("deviation", [0.0, 1.0])
+def test_no_crumpled_and_shaken_rope_is_faster_than_a_whip(deviation):
+    """Ropes as the prior expects them, the gripper at up to 2.6 m/s: measured, 22 m/s.
+
+    With a tenth of the time step it is the same: the whip is physics and not the integrator.
+    """
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        ropes = build(random_free(rng, deviation))
+        states = run(ropes, crumpled(ropes, rng), whirled(rng))
+        assert float(jnp.linalg.norm(states.velocity, axis=-1).max()) < 30.0
+
+
+@pytest.mark.parametrize("deviation", [0.3, 1.0, 3.0, 10.0])
+def test_what_is_constrained_is_legal_and_constrained_again_stays(deviation):
+    free = random_free(np.random.default_rng(0), deviation, 64)
+    once = build(free)
+    assert float(load_of(once).max()) <= LEGAL
+    twice = jax.jit(jax.vmap(lambda rope: rope.constrain()))(once)
+    for first, second in zip(jax.tree.leaves(once), jax.tree.leaves(twice), strict=True):
+        np.testing.assert_array_equal(first, second)
+    as_given = jax.vmap(coordinates.unconstrained)(free)
+    legal = np.all(load_of(as_given) <= LIMIT, axis=1)
+    assert np.any(legal) == (deviation <= 1.0)
+    for given_value, built in zip(jax.tree.leaves(as_given), jax.tree.leaves(once), strict=True):
+        np.testing.assert_array_equal(given_value[legal], built[legal])
+
+
+@pytest.mark.parametrize("deviation", [0.3, 1.0, 3.0, 10.0])
+def test_projected_free_values_are_those_of_the_legal_rope(deviation):
+    free = random_free(np.random.default_rng(1), deviation, 64)
+    projected = project(free)
+    as_given, as_projected = (
+        jax.jit(jax.vmap(coordinates.unconstrained))(values) for values in (free, projected)
     )
-    assert np.all(np.isfinite(states.position))
-    assert np.all(np.isfinite(states.velocity))
+    assert float(load_of(as_projected).max()) <= LEGAL
+    legal = np.all(load_of(as_given) <= LIMIT, axis=1)
+    for path, value in free.items():
+        np.testing.assert_allclose(projected[path][legal], value[legal], atol=2e-5)
+        np.testing.assert_allclose(
+            value_of(as_projected, path), value_of(build(free), path), rtol=1e-4, atol=1e-30
+        )
 
 
-def test_the_gradient_through_the_constraint_is_finite_and_leads_back():
+def test_beyond_the_limit_no_gradient_is_felt_and_projected_all_of_it():
+    """Softening everything alike does nothing beyond the limit, and must not be lost at it."""
+
     @jax.jit
     @jax.vmap
     @jax.value_and_grad
-    def load(free):
-        return jnp.max(coordinates.build(free).stability_load())
+    def stiffness(free):
+        return jnp.mean(jnp.log(coordinates.build(free).stretch_stiffness))
 
-    rng = np.random.default_rng(0)
+    free = {path: jnp.zeros((40, *v.shape)) for path, v in coordinates.initial.items()}
+    free["stretch_stiffness"] += jnp.linspace(3.0, 6.0, 40)[:, None]
+    _, beyond = stiffness(free)
+    _, at_the_limit = stiffness(project(free))
+    for gradient, low, high in ((beyond, -0.1, 0.1), (at_the_limit, 0.99, 1.01)):
+        total = jnp.sum(gradient["stretch_stiffness"], axis=-1)  # the prior's sigma is 1
+        assert low < float(total.min()) <= float(total.max()) < high
     for deviation in (1.0, 3.0, 10.0):
-        value, gradient = load(random_free(rng, deviation, 64))
-        assert np.all(value < 4.0)
+        _, gradient = stiffness(random_free(np.random.default_rng(0), deviation, 64))
         for leaf in jax.tree.leaves(gradient):
             assert np.all(np.isfinite(leaf))
-    # everything stiffer means a larger load, however far beyond the limit
-    for beyond in (1.0, 3.0):
-        free = {path: jnp.zeros((1, *v.shape)) for path, v in coordinates.initial.items()}
-        free["stretch_stiffness"] += beyond
-        _, gradient = load(free)
-        assert float(jnp.sum(gradient["stretch_stiffness"])) > 0
 
 
 def test_what_is_drawn_for_training_is_stable():
@@ -78,14 +150,14 @@ def test_what_is_drawn_for_training_is_stable():
     randomised = randomise(stiff, jax.random.key(0), 1.0, 50)
     assert float(np.ptp(randomised.bend_damping)) > 0
     for rope in (randomised, sample_prior(stiff, jax.random.key(1))):
-        assert float(rope.stability_load().max()) < STABILITY_LIMIT * 1.0001
+        assert float(rope.stability_load().max()) <= LEGAL
 
 
 def test_far_from_the_limit_nothing_is_changed_and_beyond_only_what_must_be():
     modest = Rope.uniform(nodes=21, stretch_stiffness=500.0, bend_damping=1e-4)
-    assert float(modest.stability_load().max()) < 0.8 * STABILITY_LIMIT
-    np.testing.assert_allclose(modest.stretch_stiffness, 500.0, rtol=1e-6)
-    np.testing.assert_allclose(modest.bend_damping, 1e-4, rtol=1e-6)
+    assert float(modest.stability_load().max()) < 0.8 * LIMIT
+    np.testing.assert_array_equal(modest.stretch_stiffness, np.full(20, 500.0, np.float32))
+    np.testing.assert_array_equal(modest.bend_damping, np.full(19, 1e-4, np.float32))
     stiff = np.full(20, 500.0)
     stiff[-1] = 1e6
     made = Rope.uniform(nodes=21, stretch_stiffness=stiff, bend_damping=1e-4)
@@ -96,7 +168,7 @@ def test_far_from_the_limit_nothing_is_changed_and_beyond_only_what_must_be():
 def test_the_constraint_stands_a_rope_without_any_stiffness_or_damping():
     limp = dict.fromkeys(
         ("stretch_stiffness", "stretch_damping", "bend_stiffness", "bend_damping",
-         "twist_stiffness", "air_drag", "quadratic_drag"), 0.0,
+         "twist_stiffness", "grip_stiffness", "grip_damping", "air_drag", "quadratic_drag"), 0.0,
     )  # fmt: skip
     for leaf in jax.tree.leaves(Rope.uniform(nodes=NODES, **limp).constrain()):
         assert np.all(np.isfinite(leaf))
@@ -117,7 +189,8 @@ def loaded(rope, load):
     """The rope with all stiffness and damping scaled to a load, past any constraint."""
     factor = load / float(rope.stability_load().max())
     names = (
-        "stretch_stiffness", "stretch_damping", "bend_stiffness", "bend_damping", "twist_stiffness"
+        "stretch_stiffness", "stretch_damping", "bend_stiffness", "bend_damping",
+        "twist_stiffness", "grip_stiffness", "grip_damping",
     )  # fmt: skip
     return eqx.tree_at(
         lambda r: [getattr(r, name) for name in names],
@@ -127,8 +200,9 @@ def loaded(rope, load):
 
 
 NONE = dict.fromkeys(
-    ("stretch_damping", "bend_damping", "twist_stiffness", "air_drag", "quadratic_drag"), 0.0
-)
+    ("stretch_damping", "bend_damping", "twist_stiffness", "grip_stiffness", "grip_damping",
+     "air_drag", "quadratic_drag"), 0.0,
+)  # fmt: skip
 ONE_TERM = {
     "stretch": {"stretch_stiffness": 300.0, "bend_stiffness": 0.0},
     "stretch damping": {"stretch_stiffness": 3.0, "bend_stiffness": 0.0, "stretch_damping": 0.5},
@@ -146,7 +220,7 @@ def test_the_bound_is_sharp(term, float64):
     rng = np.random.default_rng(0)
     start = hanging(rope) + 1e-6 * rng.normal(size=(21, 3)) * (np.arange(21) > 0)[:, None]
     actions = still(rope, 60)
-    for load, diverges in ((STABILITY_LIMIT, False), (4.4, True)):
+    for load, diverges in ((LIMIT, False), (4.4, True)):
         states = run(loaded(rope, load), at_rest(start), actions)
         growth = float(jnp.abs(states.position[-1] - hanging(rope)).max()) / 1e-6
         assert (not growth < 1e3) == diverges, (load, growth)
@@ -157,26 +231,25 @@ def stiffest(rope, position):
     """The largest h^2 k / m of any direction in which the free nodes can move."""
     shape = position.shape
     hessian = jax.hessian(lambda x: rope.elastic_energy(x.reshape(shape)))(position.ravel())
-    weight = jnp.repeat(rope._free_nodes() / jnp.sqrt(rope.node_mass), 3)
+    weight = jnp.repeat(rope.free_nodes() / jnp.sqrt(rope.node_mass), 3)
     return rope.time_step**2 * jnp.linalg.eigvalsh(hessian * weight * weight[:, None])[-1]
 
 
 @pytest.mark.parametrize("bending", [0.0, 0.1, 0.5, 9.0])
 def test_the_load_bounds_the_stiffness_of_any_shape(bending, float64):
-    """All elements at once, uneven; segments at rest length or stretched by up to a tenth.
-
-    The curvature of bending adds up to 4 / sqrt(12) (16 %) at a joint of 55 degrees, which the
-    margin between `STABILITY_LIMIT` and 4 holds together with the bound's own slack.
-    """
+    """Uneven elements, all at once or of one kind; segments stretched or shortened by a tenth."""
     rng = np.random.default_rng(1)
-    for _ in range(40):
+    kinds = ("stretch", "bend", "twist", "grip")
+    for dominant in 10 * (None, *kinds):
+        stretch, bend, twist, grip = (1.0 if dominant in (None, kind) else 1e-5 for kind in kinds)
         length = rng.uniform(0.04, 0.1, NODES - 1)
         rope = Rope.from_rest_lengths(
             length, 0.05, stretch_damping=0.0, bend_damping=0.0,
-            stretch_stiffness=200 * np.exp(rng.normal(size=NODES - 1)),
-            bend_stiffness=0.2 * np.exp(rng.normal(size=NODES - 2)),
-            twist_stiffness=3e-3 * np.exp(rng.normal(size=NODES - 3)),
+            stretch_stiffness=200 * stretch * np.exp(rng.normal(size=NODES - 1)),
+            bend_stiffness=0.2 * bend * np.exp(rng.normal(size=NODES - 2)),
+            twist_stiffness=3e-3 * twist * np.exp(rng.normal(size=NODES - 3)),
+            grip_stiffness=0.2 * grip * np.exp(rng.normal()), grip_damping=0.0,
             driven=(0, 1) if rng.random() < 0.5 else (0,),
         )  # fmt: skip
-        position = bent(rope, rng, bending) * (1 + 0.1 * rng.random())
-        assert float(stiffest(rope, position)) < 1.05 * float(rope.stability_load().max())
+        position = bent(rope, rng, bending, 0.1)
+        assert float(stiffest(rope, position)) <= 1.001 * float(rope.stability_load().max())

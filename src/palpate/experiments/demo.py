@@ -92,7 +92,8 @@ def run(options: Demo, size: Size = Size()) -> Path:
     )
     write_json(out / RESULT, result.to_dict())
     stages = [recording.parent, identified, trained, evaluated]
-    build_report([out, *stages], out / folders.REPORT, "A rope, from recording to rest")
+    notes = read_result(evaluated / RESULT).settings["notes"]
+    build_report([out, *stages], out / folders.REPORT, "A rope, from recording to rest", notes)
     tip, success, periods, seconds, still = (figure.value for figure in figures)
     print()
     print(f"tip error {tip:.4f} m per metre of rope, {size.duration:g} s ahead, unseen motions")

@@ -8,7 +8,8 @@ from palpate.experiments.options import Evaluate
 from palpate.experiments.train import figures_in_model, named_task
 from palpate.models.files import load_model
 from palpate.networks import load_policy
-from palpate.result import Figure, Result
+from palpate.result import Result, read_result
+from palpate.runs import RESULT
 from palpate.storage import write_text
 
 TABLE = "table.txt"
@@ -41,8 +42,8 @@ def run(options: Evaluate) -> Path:
                 figures += figures_in_model(named_task(options.task), model, policy, options.seed)
             result = Result(
                 name=name,
-                figures=[*figures, Figure("wall_time_s", run.elapsed, "s")],
-                settings=configuration | found.settings,
+                figures=figures,
+                settings=configuration | found.settings | {"notes": found.notes},
                 seeds=[options.seed],
                 split=found.split,
                 wall_time_s=run.elapsed,
@@ -50,5 +51,8 @@ def run(options: Evaluate) -> Path:
             write_text(run.path / TABLE, "\n".join(found.table) + "\n")
             run.finish(result.to_dict())
         print((run.path / TABLE).read_text(encoding="utf-8"), end="")
-        folders.hand_over(options, run, f"What a controller does: {options.task}")
+        notes = read_result(run.path / RESULT).settings["notes"]
+        for note in notes:
+            print(f"note: {note}")
+        folders.hand_over(options, run, f"What a controller does: {options.task}", notes=notes)
         return run.path

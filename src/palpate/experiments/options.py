@@ -140,12 +140,16 @@ class Train(Options, ABC):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found: figures, a table for a person, and how the trials were drawn."""
+    """What an evaluation found: figures, a table for a person, and how the trials were drawn.
+
+    `notes` are sentences about what could not be done.
+    """
 
     figures: list[Figure]
     table: list[str]
     settings: dict[str, Any]
     split: dict[str, Any]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

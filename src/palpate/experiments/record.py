@@ -9,7 +9,7 @@ from palpate.experiments import folders
 from palpate.experiments.options import Record
 from palpate.recording import Recording
 from palpate.recording_files import read_recording, write_recording
-from palpate.result import Figure, Result
+from palpate.result import Result
 
 
 def run(options: Record) -> Path:
@@ -47,15 +47,11 @@ def _is_there(file: Path, options: Record, configuration: dict[str, Any]) -> boo
 
 
 def _result(name: str, options: Record, recording: Recording, wall_time: float) -> Result:
-    seconds = sum(trial.duration for trial in recording.trials)
     return Result(
         name=name,
-        figures=[
-            Figure("trials", len(recording.trials), "", better="higher"),
-            Figure("duration_s", seconds, "s", better="higher"),
-            Figure("wall_time_s", wall_time, "s"),
-        ],
-        settings=folders.told(options, f"record {options.family}"),
+        figures=[],  # nothing is claimed
+        settings=folders.told(options, f"record {options.family}")
+        | {"trial_names": [trial.name for trial in recording.trials]},
         seeds=[options.seed],
         split=None,
         wall_time_s=wall_time,

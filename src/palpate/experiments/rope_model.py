@@ -113,12 +113,13 @@ def undamped(rope: Rope) -> Rope:
 
 def _simulated(world: RopeConfiguration, seed: int, quick: bool) -> tuple[Aligned, Aligned]:
     counts = (4, 3) if quick else (FITTED_TRIALS, UNSEEN_TRIALS)
-    return tuple(
+    fitted, unseen = (
         record_rope(world, range(first, first + count), DURATION).align(
             world.control_period, MARKERS, GRIPPER
         )
         for first, count in zip((seed, seed + UNSEEN_SEEDS), counts, strict=True)
     )
+    return fitted, unseen
 
 
 def _compare(

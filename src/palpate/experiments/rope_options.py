@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from palpate.runs import Run
 
 NOISE = 5e-4  # m, standard deviation of a marker's coordinate in the simulated world
+RENDERED = 3.0  # s of a trial in the moving picture
 GRIP = "grip"  # the channel that is made of gripped markers
 
 
@@ -198,6 +199,7 @@ class EvaluateRopeStabilization(Evaluate):
         from palpate.experiments import rope_evaluation
         from palpate.experiments.rope_baselines import HeldStill, SwingDamper
         from palpate.experiments.rope_recording import constants
+        from palpate.experiments.rope_rendering import render_trial
         from palpate.experiments.rope_trials import LearnedController
         from palpate.tasks import RopeStabilization
         from palpate.worlds.rope_configuration import RopeConfiguration
@@ -213,6 +215,12 @@ class EvaluateRopeStabilization(Evaluate):
         }
         evaluated = rope_evaluation.evaluate(controllers, trials, run)
         rope_evaluation.write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
+        try:
+            picture = run.path / "rendering.webp"
+            render_trial(picture, trials[0], controllers["controlled"], RENDERED)
+            notes = ()
+        except PalpateError as error:  # a machine without OpenGL: the page draws the ropes itself
+            notes = (f"the rope is drawn, not rendered: {error}",)
         figures = []
         for name, episodes in evaluated.items():
             suffix = "" if name == "controlled" else f".{name.replace(' ', '_')}"
@@ -223,6 +231,7 @@ class EvaluateRopeStabilization(Evaluate):
             table=rope_evaluation.table(trials, evaluated),
             settings={"trials": len(trials), **constants(base)},
             split={"evaluated": f"{self.ropes} sampled ropes, seed {self.seed}"},
+            notes=notes,
         )
 
 

@@ -81,4 +81,6 @@ def starting_rope(
     if rope.held_at_both_ends:
         # Two grips show how a rope is bent at rest and how its mass is spread.
         rope = declare(rope, rest_bend={"fixed": False}, node_mass={"fixed": False})
+    if {0, 1} <= set(rope.driven):  # the grip itself turns the first segment
+        rope = declare(rope, grip_stiffness={"fixed": True}, grip_damping={"fixed": True})
     return rope

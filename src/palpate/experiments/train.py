@@ -59,7 +59,7 @@ def run(options: Train) -> Path:
             figures = figures_in_model(task, model, policy, options.seed)
             result = Result(
                 name=name,
-                figures=[*figures, Figure("wall_time_s", run.elapsed, "s")],
+                figures=figures,
                 settings=run.configuration,
                 seeds=[options.seed],
                 split={"scored": f"{EPISODES} new start states in the model it was trained on"},
@@ -89,10 +89,11 @@ def settings(options: Train) -> Training:
 def figures_in_model(task: Task, model: Model, policy: Policy, seed: int) -> list[Figure]:
     """Means over episodes in the model, from start states of another seed than the training's.
 
+    They last twice as long as those trained on, for what has to stay as it is in the end.
     An outcome that some episodes do not have is averaged over those that do.
     """
     key = jax.random.fold_in(jax.random.key(seed), 1)
-    steps = round(task.duration / model.control_period)
+    steps = round(2 * task.duration / model.control_period)
 
     @jax.jit
     def outcome() -> dict[str, jax.Array]:

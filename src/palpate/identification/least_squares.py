@@ -5,6 +5,7 @@ only J^T J is kept: memory does not grow with the recording.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -50,13 +51,18 @@ class NormalEquations:
     def at(self, free: Free, windows: Windows) -> System:
         """Assemble over all windows, a few at a time."""
         flat, unravel = ravel_pytree(free)
-        count = windows.start.shape[0]
-        total = None
-        for first in range(0, count, GROUP):
-            group = jax.tree.map(lambda x, f=first: x[f : f + GROUP], windows)
-            part = _assemble(self.coordinates, unravel, flat, group, self.scale, self.knee)
-            total = part if total is None else _add(total, part)
-        return total
+        parts = [
+            _assemble(
+                self.coordinates,
+                unravel,
+                flat,
+                jax.tree.map(lambda x, f=first: x[f : f + GROUP], windows),
+                self.scale,
+                self.knee,
+            )
+            for first in range(0, windows.start.shape[0], GROUP)
+        ]
+        return functools.reduce(_add, parts)
 
     def step(self, free: Free, damping: Array, windows: Windows, prior_weight: float):
         """A damped Gauss-Newton step: new free values, new damping, and the loss before.
@@ -171,7 +177,9 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     precision = information + identity
     inverse = np.linalg.inv(precision)
     sandwich = inverse @ (scores.T @ scores + identity) @ inverse
-    variance = np.maximum(np.diag(sandwich), np.diag(inverse))
+    # Scores that a few blocks dominate can exceed what was believed before any data: no more than
+    # the prior's variance, which is one.
+    variance = np.minimum(np.maximum(np.diag(sandwich), np.diag(inverse)), 1.0)
     deviation = unravel(jnp.asarray(np.sqrt(variance), flat.dtype))
     lower, upper, verdict = {}, {}, {}
     for path, declaration in coordinates.declarations.items():

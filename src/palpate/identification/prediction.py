@@ -43,7 +43,8 @@ class WindowSource:
         """
         starts = []
         for index, length in enumerate(aligned.length):
-            complete = np.isfinite(aligned.observation[index, :length].reshape(length, -1)).all(1)
+            flat = aligned.observation[index, :length].reshape(length, -1)
+            complete: np.ndarray = np.all(np.isfinite(flat), axis=1)
             possible = np.flatnonzero(complete[: length - START_FRAMES] & complete[1 : length - 1])
             if not possible.size:
                 raise PalpateError(

@@ -10,7 +10,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.models.model import Model
 from palpate.models.rope import Rope
-from palpate.parameters import describe, parameters_of
+from palpate.parameters import LogNormal, describe, parameters_of
 from palpate.storage import read_json, write_json
 
 MODELS: dict[str, type[Model]] = {"rope": Rope}
@@ -56,7 +56,7 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
         raise PalpateError(
             f"{path} has version {content.get('version')}; this palpate reads version {_VERSION}"
         )
-    kind = MODELS.get(content.get("model", ""))
+    kind = MODELS.get(str(content.get("model")))
     if kind is None:
         raise PalpateError(
             f"{path} holds the unknown model '{content.get('model')}'; "
@@ -64,29 +64,41 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
         )
     try:
         rows = {row["name"]: row["value"] for row in content["parameters"]}
-        structure = {
+        structure: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in content["structure"].items()
         }
         about = dict(content["about"])
     except (KeyError, TypeError, AttributeError) as error:
         raise PalpateError(f"{path} is damaged: its parameters or structure are missing") from error
-    _check_names(path, "parameters", rows, parameters_of(kind))
+    declared = parameters_of(kind)
+    _check_names(path, "parameters", rows, declared)
     _check_names(path, "structure", structure, _structure(kind))
+    for name, default in _structure(kind).items():
+        value = structure[name]
+        if not _alike(value, default):
+            raise PalpateError(f"'{name}' in {path} must be such as {default!r}, got {value!r}")
+        if isinstance(default, float):
+            structure[name] = float(value)
     values = {name: _numbers(path, name, value) for name, value in rows.items()}
+    for name, value in values.items():
+        _check_axes(path, name, value, kind)
+        if isinstance(declared[name].prior, LogNormal) and np.any(value < 0):
+            raise PalpateError(f"'{name}' in {path} must not be negative, got {np.min(value):g}")
     try:
         return kind(**values, **structure), about
     except (TypeError, IndexError) as error:
         raise PalpateError(f"{path} is damaged: {error}") from error
 
 
-def _structure(kind: type[Model]) -> list[str]:
+def _structure(kind: type[Model]) -> dict[str, Any]:
+    """The fields of a model that are no parameters, and their defaults."""
     declared = parameters_of(kind)
-    return [
-        field.name
+    return {
+        field.name: field.default
         for field in dataclasses.fields(kind)
         if field.name not in declared and field.name != "overrides"
-    ]
+    }
 
 
 def _check_names(path: str | Path, what: str, came: Any, expected: Any) -> None:
@@ -99,11 +111,29 @@ def _check_names(path: str | Path, what: str, came: Any, expected: Any) -> None:
         )
 
 
+def _alike(value: Any, default: Any) -> bool:
+    """Whether a value of the structure is of its default's kind; any is, where there is none."""
+    if default is dataclasses.MISSING:
+        return True
+    if isinstance(default, tuple):
+        return isinstance(value, tuple) and all(_alike(item, default[0]) for item in value)
+    return type(value) is type(default) or (type(default), type(value)) == (float, int)
+
+
+def _check_axes(path: str | Path, name: str, value: np.ndarray, kind: type[Model]) -> None:
+    """A file holds one model: a parameter has the axes of its annotation, without the batch's."""
+    annotations: dict[str, Any] = {field.name: field.type for field in dataclasses.fields(kind)}
+    axes = [axis for axis in annotations[name].dim_str.split() if not axis.startswith("*")]
+    if value.ndim != len(axes):
+        expected = f"the axes ({', '.join(axes)})" if axes else "one number"
+        raise PalpateError(f"'{name}' in {path} must be {expected}, got shape {value.shape}")
+
+
 def _numbers(path: str | Path, name: str, value: Any) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
         raise PalpateError(f"'{name}' in {path} is not numbers: {value!r}") from error
-    if not np.isfinite(array).all():
+    if not (np.abs(array) <= np.finfo(np.float32).max).all():
         raise PalpateError(f"'{name}' in {path} is not finite")
     return array

@@ -9,15 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
-from palpate.models import rope_kernel
+from palpate.models import rope_kernel, rope_stability
 from palpate.models.model import Model
 from palpate.parameters import LogNormal, Normal, Parameter, parameter, parameters_of
 
 # Ropes integrated side by side. Measured on two CPUs: 4 keeps the reverse sweep of a block in the
 # first-level cache; 16 is a third faster forwards but three times slower backwards.
 LANES = 4
-
-STABILITY_LIMIT = 3.6  # of 4: the rest is for stretched, folded and turning ropes
 
 
 class RopeState(eqx.Module):
@@ -75,6 +73,18 @@ class Rope(Model):
         prior=LogNormal(1e-5, 1.0),
         spread=0.5,
         about="torque per radian between the planes of neighbouring joints",
+    )
+    grip_stiffness: Float[Array, "*batch"] = parameter(
+        "N m/rad",
+        prior=LogNormal(1e-5, 1.5),
+        spread=0.5,
+        about="torque per radian by which the grip turns the first segment down",
+    )
+    grip_damping: Float[Array, "*batch"] = parameter(
+        "N m s/rad",
+        prior=LogNormal(1e-4, 1.5),
+        spread=0.5,
+        about="torque of the grip against turning of the first segment",
     )
     air_drag: Float[Array, "*batch"] = parameter(
         "N s/m",
@@ -165,8 +175,7 @@ class Rope(Model):
         nodes = len(rest_length) + 1
         for name, count in cls._elements(nodes).items():
             prior = parameters_of(cls)[name].prior
-            centre = prior.median if isinstance(prior, LogNormal) else prior.mean
-            value = fields.get(name, centre)
+            value = fields.get(name, prior.centre)
             fields[name] = np.full(count, value) if np.ndim(value) == 0 and count else value
         share = rest_length / np.sum(rest_length)
         node_mass = 0.5 * mass * (np.append(share, 0.0) + np.append(0.0, share))
@@ -177,7 +186,9 @@ class Rope(Model):
     @staticmethod
     def _elements(nodes: int) -> dict[str, int]:
         """How many elements each of the remaining parameters has; 0: one number for the rope."""
-        per_rope = dict.fromkeys(("air_drag", "quadratic_drag", "gravity"), 0)
+        per_rope = dict.fromkeys(
+            ("grip_stiffness", "grip_damping", "air_drag", "quadratic_drag", "gravity"), 0
+        )
         return {
             "stretch_stiffness": nodes - 1,
             "stretch_damping": nodes - 1,
@@ -234,7 +245,8 @@ class Rope(Model):
                 lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape[-2:]),
                 (state, increment, rest_bend),
             )
-        return self._integrate_blocks((state, increment, rest_bend), coefficients, *batch)
+        count = state.position.shape[0]
+        return self._integrate_blocks((state, increment, rest_bend), coefficients, count)
 
     @property
     def held_at_both_ends(self) -> bool:
@@ -280,7 +292,7 @@ class Rope(Model):
             everywhere.at[..., nodes, :].set(increment),
         )
 
-    def _free_nodes(self) -> Float[Array, " nodes"]:
+    def free_nodes(self) -> Float[Array, " nodes"]:
         """One for each node that forces move, zero for the driven ones."""
         free = np.ones(self.nodes)
         free[list(self.driven)] = 0.0
@@ -288,10 +300,13 @@ class Rope(Model):
 
     def _coefficients(self) -> rope_kernel.Coefficients:
         """The parameters as the integration uses them, each (*batch, elements)."""
-        free = self._free_nodes()
+        free = self.free_nodes()
 
         def per_node(value: Array) -> Array:
             return jnp.broadcast_to(value[..., None], (*value.shape, self.nodes))
+
+        def on_first_segment(value: Array) -> Array:
+            return rope_stability.spread(value[..., None], self.nodes - 1, 0)
 
         return rope_kernel.Coefficients(
             rest_length=self.rest_length,
@@ -300,6 +315,8 @@ class Rope(Model):
             bend_stiffness=self.bend_stiffness,
             bend_damping=self.bend_damping,
             twist_stiffness=self.twist_stiffness,
+            grip_stiffness=on_first_segment(self.grip_stiffness),
+            grip_damping=on_first_segment(self.grip_damping),
             linear_drag=per_node(self.air_drag),
             quadratic_drag=per_node(self.quadratic_drag),
             step_per_mass=self.time_step * free / self.node_mass,
@@ -359,67 +376,12 @@ class Rope(Model):
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], result)
 
     def stability_load(self) -> Float[Array, "*batch nodes"]:
-        """How much of the explicit stability limit each node uses: stable below 4.
-
-        Symplectic Euler of M x'' + C x' + K x = 0 is stable when every eigenvector's Rayleigh
-        quotients obey h^2 k/m + 2 h c/m < 4. The load bounds them by row sums of
-        M^-1 (h^2 K + 2 h C) (Gershgorin), element by element: an element of stiffness w on the
-        combination a of node coordinates adds w |a_i| sum |a_j| to row i. Stretch: a = (-1, 1).
-        Bend: a = (1/l, -1/l - 1/l', 1/l'). Twist: at most 4 k_t / `TWIST_FADE` on directions, with
-        sum |a_j| <= 2/l for the shortest l. Stretch and bend add up because they share directions
-        where the rope is bent. Driven nodes have neither row nor column, since no force moves
-        them; drag is implicit and only helps.
-        """
-        h = self.time_step
-        stretch = h**2 * self.stretch_stiffness + 2 * h * self.stretch_damping
-        bend = h**2 * self.bend_stiffness + 2 * h * self.bend_damping
-        twist = h**2 * 4.0 * self.twist_stiffness / rope_kernel.TWIST_FADE
-        per_length = 1.0 / self.rest_length
-        first, second = per_length[..., :-1], per_length[..., 1:]
-        free = self._free_nodes()
-        ends = free[:-1] + free[1:]
-        total = first * free[:-2] + (first + second) * free[1:-1] + second * free[2:]
-        nearest = jnp.maximum(
-            jnp.maximum(per_length[..., :-2], per_length[..., 1:-1]), per_length[..., 2:]
-        )
-        rows = (
-            _spread(stretch * ends, self.nodes, 0)
-            + _spread(stretch * ends, self.nodes, 1)
-            + _spread(bend * total * first, self.nodes, 0)
-            + _spread(bend * total * (first + second), self.nodes, 1)
-            + _spread(bend * total * second, self.nodes, 2)
-            + sum(_spread(twist * 2.0 * nearest**2, self.nodes, k) for k in range(4))
-        )
-        return rows * free / self.node_mass
+        """How much of the explicit stability limit each node uses: see `rope_stability`."""
+        return rope_stability.load(self)
 
     def constrain(self) -> "Rope":
-        """Keep the integration stable: soften what loads a node beyond the limit.
-
-        Every stiffness and damping that acts on a node is divided by what the load exceeds
-        `STABILITY_LIMIT` by, so that no value an optimiser can reach is unstable; a legal rope
-        stays as it is.
-        """
-        factor = 1.0 / jnp.maximum(self.stability_load() / STABILITY_LIMIT, 1.0)
-
-        def weakest(count: int) -> Array:
-            """The smallest factor of the nodes that each element acts on."""
-            span = self.nodes - count + 1
-            return jnp.min(
-                jnp.stack([factor[..., k : self.nodes - span + 1 + k] for k in range(span)]), axis=0
-            )
-
-        names = (
-            "stretch_stiffness",
-            "stretch_damping",
-            "bend_stiffness",
-            "bend_damping",
-            "twist_stiffness",
-        )
-        return eqx.tree_at(
-            lambda rope: [getattr(rope, name) for name in names],
-            self,
-            [getattr(self, name) * weakest(getattr(self, name).shape[-1]) for name in names],
-        )
+        """The rope softened where the integration would be unstable: see `rope_stability`."""
+        return rope_stability.soften(self)
 
     def energy(self, state: RopeState) -> Float[Array, "*batch"]:
         """Mechanical energy (J) above hanging at rest under the first driven node's position.
@@ -427,8 +389,8 @@ class Rope(Model):
         Gravity, motion, stretch, bend and twist (seed 1: E_rope), minus the same of the rope
         hanging still, stretched by its own weight, from where the gripper is now: lowering the
         gripper earns nothing. Never negative; what bending takes from a hanging rope's uneven
-        stretch is left out of that rest, some 1e-6 of a swing. Raises `PalpateError` for a rope that is not held at its first end
-        alone: it has no such rest.
+        stretch is left out of that rest, some 1e-6 of a swing. Raises `PalpateError` for a rope
+        that is not held at its first end alone: it has no such rest.
         """
         if self.driven != (0,):
             raise PalpateError(
@@ -450,7 +412,7 @@ class Rope(Model):
         return gravity + kinetic + self.elastic_energy(state.position) - elastic_at_rest
 
     def elastic_energy(self, position: Float[Array, "*batch nodes 3"]) -> Float[Array, "*batch"]:
-        """Energy of stretch, bend and twist, J."""
+        """Energy of stretch, bend, twist and grip, J."""
         edge = jnp.diff(position, axis=-2)
         length = jnp.sqrt(jnp.sum(jnp.square(edge), axis=-1) + rope_kernel.COINCIDENT)
         direction = edge / self.rest_length[..., None]
@@ -468,12 +430,11 @@ class Rope(Model):
             * jnp.square(triple)
             / (sine_squared[..., :-1] * sine_squared[..., 1:])
         )
+        down = jnp.array([0.0, 0.0, -1.0], position.dtype)
+        from_down = jnp.sum(jnp.square(direction[..., 0, :] - down), axis=-1)
         return 0.5 * (
-            jnp.sum(stretch, axis=-1) + jnp.sum(bending, axis=-1) + jnp.sum(twist, axis=-1)
+            jnp.sum(stretch, axis=-1)
+            + jnp.sum(bending, axis=-1)
+            + jnp.sum(twist, axis=-1)
+            + self.grip_stiffness * from_down
         )
-
-
-def _spread(values: Array, nodes: int, offset: int) -> Array:
-    """Put element values on the node `offset` after the element's first."""
-    padding = [(0, 0)] * (values.ndim - 1) + [(offset, nodes - values.shape[-1] - offset)]
-    return jnp.pad(values, padding)

@@ -10,6 +10,7 @@ d = u_{i+1} - u_i. Energies and dissipation:
                in a frame that turns with the tangent but does not spin about it, because the
                grip holds the rope; a bent rope that swings as a whole bends only where its
                tangent lies along the axis of the swing
+    grip       1/2 k_g |u_0 - down|^2               1/2 c_g |u_0'|^2,  on the first segment
     twist      1/2 k_t t^2 / ((s_a + S)(s_b + S)),  t = u_0 . (u_1 x u_2), s = |u_i x u_{i+1}|^2 at
                a joint, S = 0.01: 1/2 k_t sin^2(psi) for the torsion angle psi between successive
                binormals, faded out where a joint is straight and psi has no meaning
@@ -37,7 +38,7 @@ COINCIDENT = 1e-12  # m^2, added to l^2, which vanishes where two nodes meet
 FOLDED = 1e-3  # added to |m|^2, which vanishes where the rope is folded back on itself
 
 Flat = Float[Array, " _"]  # of any length
-Axes = tuple[Flat, Flat, Flat]
+Axes = tuple[Flat, ...]  # x, y and z
 
 
 class Coefficients(eqx.Module):
@@ -48,6 +49,8 @@ class Coefficients(eqx.Module):
     stretch_damping: Float[Array, "..."]
     bend_stiffness: Float[Array, "..."]
     bend_damping: Float[Array, "..."]
+    grip_stiffness: Float[Array, "..."]  # per segment, zero for all but the first
+    grip_damping: Float[Array, "..."]
     twist_stiffness: Float[Array, "..."]
     linear_drag: Float[Array, "..."]
     quadratic_drag: Float[Array, "..."]
@@ -136,6 +139,8 @@ def edge_forces(
         bending = bend_rate[axis] - turned * mean[axis]
         moment = c.bend_stiffness * bend[axis] + c.bend_damping * bending
         turn = _pad(moment, 1, 0, lanes) - _pad(moment, 0, 1, lanes) + gradient[axis]
+        from_down = direction[axis] + 1.0 if axis == 2 else direction[axis]
+        turn = turn + c.grip_stiffness * from_down + c.grip_damping * turning[axis]
         force.append(stretch * edge[axis] + turn * per_rest_length)
     return force[0], force[1], force[2]
 

@@ -296,10 +296,16 @@ def test_float64_is_kept_throughout(float64):
 
 def test_no_operation_promotes_a_dtype(strict):
     free = FreeParameters(chain())
-    jax.grad(lambda x: free.build(x).stiffness.sum() + free.penalty(x))(free.initial)
-    free.project(free.initial)
-    sample_prior(chain(), jax.random.key(0))
-    randomise(chain(), jax.random.key(0), jnp.asarray(0.5), 2)
+    key, half = jax.random.key(0), jnp.asarray(0.5)
+
+    def loss(values):
+        return free.build(values).stiffness.sum() + free.penalty(values)
+
+    # refused while tracing
+    jax.eval_shape(jax.grad(loss), free.initial)
+    jax.eval_shape(free.project, free.initial)
+    jax.eval_shape(lambda key: sample_prior(chain(), key), key)
+    jax.eval_shape(lambda key, half: randomise(chain(), key, half, 2), key, half)
 
 
 def test_with_values_may_add_a_batch_axis():

@@ -262,11 +262,15 @@ class FreeParameters(eqx.Module):
 
         Without it a value beyond a limit would feel no gradient, and never come back.
         """
-        legal = self.build(free)
+        proposed = self.unconstrained(free)
+        legal = proposed.constrain()
         projected = {}
         for path, declaration in self.declarations.items():
             reference = value_of(self.reference, path)
-            coordinate = declaration.prior.to_free(value_of(legal, path), reference)
+            value, before = value_of(legal, path), value_of(proposed, path)
+            coordinate = declaration.prior.to_free(value, reference)
+            # What was legal stays as it is: the way back through a value may overflow.
+            coordinate = jnp.where(value == before, free[path], coordinate)
             projected[path] = jnp.mean(coordinate) if declaration.shared else coordinate
         return projected
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.identification import gradient
 from palpate.identification.gradient import Settings, identify
 from palpate.identification.least_squares import intervals
 from palpate.identification.prediction import (
@@ -267,3 +268,24 @@ def test_a_wide_prior_moves_faster_than_a_narrow_one():
     found = identify(model, aligned, Settings(horizons=(1.0,), iterations=(5,), windows=6))
     assert abs(np.log(found.mass)) < 1e-3
     assert abs(np.log(found.friction)) > 1e-2
+
+
+def test_an_infinite_gradient_changes_nothing_and_many_are_an_error(monkeypatch):
+    """A loss that is finite can have a gradient that is not: such an iteration is passed over."""
+    truth = Cart(mass=2.0, friction=0.3)
+    aligned = recorded(truth, *pushed(truth))
+    settings = Settings(horizons=(1.0,), iterations=(30,), windows=6)
+    real = gradient.mean_loss
+
+    def spoiled(coordinates, free, windows, scale, knee):
+        """Finite, but with an infinite slope in the mass."""
+        loss = real(coordinates, free, windows, scale, knee)
+        return loss + jnp.sqrt(jnp.abs(free["mass"] - jax.lax.stop_gradient(free["mass"])))
+
+    monkeypatch.setattr(gradient, "mean_loss", spoiled)
+    with pytest.raises(PalpateError, match="not finite 21 times in a row"):
+        identify(Cart(mass=1.0, friction=0.5), aligned, settings)
+    few = Settings(horizons=(1.0,), iterations=(5,), windows=6)
+    found = identify(Cart(mass=1.0, friction=0.5), aligned, few)
+    assert float(found.mass) == 1.0
+    assert float(found.friction) == 0.5

@@ -97,7 +97,7 @@ def test_hanging_at_rest_has_no_energy_and_everything_else_has(float64):
     limp = rope(bend_stiffness=0.0, twist_stiffness=1e-3, grip_stiffness=0.0)
     resting = at_rest(hanging(limp))
     assert float(energy(limp, resting)) == pytest.approx(0.0, abs=1e-10)
-    gradient = jax.grad(lambda position: limp.energy(at_rest(position)))(resting.position)
+    gradient = jax.jit(jax.grad(lambda position: limp.energy(at_rest(position))))(resting.position)
     np.testing.assert_allclose(gradient[1:], 0, atol=1e-8)  # an equilibrium
     # bending shares the weight among neighbours: hanging keeps what that costs, far below a swing
     held = rope(bend_stiffness=0.02, twist_stiffness=1e-3, grip_stiffness=0.0)
@@ -269,12 +269,10 @@ def test_a_batch_of_ropes_may_start_from_one_state_whatever_differs_between_them
     all_apart = eqx.tree_at(
         lambda r: r.rest_bend, jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), held), bends
     )
-    alone = [
-        eqx.tree_at(lambda r: r.rest_bend, held, bend).step(state, action).position
-        for bend in bends
-    ]
+    step = jax.jit(lambda ropes: ropes.step(state, action))
+    alone = [step(eqx.tree_at(lambda r: r.rest_bend, held, bend)).position for bend in bends]
     for ropes in (bent_apart, all_apart):
-        together = ropes.step(state, action)
+        together = step(ropes)
         assert together.velocity.shape == (3, NODES, 3)
         np.testing.assert_allclose(together.position, jnp.stack(alone), atol=1e-7)
     assert float(jnp.abs(alone[0] - alone[1]).max()) > 1e-4

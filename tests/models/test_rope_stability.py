@@ -147,9 +147,10 @@ def test_beyond_the_limit_no_gradient_is_felt_and_projected_all_of_it():
 
 def test_what_is_drawn_for_training_is_stable():
     stiff = Rope.uniform(nodes=NODES, stretch_stiffness=1e5, bend_damping=1e-2)
-    randomised = randomise(stiff, jax.random.key(0), 1.0, 50)
+    randomised = jax.jit(lambda key: randomise(stiff, key, 1.0, 50))(jax.random.key(0))
     assert float(np.ptp(randomised.bend_damping)) > 0
-    for rope in (randomised, sample_prior(stiff, jax.random.key(1))):
+    drawn = jax.jit(lambda key: sample_prior(stiff, key))(jax.random.key(1))
+    for rope in (randomised, drawn):
         assert float(rope.stability_load().max()) <= LEGAL
 
 

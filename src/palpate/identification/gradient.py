@@ -36,6 +36,10 @@ Free = dict[str, Array]
 # model cannot explain must not decide the fit. The knee is relative to how far things move.
 KNEE = 0.01
 
+# A long prediction of an undamped model can be finite and its gradient not: such an iteration
+# changes nothing, and the next draws other windows.
+MOST_SKIPPED = 20
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -72,6 +76,7 @@ class Descent(eqx.Module):
     optimiser: Any
     stage: int = 0
     within: int = 0  # iterations done in this stage
+    skipped: int = 0  # iterations in a row without a finite loss and gradient
 
 
 @runtime_checkable
@@ -123,7 +128,7 @@ def identify(
                 next(ticks, None)
             bar.show(loss=loss, horizon=horizon)
             if run is not None:
-                run.log(step, loss=loss, horizon=horizon)
+                run.log(step, loss=loss if np.isfinite(loss) else None, horizon=horizon)
                 if stop or descent.within == 0 or step % 50 == 0:
                     run.save(step, descent)
     return coordinates.build(descent.free)
@@ -147,14 +152,18 @@ def _iterate(
     remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
     free, optimiser, loss = method.step(descent.free, descent.optimiser, windows, remaining)
     loss = float(loss)
-    if not np.isfinite(loss):
+    skipped = 0 if np.isfinite(loss) else descent.skipped + 1
+    if skipped > MOST_SKIPPED:
         raise PalpateError(
-            f"the prediction is not finite at iteration {step + 1} (horizon {horizon} control "
-            "periods): start from other parameters, or check the recording's units and rate"
+            f"the loss or its gradient was not finite {skipped} times in a row up to iteration "
+            f"{step + 1} (horizon {horizon} control periods): start from other parameters, or "
+            "check the recording's units and rate"
         )
     within = descent.within + 1
     ended = within >= settings.iterations[descent.stage] or loss < settings.threshold
-    following = Descent(free, optimiser, descent.stage + int(ended), 0 if ended else within)
+    following = Descent(
+        free, optimiser, descent.stage + int(ended), 0 if ended else within, skipped
+    )
     return following, loss
 
 
@@ -184,9 +193,13 @@ class Adam:
 
         def step(free: Free, optimiser: Any, windows: Windows, rate: Array):
             loss, gradient = divided(free, windows)
-            direction, optimiser = self._transform.update(gradient, optimiser)
-            free = jax.tree.map(lambda x, d: x - rate * d, free, direction)
-            return coordinates.project(free), optimiser, loss
+            finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
+            direction, moments = self._transform.update(gradient, optimiser)
+            moved = coordinates.project(jax.tree.map(lambda x, d: x - rate * d, free, direction))
+            free, optimiser = jax.tree.map(
+                lambda new, old: jnp.where(finite, new, old), (moved, moments), (free, optimiser)
+            )
+            return free, optimiser, jnp.where(finite, loss, jnp.nan)
 
         self._step = jax.jit(step)
 

@@ -19,8 +19,7 @@ class Model(eqx.Module):
 
     Batch axes lead. `step` and `observe` accept states and actions with one leading batch axis, or
     none, and parameters likewise; what has no batch axis serves the whole batch. States are small
-    named pytrees; actions are arrays of `action_shape`, observations of `observation_shape`, and
-    `features` are what a network should see of a state.
+    named pytrees; actions are arrays of `action_shape`, observations of `observation_shape`.
     """
 
     overrides: eqx.AbstractVar[tuple[tuple[str, Parameter], ...]]

@@ -88,8 +88,8 @@ def period_of(offsets: np.ndarray, interval: float) -> float:
 def check_closed_forms() -> dict[str, float]:
     """Small swing period and hanging shape of both simulations; raises if either disagrees."""
     expected = 2 * np.pi / (FIRST_ROOT * np.sqrt(GRAVITY / LENGTH))
-    soft = {"bend_stiffness": 1e-5, "bend_damping": 1e-6, "twist_stiffness": 1e-8}
-    rope = our_rope(air_drag=1e-5, quadratic_drag=1e-6, **soft)
+    # Limp, but damped enough that a small swing does not feed other modes through the stretch.
+    rope = our_rope(bend_stiffness=1e-5, twist_stiffness=1e-8, grip_stiffness=1e-8)
     seconds = 5.0
     still = jnp.zeros((round(seconds / rope.control_period), 1, 3))
     swing = rollout(rope, _at(first_mode()), still)

@@ -36,9 +36,9 @@ Free = dict[str, Array]
 # model cannot explain must not decide the fit. The knee is relative to how far things move.
 KNEE = 0.01
 
-# A long prediction of an undamped model can be finite and its gradient not: such an iteration
-# changes nothing, and the next draws other windows.
-MOST_SKIPPED = 20
+# The gradient of a long prediction of an undamped model can be infinite although the prediction is
+# not: such an iteration changes nothing, and the rest of the stage looks half as far ahead.
+MOST_HALVINGS = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Descent(eqx.Module):
     optimiser: Any
     stage: int = 0
     within: int = 0  # iterations done in this stage
-    skipped: int = 0  # iterations in a row without a finite loss and gradient
+    halvings: int = 0  # of this stage's horizon, one for each loss or gradient that was not finite
 
 
 @runtime_checkable
@@ -121,7 +121,8 @@ def identify(
         ticks = iter(bar)
         while descent.stage < len(settings.horizons) and not stop:
             before = _position(descent, settings)
-            horizon = max(1, round(settings.horizons[descent.stage] * source.longest))
+            share = settings.horizons[descent.stage] / 2**descent.halvings
+            horizon = max(1, round(share * source.longest))
             descent, loss = _iterate(descent, step, horizon, method, source, settings)
             step += 1
             for _ in range(_position(descent, settings) - before):
@@ -152,19 +153,18 @@ def _iterate(
     remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
     free, optimiser, loss = method.step(descent.free, descent.optimiser, windows, remaining)
     loss = float(loss)
-    skipped = 0 if np.isfinite(loss) else descent.skipped + 1
-    if skipped > MOST_SKIPPED:
+    halvings = descent.halvings + int(not np.isfinite(loss))
+    if halvings > MOST_HALVINGS:
         raise PalpateError(
-            f"the loss or its gradient was not finite {skipped} times in a row up to iteration "
-            f"{step + 1} (horizon {horizon} control periods): start from other parameters, or "
-            "check the recording's units and rate"
+            f"the loss or its gradient is not finite at iteration {step + 1}, however short the "
+            f"horizon ({horizon} control periods): start from other parameters, or check the "
+            "recording's units and rate"
         )
     within = descent.within + 1
     ended = within >= settings.iterations[descent.stage] or loss < settings.threshold
-    following = Descent(
-        free, optimiser, descent.stage + int(ended), 0 if ended else within, skipped
-    )
-    return following, loss
+    if ended:
+        return Descent(free, optimiser, descent.stage + 1), loss
+    return Descent(free, optimiser, descent.stage, within, halvings), loss
 
 
 def _position(descent: Descent, settings: Settings) -> int:

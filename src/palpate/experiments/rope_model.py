@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.experiments.folders import fingerprint
 from palpate.experiments.rope_recording import (
     GRIPPER,
     MARKERS,
@@ -49,9 +50,13 @@ WORLDS = {
     ),
 }
 DURATION = 5.0  # s of every trial
+EXCITATION = (
+    "five sinusoids per axis, 0.3 to 2.5 Hz, random phases, at 60 to 95 % of the speed and "
+    f"acceleration limits, still in the last 35 % of {DURATION:.0f} s"
+)
 FITTED_TRIALS, UNSEEN_TRIALS = 12, 8
 UNSEEN_SEEDS = 1000  # the unseen motions' seeds start this far after the fitted ones'
-DAMPING = ("stretch_damping", "bend_damping", "air_drag", "quadratic_drag")
+DAMPING = ("stretch_damping", "bend_damping", "grip_damping", "air_drag", "quadratic_drag")
 SEED_TABLE = {"sim1": (0.0704, 0.1510), "sim2": (0.0442, 0.1347), "real": (0.0591, 0.0810)}
 DEFORM_L1 = {"dlo1": 1.01, "dlo3": 0.77}  # cm
 GRIPPED, RATE = (0, 1, -2, -1), 100.0  # of the motion capture
@@ -67,15 +72,18 @@ def reproduce(
     """
     began = time.monotonic()
     settings = Settings(iterations=(20, 20, 60) if quick else Settings().iterations, seed=seed)
-    minutes = (3 if quick else 15) + (0 if mocap is None else 2 if quick else 6)
+    minutes = (2 if quick else 5) + (0 if mocap is None else 1 if quick else 2)
     print(f"rope-model: two simulated ropes{' and a real one' if mocap else ''}, ~{minutes} min")
+    print(f"excitation: {EXCITATION}")
     figures: list[Figure] = []
     evidence: dict[str, np.ndarray] = {}
     split: dict[str, Any] = {}
     for name, world in WORLDS.items():
         fitted, unseen = _simulated(world, seed, quick)
         rope = starting_rope(fitted, mass=world.mass)
-        errors = _compare(out / name, name, rope, fitted, unseen, settings)
+        source = {"world": constants(world), "trials": [len(fitted.length), len(unseen.length)]}
+        print(f"{name}: {', '.join(f'{k} {v}' for k, v in source['world'].items())}")
+        errors = _compare(out / name, name, rope, fitted, unseen, settings, source)
         figures += _simulated_figures(name, world, errors, unseen)
         evidence |= _evidence(name, errors)
         split[name] = {
@@ -94,10 +102,7 @@ def reproduce(
             "quick": quick,
             "identification": dataclasses.asdict(settings),
             "worlds": {name: constants(world) for name, world in WORLDS.items()},
-            "excitation": (
-                "five sinusoids per axis, 0.3 to 2.5 Hz, random phases, at 60 to 95 % of the speed "
-                f"and acceleration limits, still in the last 35 % of {DURATION:.0f} s"
-            ),
+            "excitation": EXCITATION,
         },
         [seed],
         split,
@@ -112,7 +117,11 @@ def undamped(rope: Rope) -> Rope:
 
 
 def _simulated(world: RopeConfiguration, seed: int, quick: bool) -> tuple[Aligned, Aligned]:
-    counts = (4, 3) if quick else (FITTED_TRIALS, UNSEEN_TRIALS)
+    counts = (4, 3) if quick else (EXCITATION = (
+    "five sinusoids per axis, 0.3 to 2.5 Hz, random phases, at 60 to 95 % of the speed and "
+    f"acceleration limits, still in the last 35 % of {DURATION:.0f} s"
+)
+FITTED_TRIALS, UNSEEN_TRIALS)
     fitted, unseen = (
         record_rope(world, range(first, first + count), DURATION).align(
             world.control_period, MARKERS, GRIPPER
@@ -123,12 +132,18 @@ def _simulated(world: RopeConfiguration, seed: int, quick: bool) -> tuple[Aligne
 
 
 def _compare(
-    out: Path, name: str, rope: Rope, fitted: Aligned, unseen: Aligned, settings: Settings
+    out: Path,
+    name: str,
+    rope: Rope,
+    fitted: Aligned,
+    unseen: Aligned,
+    settings: Settings,
+    source: dict[str, Any],
 ) -> dict[str, PredictionError]:
     """Errors on unseen trials of the fit, the undamped fit, and the model before fitting."""
     errors = {"before fitting": prediction_error(rope, unseen)}
     for label, start in (("damped", rope), ("undamped", undamped(rope))):
-        configuration = {"data": name, "model": label, **dataclasses.asdict(settings)}
+        configuration = {"data": name, "model": label, **source, **dataclasses.asdict(settings)}
         with Run.open(out / label, configuration) as run:
             model = identify(start, fitted, settings, run)
             errors[label] = prediction_error(model, unseen)
@@ -201,7 +216,8 @@ def _real(out: Path, mocap: Path, settings: Settings, split: dict[str, Any]) -> 
     )
     driven = np.array(GRIPPED) % fitted.observation.shape[2]
     rope = starting_rope(fitted, driven.tolist())
-    errors = _compare(out / "real", "real", rope, fitted, unseen, settings)
+    source = {"files": [fingerprint(path) for path in paths]}
+    errors = _compare(out / "real", "real", rope, fitted, unseen, settings, source)
     l1 = {label: 100.0 * error.mean_absolute for label, error in errors.items()}
     split["real"] = {"fitted": paths[0].name, "unseen": paths[1].name}
     by_trial = 100.0 * errors["damped"].by_trial

@@ -28,69 +28,78 @@ if TYPE_CHECKING:
 
 LIMIT = 3.6  # of 4: the rest is for stretched and folded ropes
 
+# Who may use how much of what the ones before left of a node's limit. Stretching comes last: its
+# stiffness only has to be large, while the others are what makes one rope differ from another.
+SHARES = {
+    "bend_stiffness": 0.5,
+    "grip_stiffness": 0.5,
+    "grip_damping": 0.5,
+    "twist_stiffness": 0.5,
+    "bend_damping": 0.5,
+    "stretch_damping": 0.5,
+    "stretch_stiffness": 1.0,
+}
+
 
 def load(rope: "Rope") -> Float[Array, "*batch nodes"]:
     """How much of the stability limit each node uses: stable below 4."""
-    h = rope.time_step
-    stretch = h**2 * rope.stretch_stiffness + 2 * h * rope.stretch_damping
-    bend = h**2 * rope.bend_stiffness + 2 * h * rope.bend_damping
-    grip = h**2 * rope.grip_stiffness + 2 * h * rope.grip_damping
-    twist = h**2 * 4.0 * rope.twist_stiffness / rope_kernel.TWIST_FADE
-    per_length = 1.0 / rope.rest_length
-    first, second = per_length[..., :-1], per_length[..., 1:]
-    free = rope.free_nodes()
-    ends = free[:-1] + free[1:]
-    total = first * free[:-2] + (first + second) * free[1:-1] + second * free[2:]
-    held = (grip * per_length[..., 0] ** 2)[..., None] * ends[:1]
-    nearest = jnp.maximum(
-        jnp.maximum(per_length[..., :-2], per_length[..., 1:-1]), per_length[..., 2:]
-    )
-    nodes = rope.nodes
-    rows = (
-        spread(stretch * ends, nodes, 0)
-        + spread(stretch * ends, nodes, 1)
-        + spread(bend * total * first, nodes, 0)
-        + spread(bend * total * (first + second), nodes, 1)
-        + spread(bend * total * second, nodes, 2)
-        + spread(held, nodes, 0)
-        + spread(held, nodes, 1)
-        + sum(spread(twist * 2.0 * nearest**2, nodes, k) for k in range(4))
-    )
-    return rows * free / rope.node_mass
+    return sum((_load_of(rope, name, getattr(rope, name)) for name in SHARES), start=jnp.zeros(()))
 
 
 def soften(rope: "Rope") -> "Rope":
-    """A stable rope: itself when the load stays below `LIMIT`.
+    """A stable rope: itself when every kind of element keeps its share of `LIMIT`.
 
-    Every stiffness and damping that acts on a node is divided by what the load exceeds the limit
-    by, so that no value an optimiser can reach is unstable.
+    Each kind that asks for more is scaled down alone, where it does, so that no value an optimiser
+    can reach is unstable, and one parameter beyond its limit does not wear the others down.
     """
-    excess = jnp.maximum(load(rope) / LIMIT, 1.0)
-    # Beyond by rounding alone is legal: else a rope at the limit would not feel its gradient.
-    factor = jnp.where(excess > 1.0001, 1.0 / excess, 1.0)
-
-    def weakest(count: int) -> Array:
-        """The smallest factor of the nodes that each of `count` elements acts on."""
-        span = rope.nodes - count + 1
-        reached = [factor[..., k : rope.nodes - span + 1 + k] for k in range(span)]
-        return jnp.min(jnp.stack(reached), axis=0)
-
-    names = (
-        "stretch_stiffness",
-        "stretch_damping",
-        "bend_stiffness",
-        "bend_damping",
-        "twist_stiffness",
-    )
-    softened = {
-        name: getattr(rope, name) * weakest(getattr(rope, name).shape[-1]) for name in names
-    }
-    at_grip = jnp.minimum(factor[..., 0], factor[..., 1])
-    for name in ("grip_stiffness", "grip_damping"):
-        softened[name] = getattr(rope, name) * at_grip
+    left = jnp.asarray(LIMIT, rope.node_mass.dtype)
+    softened = {}
+    for name, share in SHARES.items():
+        value = getattr(rope, name)
+        excess = jnp.maximum(_load_of(rope, name, value) / (share * left), 1.0)
+        # Beyond by rounding alone is legal: else a rope at the limit would not feel its gradient.
+        factor = jnp.where(excess > 1.0001, 1.0 / excess, 1.0)
+        softened[name] = value * _weakest(factor, name, value)
+        left = left - _load_of(rope, name, softened[name])
     return eqx.tree_at(
         lambda rope: [getattr(rope, name) for name in softened], rope, list(softened.values())
     )
+
+
+def _load_of(rope: "Rope", name: str, value: Array) -> Float[Array, "*batch nodes"]:
+    """What the elements of one kind add to the load of each node."""
+    h, nodes, free = rope.time_step, rope.nodes, rope.free_nodes()
+    weight = value * (2.0 * h if name.endswith("damping") else h**2)
+    per_length = 1.0 / rope.rest_length
+    first, second = per_length[..., :-1], per_length[..., 1:]
+    ends = free[:-1] + free[1:]
+    if name.startswith("stretch"):
+        rows = spread(weight * ends, nodes, 0) + spread(weight * ends, nodes, 1)
+    elif name.startswith("grip"):
+        held = (weight * per_length[..., 0] ** 2)[..., None] * ends[:1]
+        rows = spread(held, nodes, 0) + spread(held, nodes, 1)
+    elif name.startswith("bend"):
+        total = first * free[:-2] + (first + second) * free[1:-1] + second * free[2:]
+        rows = (
+            spread(weight * total * first, nodes, 0)
+            + spread(weight * total * (first + second), nodes, 1)
+            + spread(weight * total * second, nodes, 2)
+        )
+    else:
+        nearest = jnp.maximum(jnp.maximum(first[..., :-1], first[..., 1:]), second[..., 1:])
+        turn = weight * (8.0 / rope_kernel.TWIST_FADE) * nearest**2
+        rows = sum((spread(turn, nodes, k) for k in range(4)), start=jnp.zeros(()))
+    return rows * free / rope.node_mass
+
+
+def _weakest(factor: Array, name: str, value: Array) -> Array:
+    """The smallest of the nodes' factors that each element of one kind acts on."""
+    if name.startswith("grip"):
+        return jnp.minimum(factor[..., 0], factor[..., 1])
+    nodes, count = factor.shape[-1], value.shape[-1]
+    span = nodes - count + 1
+    reached = [factor[..., k : nodes - span + 1 + k] for k in range(span)]
+    return jnp.min(jnp.stack(reached), axis=0)
 
 
 def spread(values: Array, size: int, offset: int) -> Array:

@@ -117,11 +117,7 @@ def undamped(rope: Rope) -> Rope:
 
 
 def _simulated(world: RopeConfiguration, seed: int, quick: bool) -> tuple[Aligned, Aligned]:
-    counts = (4, 3) if quick else (EXCITATION = (
-    "five sinusoids per axis, 0.3 to 2.5 Hz, random phases, at 60 to 95 % of the speed and "
-    f"acceleration limits, still in the last 35 % of {DURATION:.0f} s"
-)
-FITTED_TRIALS, UNSEEN_TRIALS)
+    counts = (4, 3) if quick else (FITTED_TRIALS, UNSEEN_TRIALS)
     fitted, unseen = (
         record_rope(world, range(first, first + count), DURATION).align(
             world.control_period, MARKERS, GRIPPER

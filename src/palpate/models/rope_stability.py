@@ -43,27 +43,36 @@ SHARES = {
 
 def load(rope: "Rope") -> Float[Array, "*batch nodes"]:
     """How much of the stability limit each node uses: stable below 4."""
-    return sum((_load_of(rope, name, getattr(rope, name)) for name in SHARES), start=jnp.zeros(()))
+    return sum(_loads(rope).values(), start=jnp.zeros(()))
 
 
 def soften(rope: "Rope") -> "Rope":
-    """A stable rope: itself when every kind of element keeps its share of `LIMIT`.
+    """A stable rope: itself when the load stays below `LIMIT`.
 
-    Each kind that asks for more is scaled down alone, where it does, so that no value an optimiser
-    can reach is unstable, and one parameter beyond its limit does not wear the others down.
+    Beyond it each kind of element may use its share of what is left, or what the kinds after it
+    leave, if that is more; one that asks for more is scaled down alone, where it does. No value an
+    optimiser can reach is unstable, and one parameter beyond its limit does not wear others down.
     """
+    loads = _loads(rope)
     left = jnp.asarray(LIMIT, rope.node_mass.dtype)
     softened = {}
     for name, share in SHARES.items():
         value = getattr(rope, name)
-        excess = jnp.maximum(_load_of(rope, name, value) / (share * left), 1.0)
+        asked = loads.pop(name)
+        later = sum(loads.values(), start=jnp.zeros(()))
+        allowed = jnp.maximum(share * left, left - later)
+        excess = jnp.maximum(asked / allowed, 1.0)
         # Beyond by rounding alone is legal: else a rope at the limit would not feel its gradient.
         factor = jnp.where(excess > 1.0001, 1.0 / excess, 1.0)
         softened[name] = value * _weakest(factor, name, value)
-        left = left - _load_of(rope, name, softened[name])
+        left = jnp.maximum(left - _load_of(rope, name, softened[name]), 1e-5)  # rounding
     return eqx.tree_at(
         lambda rope: [getattr(rope, name) for name in softened], rope, list(softened.values())
     )
+
+
+def _loads(rope: "Rope") -> dict[str, Array]:
+    return {name: _load_of(rope, name, getattr(rope, name)) for name in SHARES}
 
 
 def _load_of(rope: "Rope", name: str, value: Array) -> Float[Array, "*batch nodes"]:

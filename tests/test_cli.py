@@ -161,6 +161,11 @@ def test_what_is_recorded_by_default_is_the_default_rope():
             "a seed is a whole number, 0 or greater, not -1; `palpate demo --help` says what there "
             "is",
         ),
+        (
+            "record rope --seed=abc",
+            "--seed takes a whole number, not 'abc'; `palpate record rope --help` says what there "
+            "is",
+        ),
         ("record rope --trials 0", "a recording has at least one trial, not 0"),
         ("record rope --mass -1", "a rope's mass is greater than 0, not -1.0"),
     ],

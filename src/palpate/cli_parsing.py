@@ -55,9 +55,10 @@ def sentence(box: str, program: str, words: list[str]) -> str:
 
 def _wrong_value(match: re.Match[str], words: list[str]) -> str:
     option, takes = match.groups()
-    given = itertools.takewhile(
-        lambda word: not word.startswith("--"), words[words.index(option) + 1 :]
-    )
+    at = next(index for index, word in enumerate(words) if word.partition("=")[0] == option)
+    _, joined, value = words[at].partition("=")
+    following = itertools.takewhile(lambda word: not word.startswith("--"), words[at + 1 :])
+    given = [value] if joined else following
     return f"{option} takes {_TAKES.get(takes, takes)}, not '{' '.join(given)}'"
 
 

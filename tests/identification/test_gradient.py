@@ -239,6 +239,8 @@ def test_errors_say_what_is_wrong(change, message):
 def test_settings_are_checked():
     with pytest.raises(PalpateError, match="one number of iterations"):
         Settings(iterations=(1, 2))
+    with pytest.raises(PalpateError, match="at least one iteration"):
+        Settings(iterations=(1, 0, 2))
     with pytest.raises(PalpateError, match="shares between 0 and 1"):
         Settings(horizons=(0.1, 0.5, 2.0))
 

@@ -139,6 +139,11 @@ class IdentifyRope(Identify):
     def _thinned(self, recording: Recording) -> Recording:
         if self.nodes is None:
             return recording
+        if not set(self.driven) <= {0, -1}:
+            raise PalpateError(
+                f"--nodes keeps every so many markers, so only the ends can be driven: expected "
+                f"--driven 0, -1 or both with it, got {' '.join(map(str, self.driven))}"
+            )
         count = recording.trials[0][self.observation].values.shape[1]
         every, rest = divmod(count - 1, max(self.nodes - 1, 1))
         if rest or not every:

@@ -65,6 +65,11 @@ class Settings:
                 f"one number of iterations is needed for each horizon, got {len(self.horizons)} "
                 f"horizons and {len(self.iterations)} numbers"
             )
+        if min(self.iterations) < 1 or self.windows < 1:
+            raise PalpateError(
+                "an identification needs at least one iteration at each horizon and one window, "
+                f"got iterations {self.iterations} and {self.windows} windows"
+            )
         if not all(0.0 < share <= 1.0 for share in self.horizons):
             raise PalpateError(f"horizons are shares between 0 and 1, got {self.horizons}")
 
@@ -161,7 +166,9 @@ def _iterate(
             "recording's units and rate"
         )
     within = descent.within + 1
-    ended = within >= settings.iterations[descent.stage] or loss < settings.threshold
+    # What is easily met at a shortened horizon says nothing about the stage's own.
+    good = loss < settings.threshold and halvings == 0
+    ended = within >= settings.iterations[descent.stage] or good
     if ended:
         return Descent(free, optimiser, descent.stage + 1), loss
     return Descent(free, optimiser, descent.stage, within, halvings), loss

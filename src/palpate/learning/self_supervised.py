@@ -60,6 +60,13 @@ class Training:
     depth: int = 2
     checkpoint_every: int = 100
 
+    def __post_init__(self) -> None:
+        if self.iterations < 1 or self.batch < 1 or self.starts < 2:
+            raise PalpateError(
+                "a training needs at least one iteration, one episode in each and two start "
+                f"states, got {self.iterations}, {self.batch} and {self.starts}"
+            )
+
 
 class TrainingState(eqx.Module):
     """What a checkpoint holds: the rest follows from the seed and the iteration."""

@@ -17,10 +17,13 @@ from palpate.experiments.rope_options import (
     RecordRope,
     TrainRopeStabilization,
 )
-from palpate.report import build_report
+from palpate.report import build_report, motion_figure, read_evidence
 from palpate.result import Figure, Result, read_result
 from palpate.runs import RESULT
 from palpate.storage import read_json, write_json
+
+PICTURE = "picture.png"  # the README's
+INSTANTS = (0.8, 1.6, 2.4, 3.2)  # s, of the motion in the picture
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,7 @@ def run(options: Demo, size: Size = Size()) -> Path:
     stages = [recording.parent, identified, trained, evaluated]
     notes = read_result(evaluated / RESULT).settings["notes"]
     build_report([out, *stages], out / folders.REPORT, "A rope, from recording to rest", notes)
+    _draw(out / PICTURE, identified, evaluated)
     tip, success, periods, seconds, still = (figure.value for figure in figures)
     print()
     print(f"tip error {tip:.4f} m per metre of rope, {size.duration:g} s ahead, unseen motions")
@@ -103,7 +107,14 @@ def run(options: Demo, size: Size = Size()) -> Path:
         print(f"time to 1 % energy {seconds:.2f} s, {periods:.2f} periods")
     print(f"at rest in {success:.0%} of the trials; with the gripper held still in {still:.0%}")
     print(f"report: {out / folders.REPORT}")
+    print(f"picture: {out / PICTURE}")
     return out
+
+
+def _draw(path: Path, identified: Path, evaluated: Path) -> None:
+    """The recorded motion beside its prediction, and the energy with and without control."""
+    motion = read_evidence(identified).motions[0]
+    motion_figure(path, motion, INSTANTS, read_evidence(evaluated).energy)
 
 
 def _figures(identified: Path, evaluated: Path, length: float) -> list[Figure]:

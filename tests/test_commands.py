@@ -408,6 +408,7 @@ def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
     assert "demo: about" in said.splitlines()[0]
     assert said.splitlines()[-1] == f"report: {folder / folders.REPORT}"
     assert "m per metre of rope" in said
+    assert (folder / demo.PICTURE).read_bytes().startswith(b"\x89PNG")
     figures = {figure.name: figure.value for figure in read_result(folder / "result.json").figures}
     assert 0.0 < figures["tip_rmse_per_length"] < 0.2
     assert "note: the rope is drawn, not rendered: no OpenGL here; install libegl1\n" in said

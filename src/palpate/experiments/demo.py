@@ -106,8 +106,8 @@ def run(options: Demo, size: Size = Size()) -> Path:
     else:
         print(f"time to 1 % energy {seconds:.2f} s, {periods:.2f} periods")
     print(f"at rest in {success:.0%} of the trials; with the gripper held still in {still:.0%}")
-    print(f"report: {out / folders.REPORT}")
     print(f"picture: {out / PICTURE}")
+    print(f"report: {out / folders.REPORT}")
     return out
 
 

@@ -192,7 +192,7 @@ def _limits(seen: Any) -> tuple[tuple[float, float], tuple[float, float]]:
 
 def _round_ticks(low: float, high: float) -> list[float]:
     step = float(max(s for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if s <= max(high - low, 0.05)))
-    step = step / 2 if (high - low) / step < 2 else step
+    step = step if (high - low) / step >= 1 else step / 2
     return [float(t) for t in np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step]
 
 
@@ -241,7 +241,8 @@ def _legend(figure: "Figure") -> None:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if len(handles) > 1:
-        place = {"loc": "outside upper left", "ncols": len(handles), "frameon": False}
+        across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
+        place = {"loc": "outside upper left", "ncols": across, "frameon": False}
         figure.legend(handles.values(), handles.keys(), handlelength=3.5, **place)
 
 

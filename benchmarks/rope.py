@@ -227,9 +227,9 @@ def benchmark(quick: bool = False) -> Result:
             (
                 theirs,
                 BATCH * STEPS * SUBSTEPS / batched,
-                SINGLE_STEPS * SUBSTEPS / min(seconds(single) for _ in range(5)),
+                SINGLE_STEPS * SUBSTEPS / seconds(single),
                 seconds(backward) / batched,
-                64 * STEPS * SUBSTEPS / min(seconds(small) for _ in range(5)),
+                64 * STEPS * SUBSTEPS / seconds(small),
             )
         )
     theirs, batched, alone, ratio, cached = np.array(rows).T

@@ -58,8 +58,8 @@ def test_any_free_values_build_a_stable_rope_however_crumpled_and_shaken(seed, d
     """Three seconds from a crumpled start; let alone, it gains no energy.
 
     At load L symplectic Euler keeps an ellipse around the energy, of which it shows up to
-    1 / (1 - sqrt(L) / 2) = 20 times the start's at `LIMIT` while its stiffness is constant. A rope
-    that is free to stretch far is not: 58 was measured at nine sigma. An instability shows e^100.
+    1 / (1 - sqrt(L) / 2) = 20 times the start's at `LIMIT` while its stiffness is constant. 58 was
+    measured at nine sigma, cause not found. An instability shows e^100.
     """
     rng = np.random.default_rng(seed)
     ropes = build(random_free(rng, deviation))

@@ -80,3 +80,16 @@ def data_parallel(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], A
         return function(shared, batch) if size % len(devices) else divided(shared, batch)
 
     return call
+
+
+def everywhere(tree: Any) -> Any:
+    """The arrays on all devices, as a computation by `data_parallel` leaves what it returns.
+
+    What a loop starts from has to be placed so too: else its first turn is compiled by itself, and
+    rounds differently from the others.
+    """
+    import jax
+    from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+    placed = NamedSharding(Mesh(jax.devices(), ("batch",)), PartitionSpec())
+    return jax.device_put(tree, placed)

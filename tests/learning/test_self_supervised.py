@@ -47,7 +47,9 @@ def success(task, model, policy: CommandPolicy, noise: float = 0.0) -> float:
     start = task.starts(model, jax.random.key(9), 200)
     models = randomise(model, jax.random.key(8), 1.0, 200)
     steps = round(1.5 * task.duration / model.control_period)
-    states, actions = simulate(task, models, policy, start, steps, jax.random.key(7), noise)
+    states, actions = simulate(
+        task, models, policy, start, steps, jax.random.split(jax.random.key(7), 200), noise
+    )
     return float(task.outcome(models, start, states, actions)["success"].mean())
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Key
 
 from palpate.models.model import Model
 from palpate.networks.policy import Policy
@@ -18,28 +18,30 @@ def simulate(
     policy: Policy,
     start: Start,
     steps: int,
-    key: PRNGKeyArray | None = None,
+    keys: Key[Array, " batch"] | None = None,
     noise: float = 0.0,
 ) -> tuple[Any, Array]:
     """States after each of `steps` decisions in closed loop, and the actions: (batch, time, ...).
 
     Without noise the policy sees the state. With it, the policy sees what a robot would: noisy
     observations (standard deviation `noise`, in the observation's unit) and velocities estimated
-    from them.
+    from them. `keys`: one of each episode, (batch,), so that its chance does not depend on the
+    company it is in; a noisy episode needs one.
     """
-    key = jax.random.key(0) if key is None else key
+    if keys is None:
+        keys = jax.random.split(jax.random.key(0), jax.tree.leaves(start.state)[0].shape[0])
     estimator = VelocityEstimator(models.control_period)
 
-    def perceive(window: Array, state: Any, key: PRNGKeyArray) -> tuple[Array, Any]:
+    def perceive(window: Array, state: Any, keys: Key[Array, " batch"]) -> tuple[Array, Any]:
         observed = models.observe(state)
-        observed = observed + noise * jax.random.normal(key, observed.shape, observed.dtype)
+        observed = observed + noise * _normal(keys, observed.shape[1:], observed.dtype)
         window, velocity = estimator.update(window, observed)
         before = observed - models.control_period * velocity
         return window, models.initial_state(jnp.stack([before, observed], axis=1))
 
     def advance(loop: tuple[Any, Any, Array | None], index: Array) -> tuple[Any, Any]:
         state, memory, window = loop
-        for_noise, for_policy = jax.random.split(jax.random.fold_in(key, index))
+        for_noise, for_policy = jax.vmap(jax.random.split, out_axes=1)(_fold_in(keys, index))
         seen = state
         if window is not None:
             window, seen = perceive(window, state, for_noise)
@@ -49,14 +51,18 @@ def simulate(
 
     window = None
     if noise:
-        window = _past(models, start, estimator, noise, jax.random.fold_in(key, steps))
+        window = _past(models, start, estimator, noise, _fold_in(keys, steps))
     loop = start.state, policy.initial_carry(start.command), window
     _, (states, actions) = jax.lax.scan(advance, loop, jnp.arange(steps))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (states, actions))
 
 
 def _past(
-    models: Model, start: Start, estimator: VelocityEstimator, noise: float, key: PRNGKeyArray
+    models: Model,
+    start: Start,
+    estimator: VelocityEstimator,
+    noise: float,
+    keys: Key[Array, " batch"],
 ) -> Array:
     """What was seen before the first decision: the start's motion, continued backwards."""
     observed = models.observe(start.state)
@@ -64,4 +70,13 @@ def _past(
     back = jnp.arange(-estimator.frames, 0, dtype=observed.dtype)
     back = back.reshape(-1, *(1,) * observed.ndim)
     window = observed + back * (following - observed)
-    return window + noise * jax.random.normal(key, window.shape, window.dtype)
+    shape = (len(window), *window.shape[2:])
+    return window + noise * jnp.moveaxis(_normal(keys, shape, window.dtype), 0, 1)
+
+
+_fold_in = jax.vmap(jax.random.fold_in, in_axes=(0, None))
+
+
+def _normal(keys: Key[Array, " batch"], shape: tuple[int, ...], dtype: Any) -> Array:
+    """Standard normal numbers, (batch, *shape), of each episode's own key."""
+    return jax.vmap(lambda key: jax.random.normal(key, shape, dtype))(keys)

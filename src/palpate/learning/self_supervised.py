@@ -15,10 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, PRNGKeyArray
 
-from palpate.devices import data_parallel
+from palpate.devices import data_parallel, everywhere
 from palpate.errors import PalpateError
 from palpate.learning.closed_loop import simulate
 from palpate.models.model import Model
@@ -107,9 +106,7 @@ def train(
     done = 0
     if run is not None:
         done, state = run.restore(state) or (0, state)
-    # Where an update leaves it: else the second would compile anew, to other last digits.
-    everywhere = NamedSharding(Mesh(jax.devices(), ("batch",)), PartitionSpec())
-    state, pool, for_updates = jax.device_put((state, pool, for_updates), everywhere)
+    state, pool, for_updates = everywhere((state, pool, for_updates))
     stages = _stages(task, model, training)
     bar = progress(range(done + 1, training.iterations + 1), "training", done=done)
     updates = {}
@@ -134,7 +131,7 @@ def train(
                     run.save(iteration, state)
             if stop:
                 break
-    return eqx.combine(state.policy, static)
+    return eqx.combine(jax.tree.map(jnp.asarray, jax.device_get(state.policy)), static)
 
 
 def _finite(value: Array) -> float | None:
@@ -183,15 +180,14 @@ def _update(
     """The jitted iteration for one horizon: (state, key, iteration) to (state, metrics)."""
 
     def value_and_gradient(shared, batch):
-        arrays, common, key = shared
-        own, start, index = batch
+        arrays, common = shared
+        own, start, keys = batch
         models = eqx.combine(own, common)
-        key = jax.random.fold_in(key, index[0])  # other noise on each device
 
         def loss(arrays):
             policy = eqx.combine(arrays, static)
             noise = training.observation_noise
-            states, actions = simulate(task, models, policy, start, horizon, key, noise)
+            states, actions = simulate(task, models, policy, start, horizon, keys, noise)
             return jnp.mean(task.loss(models, start, states, actions))
 
         return jax.value_and_grad(loss)(arrays)
@@ -210,9 +206,8 @@ def _update(
         start = task.adapt(start, models)
         perturbed = jax.tree.map(lambda leaf, single: leaf.ndim > single.ndim, models, model)
         own, common = eqx.partition(models, perturbed)
-        loss, gradient = divided(
-            (state.policy, common, keys[3]), (own, start, jnp.arange(training.batch))
-        )
+        episodes = jax.random.split(keys[3], training.batch)
+        loss, gradient = divided((state.policy, common), (own, start, episodes))
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(norm) & jnp.isfinite(loss)
         changes, moments = optimiser.update(gradient, state.optimiser)

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from palpate.errors import PalpateError
 from palpate.storage import load_arrays, read_manifest, save_arrays
@@ -39,7 +39,7 @@ class Policy(eqx.Module):
 
     @abstractmethod
     def __call__(
-        self, carry: Any, observation: Array, goal: Any, key: PRNGKeyArray | None
+        self, carry: Any, observation: Array, goal: Any, key: Key[Array, "*batch"] | None
     ) -> tuple[Any, Array]:
         """The next carry, and the action to hold for one control period."""
 
@@ -115,7 +115,7 @@ class CommandPolicy(Policy):
         carry: Array,
         observation: Float[Array, "*batch features"],
         goal: Any = None,
-        key: PRNGKeyArray | None = None,
+        key: Key[Array, "*batch"] | None = None,
     ) -> tuple[Array, Array]:
         """The command, as the next carry and as the action: (*batch, *action_shape)."""
         mean, scale = jax.lax.stop_gradient((self.mean, self.scale))

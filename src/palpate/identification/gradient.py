@@ -37,8 +37,10 @@ Free = dict[str, Array]
 KNEE = 0.01
 
 # The gradient of a long prediction of an undamped model can be infinite although the prediction is
-# not: such an iteration changes nothing, and the rest of the stage looks half as far ahead.
+# not: such an iteration changes nothing and the next look half as far ahead, until a few in a row
+# were finite and the horizon grows back by one doubling.
 MOST_HALVINGS = 6
+RECOVERY = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +83,8 @@ class Descent(eqx.Module):
     optimiser: Any
     stage: int = 0
     within: int = 0  # iterations done in this stage
-    halvings: int = 0  # of this stage's horizon, one for each loss or gradient that was not finite
+    halvings: int = 0  # of this stage's horizon, for losses or gradients that were not finite
+    finite: int = 0  # iterations in a row since the horizon was last changed
 
 
 @runtime_checkable
@@ -137,7 +140,7 @@ def identify(
                 run.log(step, loss=loss if np.isfinite(loss) else None, horizon=horizon)
                 if stop or descent.within == 0 or step % 50 == 0:
                     run.save(step, descent)
-    return coordinates.build(descent.free)
+    return coordinates.build(jax.tree.map(jnp.asarray, jax.device_get(descent.free)))
 
 
 def _iterate(
@@ -158,7 +161,11 @@ def _iterate(
     remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
     free, optimiser, loss = method.step(descent.free, descent.optimiser, windows, remaining)
     loss = float(loss)
-    halvings = descent.halvings + int(not np.isfinite(loss))
+    halvings, finite = descent.halvings, descent.finite + 1
+    if not np.isfinite(loss):
+        halvings, finite = halvings + 1, 0
+    elif halvings and finite >= RECOVERY:
+        halvings, finite = halvings - 1, 0
     if halvings > MOST_HALVINGS:
         raise PalpateError(
             f"the loss or its gradient is not finite at iteration {step + 1}, however short the "
@@ -167,11 +174,11 @@ def _iterate(
         )
     within = descent.within + 1
     # What is easily met at a shortened horizon says nothing about the stage's own.
-    good = loss < settings.threshold and halvings == 0
+    good = loss < settings.threshold and descent.halvings == 0
     ended = within >= settings.iterations[descent.stage] or good
     if ended:
         return Descent(free, optimiser, descent.stage + 1), loss
-    return Descent(free, optimiser, descent.stage, within, halvings), loss
+    return Descent(free, optimiser, descent.stage, within, halvings, finite), loss
 
 
 def _position(descent: Descent, settings: Settings) -> int:
@@ -217,6 +224,7 @@ class Adam:
     def step(self, free: Free, optimiser: Any, windows: Windows, remaining: float):
         """One Adam update."""
         rate = self._rate * 0.5 * (1.0 - np.cos(np.pi * remaining))
+        free, optimiser = devices.everywhere((free, optimiser))
         return self._step(free, optimiser, windows, jnp.asarray(rate, jnp.zeros(()).dtype))
 
 

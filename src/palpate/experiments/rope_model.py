@@ -55,7 +55,7 @@ EXCITATION = (
     f"acceleration limits, still in the last 35 % of {DURATION:.0f} s"
 )
 FITTED_TRIALS, UNSEEN_TRIALS = 12, 8
-UNSEEN_SEEDS = 1000  # the unseen motions' seeds start this far after the fitted ones'
+UNSEEN_SEEDS = 310_000  # the unseen motions' seeds start this far after the fitted ones'
 DAMPING = ("stretch_damping", "bend_damping", "grip_damping", "air_drag", "quadratic_drag")
 SEED_TABLE = {"sim1": (0.0704, 0.1510), "sim2": (0.0442, 0.1347), "real": (0.0591, 0.0810)}
 DEFORM_L1 = {"dlo1": 1.01, "dlo3": 0.77}  # cm

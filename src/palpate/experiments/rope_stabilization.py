@@ -53,7 +53,7 @@ BASE = RopeConfiguration()  # the rope that is recorded, and the middle of those
 NODES, SUBSTEPS = 11, 4  # of the model: every second marker, in steps of 2.5 ms
 RECORDED_TRIALS, RECORDED_DURATION = 8, 5.0  # s
 ROPES = 125
-EVALUATION_SEEDS = 500_000  # the evaluation draws from here on, the recording from `seed` on
+EVALUATION_SEEDS = 910_000  # the evaluation draws from here on, the recording from `seed` on
 SUCCESS_BAR, PERIODS_BAR = 0.99, 0.9
 NAME = "rope-stabilization"
 SHIPPED = f"assets/{NAME}.safetensors"
@@ -107,7 +107,8 @@ def reproduce(
     else:
         announce(NAME, size.minutes)
         model, spent = identified_rope(out, size, seed)
-        policy, about = trained_policy(out / "train", model, size.training, seed)
+        command = f"palpate reproduce {NAME} --seed {seed}{' --quick' if quick else ''}"
+        policy, about = trained_policy(out / "train", model, size.training, seed, command)
         spent += about["wall_time_s"]
     trials = evaluation_trials(BASE, size.ropes, EVALUATION_SEEDS + seed)
     evaluated, took = _evaluated(out / "evaluate", policy, about, trials, seed)
@@ -187,9 +188,12 @@ def _recorded(path: Path, trials: int, seed: int) -> tuple[Recording, float]:
 
 
 def trained_policy(
-    path: Path, model: Rope, training: Training, seed: int
+    path: Path, model: Rope, training: Training, seed: int, command: str
 ) -> tuple[CommandPolicy, dict[str, Any]]:
-    """The policy trained in the folder `path`, and its manifest; read if it is there already."""
+    """The policy trained in the folder `path`, and its manifest; read if it is there already.
+
+    The manifest says by which `command`.
+    """
     task = RopeStabilization()
     configuration = {
         "stage": "train",
@@ -206,7 +210,7 @@ def trained_policy(
                 "task": task.name,
                 "features": task.feature_names(model),
                 "action": "gripper velocity, m/s",
-                "command": f"palpate reproduce {NAME} --seed {seed}",
+                "command": command,
                 "seed": seed,
                 "training": dataclasses.asdict(training),
                 "model": describe(model),

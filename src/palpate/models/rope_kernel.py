@@ -33,6 +33,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from palpate.devices import compiled_apart
+
 TWIST_FADE = 0.01  # S above: twist counts half at joints of 0.1 rad
 COINCIDENT = 1e-12  # m^2, added to l^2, which vanishes where two nodes meet
 FOLDED = 1e-3  # added to |m|^2, which vanishes where the rope is folded back on itself
@@ -106,7 +108,7 @@ def _moved_by_forces(
     speed = jnp.sqrt(_dot(velocity, velocity) + 1e-12)
     slowing = 1.0 / (1.0 + c.step_per_mass * (c.linear_drag + c.quadratic_drag * speed))
     x, y, z = (
-        v + c.step_per_mass * (_pad(f, 0, 1, lanes) - _pad(f, 1, 0, lanes))
+        v + c.step_per_mass * _difference(_pad(f, 1, 1, lanes), lanes)
         for f, v in zip(force, velocity, strict=True)
     )
     return slowing * x, slowing * y, slowing * (z - c.step_gravity)
@@ -119,60 +121,112 @@ def edge_forces(
 
     Shapes: flat (nodes x lanes,) to flat (segments x lanes,).
     """
-    edge = tuple(_difference(p, lanes) for p in position)
-    relative = tuple(_difference(v, lanes) for v in velocity)
-    per_length = 1.0 / jnp.sqrt(_dot(edge, edge) + COINCIDENT)
-    stretch = c.stretch_stiffness * (1.0 - c.rest_length * per_length)
-    stretch = stretch + c.stretch_damping * _dot(relative, edge) * per_length * per_length
+    edge, direction, turning, stretch = _stretch(
+        position, velocity, c.rest_length, c.stretch_stiffness, c.stretch_damping, lanes=lanes
+    )
+    earlier, later, bend, moment = _bending(
+        direction, turning, rest_bend, c.bend_stiffness, c.bend_damping, lanes=lanes
+    )
+    to_earlier, to_later = _twist(earlier, later, bend, c.twist_stiffness, lanes=lanes)
     per_rest_length = 1.0 / c.rest_length
-    direction = tuple(e * per_rest_length for e in edge)
-    turning = tuple(w * per_rest_length for w in relative)
-    bend = tuple(_difference(u, lanes) for u in direction)
-    bend_rate = tuple(_difference(u, lanes) for u in turning)
-    mean = tuple(_drop(u, -1, lanes) + _drop(u, 1, lanes) for u in direction)
-    turned = _dot(mean, bend_rate) / (_dot(mean, mean) + FOLDED)
-    gradient = _twist(direction, bend, c, lanes)
-    if rest_bend is not None:
-        bend = tuple(b - rest for b, rest in zip(bend, rest_bend, strict=True))
     force = []
     for axis in range(3):
-        bending = bend_rate[axis] - turned * mean[axis]
-        moment = c.bend_stiffness * bend[axis] + c.bend_damping * bending
-        turn = _pad(moment, 1, 0, lanes) - _pad(moment, 0, 1, lanes) + gradient[axis]
+        turn = _pad(to_earlier[axis] - moment[axis], 0, 1, lanes)
+        turn = turn + _pad(to_later[axis] + moment[axis], 1, 0, lanes)
         from_down = direction[axis] + 1.0 if axis == 2 else direction[axis]
         turn = turn + c.grip_stiffness * from_down + c.grip_damping * turning[axis]
         force.append(stretch * edge[axis] + turn * per_rest_length)
     return force[0], force[1], force[2]
 
 
-def _twist(direction: Axes, bend: Axes, c: Coefficients, lanes: int) -> Axes:
-    """Gradient of the twist energy to each direction.
+@compiled_apart
+def _stretch(
+    position: Axes,
+    velocity: Axes,
+    rest_length: Flat,
+    stiffness: Flat,
+    damping: Flat,
+    *,
+    lanes: int,
+) -> tuple[Axes, Axes, Axes, Flat]:
+    """Of each segment the edge, its direction, the rate of that, and the tension per length."""
+    edge = tuple(_difference(p, lanes) for p in position)
+    relative = tuple(_difference(v, lanes) for v in velocity)
+    per_length = 1.0 / jnp.sqrt(_dot(edge, edge) + COINCIDENT)
+    tension = stiffness * (1.0 - rest_length * per_length)
+    tension = tension + damping * _dot(relative, edge) * per_length * per_length
+    per_rest_length = 1.0 / rest_length
+    direction = tuple(e * per_rest_length for e in edge)
+    turning = tuple(w * per_rest_length for w in relative)
+    return edge, direction, turning, tension
+
+
+@compiled_apart
+def _bending(
+    direction: Axes,
+    turning: Axes,
+    rest_bend: Axes | None,
+    stiffness: Flat,
+    damping: Flat,
+    *,
+    lanes: int,
+) -> tuple[Axes, Axes, Axes, Axes]:
+    """Of each joint the directions before and after it, its bend, and its moment."""
+    earlier, later = _around_joints(direction, lanes)
+    bend = _minus(later, earlier)
+    mean = tuple(a + b for a, b in zip(earlier, later, strict=True))
+    rate_before, rate_after = _around_joints(turning, lanes)
+    bend_rate = _minus(rate_after, rate_before)
+    turned = _dot(mean, bend_rate) / (_dot(mean, mean) + FOLDED)
+    elastic = bend if rest_bend is None else _minus(bend, rest_bend)
+    moment = tuple(
+        stiffness * e + damping * (rate - turned * m)
+        for e, rate, m in zip(elastic, bend_rate, mean, strict=True)
+    )
+    return earlier, later, bend, moment
+
+
+@compiled_apart
+def _twist(
+    earlier: Axes, later: Axes, bend: Axes, stiffness: Flat, *, lanes: int
+) -> tuple[Axes, Axes]:
+    """Gradient of the twist energy to the directions before and after each joint.
 
     With binormals b_j = u_j x u_{j+1}, s = |b|^2 and t = u_0 . b_2: dt/du_0 = b_2, and what the
     energy gains per binormal, g_j, turns into u_{j+1} x g_j for u_j and g_j x u_j for u_{j+1}.
     """
-    earlier = tuple(_drop(u, -1, lanes) for u in direction)
-    later = tuple(_drop(u, 1, lanes) for u in direction)
     binormal = _cross(later, bend)
     fade = 1.0 / (_dot(binormal, binormal) + TWIST_FADE)
     second = tuple(_drop(b, 1, lanes) for b in binormal)
-    first_direction = tuple(_drop(u, -2, lanes) for u in direction)
+    first_direction = tuple(_drop(u, -1, lanes) for u in earlier)
     triple = _dot(first_direction, second)
-    response = c.twist_stiffness * triple * _drop(fade, -1, lanes) * _drop(fade, 1, lanes)
-    twice_energy = response * triple
-    fading = (_pad(twice_energy, 0, 1, lanes) + _pad(twice_energy, 1, 0, lanes)) * fade
+    response = stiffness * triple * _drop(fade, -1, lanes) * _drop(fade, 1, lanes)
+    twice_energy = _pad(response * triple, 1, 1, lanes)
+    fading = (_drop(twice_energy, 1, lanes) + _drop(twice_energy, -1, lanes)) * fade
     per_binormal = tuple(
-        _pad(response * first_direction[axis], 1, 0, lanes) - fading * binormal[axis]
-        for axis in range(3)
+        _pad(response * u, 1, 0, lanes) - fading * b
+        for u, b in zip(first_direction, binormal, strict=True)
     )
-    to_earlier, to_later = _cross(later, per_binormal), _cross(per_binormal, earlier)
-    x, y, z = (
-        _pad(response * second[axis], 0, 2, lanes)
-        + _pad(to_earlier[axis], 0, 1, lanes)
-        + _pad(to_later[axis], 1, 0, lanes)
-        for axis in range(3)
+    to_earlier = tuple(
+        _pad(response * b, 0, 1, lanes) + turn
+        for b, turn in zip(second, _cross(later, per_binormal), strict=True)
     )
-    return x, y, z
+    return to_earlier, _cross(per_binormal, earlier)
+
+
+def _around_joints(values: Axes, lanes: int) -> tuple[Axes, Axes]:
+    """What segments have before and after each joint.
+
+    Taken once: a slice costs its reverse sweep a copy.
+    """
+    return (
+        tuple(_drop(value, -1, lanes) for value in values),
+        tuple(_drop(value, 1, lanes) for value in values),
+    )
+
+
+def _minus(a: Axes, b: Axes) -> Axes:
+    return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
 def _dot(a, b) -> Flat:

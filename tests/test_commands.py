@@ -11,8 +11,10 @@ import pytest
 from palpate.cli import main
 from palpate.errors import PalpateError
 from palpate.experiments import demo, folders, identify, reproduce, rope_evaluation, train
-from palpate.experiments.options import Demo, Identify, Options, Reproduce, Train
-from palpate.experiments.rope_options import RecordRope
+from palpate.experiments.options import Demo, Identify, Reproduce, Train
+from palpate.experiments.rope_options import IdentifyRope, RecordRope
+from palpate.identification.least_squares import Intervals
+from palpate.identification.prediction import PredictionError, Windows
 from palpate.models import files
 from palpate.models.files import load_model
 from palpate.models.model import rollout
@@ -70,14 +72,18 @@ def elsewhere(tmp_path, monkeypatch):
         monkeypatch.setitem(TASKS, task.name, task)
 
 
-def recorded(name, path, trials=5, steps=80):
-    """A file with trials of the true toy under random pushes, seen with a little noise."""
+def recorded(name, path, trials=5, steps=80, hidden=0):
+    """A file with trials of the true toy under random pushes, seen with a little noise.
+
+    The last `hidden` frames show nothing.
+    """
     model, rng = TRUTH[name], np.random.default_rng(0)
     actions = np.repeat(rng.normal(size=(trials, steps // 10, 1)), 10, axis=1)
     start = model.initial_state(jnp.zeros((trials, 1, 1)))
     states = rollout(model, start, jnp.asarray(actions, jnp.float32))
     seen = np.concatenate([np.zeros((trials, 1, 1)), model.observe(states)], axis=1)
     seen += 1e-4 * rng.normal(size=seen.shape)
+    seen[:, len(seen[0]) - hidden :] = np.nan
     time = model.control_period * np.arange(steps + 1)
     write_recording(
         path,
@@ -112,19 +118,19 @@ def test_a_toy_is_identified_trained_for_and_reported(name, tmp_path, capsys):
     assert "90 % interval" in said
     assert f"over 1 trial of {LASTS[name]} s (validation)" in said
     model, about = load_model(folder / folders.MODEL)
-    result = read_json(folder / "result.json")
+    result = read_result(folder / "result.json")
     unit = {"cart": "cm", "pendulum": "rad"}[name]
-    assert [figure["name"] for figure in result["figures"]] == [
+    assert [figure.name for figure in result.figures] == [
         f"l1_{unit}",
         f"rmse_at_end_{unit}",
         f"l1_fitted_trials_{unit}",
         "wall_time_s",
     ]
-    assert about["figures"][f"l1_{unit}"] == result["figures"][0]["value"]
-    assert len(result["split"]["fitted"]) == 4
-    (held_out,) = result["split"]["validation"]
-    assert held_out not in result["split"]["fitted"]
-    for row in result["parameters"]:
+    assert about["figures"][f"l1_{unit}"] == result.figures[0].value
+    assert len(result.split["fitted"]) == 4
+    (held_out,) = result.split["validation"]
+    assert held_out not in result.split["fitted"]
+    for row in result.parameters:
         true = float(getattr(TRUTH[name], row["name"]))
         assert np.isclose(row["value"], true, rtol=0.15), row
         assert row["lower"] < row["value"] < row["upper"]
@@ -133,7 +139,9 @@ def test_a_toy_is_identified_trained_for_and_reported(name, tmp_path, capsys):
     assert set(shown.horizon.values) == {"identified", "start model"}
     assert shown.horizon.values["identified"][-1] < shown.horizon.values["start model"][-1]
     assert not shown.motions  # a number is no chain of points
-    assert (folder / folders.REPORT).exists()
+    page = (folder / folders.REPORT).read_text()
+    assert f"RMSE ({UNIT[name]})" in page
+    assert f" {UNIT[name]} after {LASTS[name][:-1]}" in page
 
     trained = train.run(
         TrainToy(model=folder, task=TOY_TASKS[name].name, iterations=30, batch=8, starts=64)
@@ -142,8 +150,16 @@ def test_a_toy_is_identified_trained_for_and_reported(name, tmp_path, capsys):
     assert manifest["task"] == TOY_TASKS[name].name
     assert manifest["training"]["iterations"] == 30
     assert policy.period == model.control_period
-    figures = {figure.name: figure.value for figure in read_result(trained / "result.json").figures}
-    assert 0.0 <= figures["in_model.success"] <= 1.0
+    figures = {figure.name: figure for figure in read_result(trained / "result.json").figures}
+    assert 0.0 <= figures["in_model.success"].value <= 1.0
+    units = {name: figure.unit for name, figure in figures.items()}
+    distance = {"in_model.distance": "m"} if name == "cart" else {}
+    assert units == {"in_model.success": "", **distance}
+    task = "" if name == "cart" else " --task pendulum-damping"
+    assert manifest["command"] == (
+        f"palpate train {TOY_TASKS[name].name} --seed 0{task} --model {folder} --iterations 30 "
+        "--batch 8 --starts 64"
+    )
     assert len(read_evidence(trained).metrics) == 30
     assert (trained / folders.REPORT).exists()
 
@@ -153,6 +169,40 @@ def test_the_only_trial_is_fitted_and_said_to_be(tmp_path, capsys):
     folder = identify.run(IdentifyToy(recordings=(recording,), iterations=(1, 1, 1)))
     assert "(the fitted trial)" in capsys.readouterr().out
     assert "none" in read_json(folder / "result.json")["split"]["validation"]
+
+
+def test_the_error_at_the_end_is_the_last_that_was_seen(tmp_path):
+    recording = recorded("cart", tmp_path / "toy.npz", hidden=10)
+    folder = identify.run(IdentifyToy(recordings=(recording,), iterations=(1, 1, 1)))
+    result = read_json(folder / "result.json")
+    curve = read_evidence(folder).horizon.values["identified"]
+    assert np.isnan(curve[-10:]).all()
+    assert result["settings"]["end_s"] == pytest.approx(69 * 0.05)
+    (end,) = (f["value"] for f in result["figures"] if f["name"] == "rmse_at_end_cm")
+    assert end == pytest.approx(100 * curve[68], rel=1e-5)
+    assert end > 0.1
+    assert "NaN" not in (folder / "result.json").read_text()
+
+
+def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap():
+    seen = np.ones((4, 6, 2, 3), bool)
+    seen[:, 2] = seen[1:, 3] = seen[:, 4, 1] = False
+    prediction, target = np.full(seen.shape, 0.1), np.zeros(seen.shape)
+    target[0] = 7.0  # the median of those trials that were scored
+    parts = target[:, :2], target[:, :, 0, :1], target, seen
+    windows = Windows(*map(jnp.asarray, parts))
+    by_trial, time = np.array([2.0, 1.0, np.nan, np.nan]), 0.1 * np.arange(1, 7)
+    error = PredictionError(0.1, by_trial, time, np.ones(6), prediction, windows)
+    nothing = Intervals({}, {}, {}, ())
+    identified = identify.Identified(START["cart"], nothing, error, error, error)
+    found = identify.evidence(identified, "m")
+    for edge in ("low", "high"):
+        assert np.flatnonzero(np.isnan(found[f"horizon.identified.{edge}"])).tolist() == [2]
+    np.testing.assert_allclose(found["horizon.identified.low"][3], 6.9 * np.sqrt(3), rtol=1e-5)
+    np.testing.assert_allclose(found["motion.observed"][0], 7.0)
+    assert np.isnan(found["motion.observed"][2]).all()
+    newtons = identify.evidence(identified, "N")
+    assert not any(name.startswith("motion") for name in newtons)  # no places, whatever the shape
 
 
 def test_validation_is_scored_as_recorded_and_not_fitted(tmp_path):
@@ -170,6 +220,31 @@ def test_validation_is_scored_as_recorded_and_not_fitted(tmp_path):
     assert len(both.fitted.trials) + len(both.validation.trials) == 6
 
 
+def test_what_was_put_right_is_said_of_every_recording(tmp_path, capsys):
+    def marked(name, hidden, left_out):
+        time, values = 0.01 * np.arange(30), np.zeros((30, 3, 3))
+        values[..., 0] = 0.1 * np.sin(20 * time)[:, None]
+        values[..., 2] = -0.1 * np.arange(3)
+        values[hidden, 0] = np.nan
+        notes = (f"{left_out} unlabelled markers were left out",)
+        markers = Channel("markers", Role.OBSERVATION, time, values, "m", notes=notes)
+        write_recording(tmp_path / name, Recording((Trial("one", {"markers": markers}),), {}))
+        return tmp_path / name
+
+    fitted, validation = marked("a.npz", [7], 4), marked("b.npz", [11, 12], 5)
+    options = IdentifyRope(recordings=(fitted,), validate=(validation,))
+    identify.read(options)
+    unseen = "unseen positions of driven markers were interpolated"
+    assert capsys.readouterr().out.splitlines() == [
+        "note: trial 'one', markers: 4 unlabelled markers were left out",
+        f"note: trial 'one', grip: 1 {unseen}",
+        "note: validation, trial 'one', markers: 5 unlabelled markers were left out",
+        f"note: validation, trial 'one', grip: 2 {unseen}",
+    ]
+    identify.read(dataclasses.replace(options, nodes=3, validate=()))
+    assert capsys.readouterr().out.splitlines()[1] == f"note: trial 'one', grip: 1 {unseen}"
+
+
 def test_parameters_are_freed_fixed_and_shared_by_name():
     cart = identify.with_declarations(START["cart"], (), ("mass",), ("friction",))
     rows = {row["name"]: row for row in identify.describe(cart)}
@@ -179,72 +254,6 @@ def test_parameters_are_freed_fixed_and_shared_by_name():
         identify.with_declarations(cart, ("mas",), (), ())
     with pytest.raises(PalpateError, match="'mass' cannot be fixed and identified"):
         identify.with_declarations(cart, (), ("mass",), ("mass",))
-
-
-# --- folders ----------------------------------------------------------------------------------
-
-
-def finish(run):
-    run.finish({"wall_time_s": 1.0})
-    run.close()
-
-
-def test_runs_are_numbered_and_an_unfinished_one_is_taken_up():
-    def opened(seed, **told):
-        return folders.open_run(Options(**told), "work", {"seed": seed}, folders.MODEL)
-
-    first = opened(1)
-    assert first.path == folders.RUNS / "work-001"
-    first.close()
-    again = opened(1)
-    assert again.path == first.path
-    again.close()
-    other = opened(2)
-    assert other.path == folders.RUNS / "work-002"
-    other.close()
-    finish(opened(1))
-    anew = opened(1)
-    assert anew.path == folders.RUNS / "work-003"
-    anew.close()
-    fresh = opened(1, fresh=True)
-    assert fresh.path == folders.RUNS / "work-004"
-    fresh.close()
-
-
-def test_out_is_a_folder_or_the_file_that_is_wanted(tmp_path):
-    run = folders.open_run(Options(out=tmp_path / "here"), "work", {}, folders.MODEL)
-    assert run.path == tmp_path / "here"
-    run.close()
-    options = Options(out=tmp_path / "there" / "mine.json")
-    with folders.open_run(options, "work", {}, folders.MODEL) as run:
-        assert run.path == folders.RUNS / "work-001"
-        (run.path / folders.MODEL).write_text("{}")
-        assert folders.deliver(options, run, folders.MODEL) == options.out
-    assert options.out.read_text() == "{}"
-    for wrong in ("policy.safetensors", "recording.npz"):
-        with pytest.raises(PalpateError, match=r"a folder, or a file that ends in \.json"):
-            folders.open_run(Options(out=tmp_path / wrong), "work", {}, folders.MODEL)
-    with pytest.raises(PalpateError, match=r"has to be a folder$"):
-        folders.open_run(Options(out=tmp_path / "model.json"), "work", {})
-
-
-def test_an_input_that_changes_is_another_configuration(tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_bytes(b"one")
-    before = folders.fingerprint(path)
-    path.write_bytes(b"two")
-    assert folders.fingerprint(path) != before
-    with pytest.raises(PalpateError, match="there is no file"):
-        folders.fingerprint(tmp_path / "none")
-
-
-def test_starting_over_empties_the_runs_of_a_folder_and_nothing_else(tmp_path):
-    finish(Run.open(tmp_path / "deep" / "stage", {"seed": 1}))
-    (tmp_path / "deep" / "stage" / "notes.txt").write_text("mine")
-    folders.start_over(tmp_path)
-    with Run.open(tmp_path / "deep" / "stage", {"seed": 2}) as run:
-        assert not run.finished
-    assert (tmp_path / "deep" / "stage" / "notes.txt").read_text() == "mine"
 
 
 # --- recording --------------------------------------------------------------------------------
@@ -313,9 +322,11 @@ def experiment(monkeypatch):
 
 
 def test_reproduce_writes_the_result_and_prints_a_line_for_each_figure(
-    experiment, tmp_path, capsys
+    experiment, tmp_path, capsys, monkeypatch
 ):
-    assert main(["reproduce", "rope-model", "--out", "here", "--seed", "5", "--mocap", "m"]) == 0
+    given = ["reproduce", "rope-model", "--out", "here", "--seed", "5", "--mocap", "m"]
+    monkeypatch.setattr(sys, "argv", ["palpate", *given])  # what the run's environment tells
+    assert main(given) == 0
     assert experiment.given["seed"] == 5
     assert str(experiment.given["mocap"]) == "m"
     lines = capsys.readouterr().out.splitlines()
@@ -425,9 +436,12 @@ def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
     result = read_result(tmp_path / "again" / "result.json")
     names = {figure.name for figure in result.figures}
     assert {"success_rate", "success_rate.held_still", "in_model.success"} <= names
+    assert "in_model.final_speed m/s" in {f"{f.name} {f.unit}" for f in result.figures}
     assert main([*evaluate, "--policy", policy]) == 2
     assert "model was" in capsys.readouterr().err
-    # nothing that is finished is done again
+    # nothing that is finished is done again, and the time it took stays what it was
     before = (folder / "train" / "result.json").stat().st_mtime_ns
+    took = read_result(folder / "result.json").wall_time_s
     demo.run(Demo(out=tmp_path / "demo"), tiny)
+    assert read_result(folder / "result.json").wall_time_s == took
     assert (folder / "train" / "result.json").stat().st_mtime_ns == before

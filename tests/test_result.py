@@ -1,5 +1,6 @@
 """Figures say truly whether they meet their bar, and `result.json` is checked when it is read."""
 
+import dataclasses
 import importlib.metadata
 import json
 import subprocess
@@ -78,6 +79,14 @@ def test_the_document_has_the_agreed_schema_and_comes_back(tmp_path):
     assert read.lines() == example().lines()
 
 
+def test_an_identification_adds_its_parameters_and_warnings(tmp_path):
+    rows = [{"name": "mass", "value": 1.0, "lower": None}]
+    found = dataclasses.replace(example(), parameters=rows, warnings=["Weigh it."])
+    assert list(found.to_dict()) == [*SCHEMA, "parameters", "warnings"]
+    write_json(tmp_path / "result.json", found.to_dict())
+    assert read_result(tmp_path / "result.json") == found
+
+
 def test_nan_in_the_settings_is_refused_by_name():
     with pytest.raises(PalpateError, match=r"toy\.settings\.rate is nan"):
         Result("toy", [], {"rate": float("nan")}, [], None, 1.0).to_dict()
@@ -102,6 +111,7 @@ def figure_changed(**changes):
         (changed(extra=1), "the result has the unknown key extra"),
         (changed(wall_time_s="long"), "has wall_time_s 'long': expected int or float"),
         (changed(wall_time_s=True), "has wall_time_s True: expected int or float"),
+        (changed(warnings="none"), "has warnings 'none': expected list"),
         (changed(commit=1), "has commit 1: expected str or null"),
         (figure_changed(value="0.97"), r"figures\[1\] has value '0.97': expected int or float or"),
         (figure_changed(better="more"), "better='more': expected 'lower' or 'higher'"),

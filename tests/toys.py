@@ -112,6 +112,7 @@ class CartToOrigin(Task):
     """Bring the cart to the origin, and to rest there, with a bounded force."""
 
     name: ClassVar[str] = "cart-to-origin"
+    outcome_units: ClassVar[dict[str, str]] = {"distance": "m"}
     duration: float = eqx.field(static=True, default=3.0)
     action_limit: float = eqx.field(static=True, default=4.0)  # N
     action_rate_limit: float | None = eqx.field(static=True, default=None)
@@ -137,7 +138,8 @@ class CartToOrigin(Task):
     def outcome(self, models, start, states, actions) -> dict[str, Array]:
         near = jnp.abs(states.position[:, -1, 0]) < 0.05
         still = jnp.abs(states.velocity[:, -1, 0]) < 0.05
-        return {"success": jnp.asarray(near & still, float)}
+        distance = jnp.abs(states.position[:, -1, 0])
+        return {"success": jnp.asarray(near & still, float), "distance": distance}
 
 
 class PendulumDamping(Task):

@@ -138,6 +138,9 @@ class Result:
     `settings` are those that produced the figures, `seeds` all seeds used, `split` says which
     trials or objects were fitted, chosen on and evaluated, `wall_time_s` is in seconds. Machine,
     versions and commit are those of this process unless the result was read from a file.
+
+    An identification has `parameters` too, rows as `palpate.report.evidence` describes them, and
+    `warnings`, sentences about how far not to trust it; other results leave both keys out.
     """
 
     name: str
@@ -149,6 +152,8 @@ class Result:
     machine: dict[str, Any] = field(default_factory=machine)
     versions: dict[str, str] = field(default_factory=versions)
     commit: str | None = field(default_factory=commit)
+    parameters: list[dict[str, Any]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         names = [figure.name for figure in self.figures]
@@ -163,6 +168,9 @@ class Result:
         """
         document = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
         document["figures"] = [figure.to_dict() for figure in self.figures]
+        for name in _OPTIONAL:
+            if not document[name]:
+                del document[name]
         return plain(document, self.name)
 
     def lines(self) -> list[str]:
@@ -181,11 +189,11 @@ def read_result(path: str | Path) -> Result:
     Raises `PalpateError` naming the file, the key and what was expected there.
     """
     try:
-        document = _checked(read_json(path), "the result", _RESULT)
+        document = _checked(read_json(path), "the result", _RESULT, _OPTIONAL)
         figures = []
         for index, item in enumerate(document["figures"]):
             where = f"figures[{index}]"
-            entry = dict(_checked(item, where, _FIGURE))
+            entry = dict(_checked(item, where, _FIGURE, {}))
             met = entry.pop("met")
             figure = Figure(**entry)
             if met != figure.met:
@@ -226,19 +234,25 @@ _RESULT: dict[str, tuple[type, ...]] = {
     "versions": (dict,),
     "commit": (str, _NONE),
 }
+_OPTIONAL: dict[str, tuple[type, ...]] = {"parameters": (list,), "warnings": (list,)}
 
 
-def _checked(document: Any, where: str, schema: dict[str, tuple[type, ...]]) -> dict[str, Any]:
+def _checked(
+    document: Any,
+    where: str,
+    schema: dict[str, tuple[type, ...]],
+    optional: dict[str, tuple[type, ...]],
+) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise PalpateError(f"{where} is a {type(document).__name__}: expected a JSON object")
     for problem, names in (
         ("lacks", schema.keys() - document.keys()),
-        ("has the unknown key", document.keys() - schema.keys()),
+        ("has the unknown key", document.keys() - schema.keys() - optional.keys()),
     ):
         if names:
             raise PalpateError(f"{where} {problem} {', '.join(sorted(names))}")
-    for name, types in schema.items():
-        value = document[name]
+    for name, value in document.items():
+        types = schema.get(name) or optional[name]
         # bool is an int to Python, but not a number to anyone else
         if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
             expected = " or ".join("null" if kind is _NONE else kind.__name__ for kind in types)

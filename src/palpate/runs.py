@@ -144,7 +144,11 @@ class Run:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of work behind the present state: pauses and work that was lost do not count."""
+        """Seconds of work behind the present state, that of earlier processes included.
+
+        Pauses and work that was lost, since the last checkpoint of a process that was killed, do
+        not count.
+        """
         return time.monotonic() - self._began
 
     def log(self, step: int, /, **metrics: Any) -> None:
@@ -189,8 +193,9 @@ class Run:
             except DamagedFileError as error:
                 print(f"{error}; going back to the checkpoint before it", file=sys.stderr)
                 continue
+            prepared = 0.0 if self._positioned else time.monotonic() - self._began
             self._go_back_to(step)
-            self._began = time.monotonic() - manifest["time"]
+            self._began = time.monotonic() - prepared - manifest["time"]
             return step, tree
         if checkpoints:
             raise PalpateError(

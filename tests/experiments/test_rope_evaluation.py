@@ -27,6 +27,8 @@ BASE = RopeConfiguration(**SMALL)
 class Slide:
     """Moves every gripper along x."""
 
+    period = None
+
     def __init__(self, speed: float):
         self.speed = speed
 
@@ -116,6 +118,14 @@ def test_ropes_that_cannot_go_side_by_side_are_refused():
         evaluate(CONTROLLERS, [*four_trials(), Trial(other, "straight", 0)])
 
 
+def test_a_controller_for_another_period_is_refused_before_the_first_is_tried(monkeypatch):
+    monkeypatch.setattr(rope_evaluation, "run_trials", None)
+    slow = Slide(0.1)
+    slow.period = 0.02
+    with pytest.raises(PalpateError, match=r"decides every 0.02 s"):
+        evaluate({"fast": Slide(0.4), "slow": slow}, four_trials())
+
+
 def episodes_of(*settled_after: int | None) -> Episodes:
     """Episodes of 300 control periods whose energy falls at once to nothing, or never."""
     energy = np.ones((len(settled_after), 301))
@@ -170,6 +180,17 @@ def test_without_a_success_there_is_no_time():
     assert (rate.met, periods.met, seconds.met) == (False, False, None)
 
 
+def test_when_every_simulation_ended_early_there_is_no_final_speed(recwarn):
+    episodes = episodes_of(None, None, None, None)
+    for trial in range(4):
+        episodes.energy[trial], episodes.gripper_speed[trial] = np.nan, np.nan
+        episodes.failures[trial] = "diverged"
+    summary = summarise(four_trials(), episodes)
+    assert (summary.successes, summary.diverged, summary.final_speed) == (0, 4, None)
+    assert "nan" not in summary.line("x")
+    assert not recwarn.list
+
+
 def test_poses_are_apart():
     trials, episodes = four_trials(), episodes_of(50, 100, None, None)
     episodes.failures[3] = "diverged"
@@ -203,3 +224,17 @@ def test_evidence_is_what_a_report_reads(short, tmp_path):
     assert evidence.energy is not None
     assert evidence.energy.values["slow"].shape[0] == 4
     np.testing.assert_allclose(evidence.energy.values["slow"][:, 0], 1.0)
+
+
+def test_a_rope_that_was_never_seen_is_not_drawn(short, tmp_path):
+    trials = four_trials()
+    evaluated = evaluate(CONTROLLERS, trials)
+    for episodes in evaluated.values():
+        episodes.failures[2] = "diverged while it was shaken"
+        for part in (episodes.energy[2], episodes.gripper_speed[2], episodes.markers[1]):
+            part[:] = np.nan
+    with Run.open(tmp_path, {}) as run:
+        write_trial_evidence(run, trials, evaluated, ["slow", "fast"])
+    evidence = read_evidence(tmp_path)
+    assert [motion.group for motion in evidence.motions] == ["straight"]
+    assert evidence.energy is not None

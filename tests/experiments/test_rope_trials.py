@@ -14,6 +14,7 @@ from palpate.experiments.rope_trials import (
     LearnedController,
     Seen,
     Trial,
+    check_period,
     run_trials,
     settling_time,
     wilson_interval,
@@ -22,6 +23,7 @@ from palpate.models.rope import RopeState
 from palpate.networks import CommandPolicy
 from palpate.tasks import RopeStabilization
 from palpate.worlds.rope import RopeConfiguration, RopeWorld
+from palpate.worlds.world import DivergedError
 from small_rope import QUIET, SMALL
 
 SMALL_ROPE = RopeConfiguration(**SMALL, **QUIET)
@@ -30,6 +32,8 @@ PERIOD = SMALL_ROPE.control_period
 
 class Constant:
     """Moves every gripper at its own constant velocity."""
+
+    period = None
 
     def __init__(self, velocities: np.ndarray):
         self.velocities = velocities
@@ -159,6 +163,36 @@ def test_a_diverged_world_is_a_failure_and_stops_no_other(monkeypatch):
     assert np.isfinite(episodes.energy[0, :5]).all()
 
 
+class FragileWhenShaken(RopeWorld):
+    """Diverges while it is shaken."""
+
+    def reset(self, seed, start="hanging", azimuth=None):
+        if start == "shaken":
+            raise DivergedError("the rope's simulation diverged")
+        return super().reset(seed, start, azimuth)
+
+
+def test_a_world_that_diverges_before_its_start_is_a_failure_and_stops_no_other(monkeypatch):
+    monkeypatch.setattr(rope_trials, "RopeWorld", FragileWhenShaken)
+    trials = [Trial(SMALL_ROPE, "shaken", 0), Trial(SMALL_ROPE, "straight", 1)]
+    controller = Constant(np.array([[0.1, 0, 0], [0, 0, 0.0]]))
+    episodes = run_trials(trials, controller, 10, kept=[0, 1])
+    assert episodes.failures == {0: "the rope's simulation diverged"}
+    assert np.isnan(episodes.energy[0]).all()
+    assert np.isnan(episodes.gripper_speed[0]).all()
+    assert np.isnan(episodes.markers[0]).all()
+    assert np.isfinite(episodes.energy[1]).all()
+    assert all(np.isfinite(seen.markers).all() for seen in controller.seen)
+    alone = run_trials(trials[1:], Constant(np.zeros((1, 3))), 10)
+    np.testing.assert_array_equal(episodes.energy[1], alone.energy[0])
+
+
+def test_a_start_that_does_not_exist_is_no_failed_trial():
+    trials = [Trial(SMALL_ROPE, "helyx", 0), Trial(SMALL_ROPE, "straight", 1)]
+    with pytest.raises(PalpateError, match="unknown start 'helyx'"):
+        run_trials(trials, HeldStill(), 3)
+
+
 def policy_for(nodes: int) -> CommandPolicy:
     """An untrained policy whose output is not small."""
     observations = jax.random.normal(jax.random.key(1), (50, 6 * (nodes - 1)))
@@ -211,6 +245,23 @@ def test_policy_for_other_nodes_is_refused():
     controller = LearnedController(policy_for(8), RopeStabilization())
     with pytest.raises(PalpateError, match="8 nodes needs a multiple of 7 markers and one more"):
         controller.begin(Seen(np.zeros((1, 11, 3)), np.zeros((1, 3))))
+
+
+def test_a_controller_for_another_control_period_is_refused_before_anything_moves(monkeypatch):
+    slow = dataclasses.replace(SMALL_ROPE, control_period=2 * PERIOD)
+    monkeypatch.setattr(rope_trials, "RopeWorld", None)
+    for controller in (
+        LearnedController(policy_for(11), RopeStabilization()),
+        SwingDamper(SMALL_ROPE),
+    ):
+        with pytest.raises(PalpateError, match=r"decides every 0.01 s .* period of 0.02 s"):
+            run_trials([Trial(SMALL_ROPE, "straight", 0), Trial(slow, "helix", 0)], controller, 3)
+
+
+def test_a_period_read_off_a_clock_is_the_same(monkeypatch):
+    near = dataclasses.replace(policy_for(11), period=1.0003 * PERIOD)
+    check_period(LearnedController(near, RopeStabilization()), [Trial(SMALL_ROPE, "helix", 0)])
+    check_period(HeldStill(), [Trial(SMALL_ROPE, "helix", 0)])
 
 
 def test_held_still_keeps_the_gripper():

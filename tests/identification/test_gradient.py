@@ -191,6 +191,24 @@ def test_gaps_are_bridged_and_do_not_count():
     assert prediction_error(truth, spoiled).mean_absolute > error.mean_absolute + 1e-3
 
 
+def test_an_error_that_nobody_saw_is_not_known():
+    truth = Cart(mass=2.0, friction=0.3)
+    aligned = recorded(truth, *pushed(truth))
+    observation = np.array(aligned.observation)
+    observation[:, 30:33] = np.nan
+    observation[:, -5:] = np.nan
+    observation[2, 2:] = np.nan
+    holed = Aligned(aligned.period, observation, aligned.action, aligned.length)
+    error = prediction_error(Cart(mass=3.0, friction=0.3), holed)
+    assert np.flatnonzero(np.isnan(error.rmse)).tolist() == [28, 29, 30, *range(54, 59)]
+    assert error.last_seen == 53
+    assert error.rmse[error.last_seen] > 0.1
+    assert np.flatnonzero(np.isnan(error.by_trial)).tolist() == [2]
+    observation[:, 2:] = np.nan
+    with pytest.raises(PalpateError, match="nothing is seen after the first two"):
+        prediction_error(truth, holed)
+
+
 def test_unequal_lengths_end_where_the_trial_ends():
     truth = Cart(mass=2.0, friction=0.3)
     aligned = recorded(truth, *pushed(truth))

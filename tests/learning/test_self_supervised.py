@@ -10,11 +10,10 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.learning import Training, manifest, simulate, train
+from palpate.learning import Training, simulate, train
 from palpate.networks.policy import CommandPolicy
 from palpate.parameters import randomise
 from palpate.runs import Run
@@ -147,12 +146,3 @@ def test_seed_decides() -> None:
     training = Training(iterations=1, **ONE_STAGE)
     first, other = (train(CartToOrigin(), CART, training, seed) for seed in (0, 1))
     assert not same(first, other)
-
-
-def test_manifest_says_what_the_policy_was_trained_on() -> None:
-    said = plain(manifest(CartToOrigin(), CART, Training(**SMALL), 3))
-    assert said["task"] == "cart-to-origin"
-    assert said["features"]["velocity"] == "(1,) m/s"
-    assert said["model"]["parameters"][0]["unit"] == "kg"
-    assert said["training"]["batch"] == 32
-    np.testing.assert_equal(said["seed"], 3)

@@ -1,5 +1,7 @@
 """No parameters an optimiser can reach make the rope unstable, and the bound is not silly."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,12 @@ project = jax.jit(jax.vmap(coordinates.project))
 load_of = jax.jit(jax.vmap(lambda rope: rope.stability_load()))
 elastic_energy = jax.jit(jax.vmap(lambda rope, position: rope.elastic_energy(position)))
 LEGAL = LIMIT * 1.0002  # up to rounding
+TURN = 0.3  # rad in a time step: up to here the stiffness of a segment is as good as constant
+
+
+def shown(load):
+    """How many times the energy of a still start symplectic Euler shows at a load below 4."""
+    return 1.0 / (1.0 - np.sqrt(load) / 2.0)
 
 
 def random_free(rng, deviation, batch=BATCH):
@@ -51,15 +59,36 @@ def whirled(rng):
     return jnp.asarray(velocity[:, :, None], jnp.float32)
 
 
+def gained(ropes, start, states):
+    """The most energy ever shown, relative to the start's and the rope lifted by its length."""
+    mass, gravity = np.asarray(ropes.node_mass)[:, None], np.asarray(ropes.gravity)[:, None]
+    motion = 0.5 * np.sum(mass * np.sum(np.asarray(states.velocity) ** 2, axis=-1), axis=-1)
+    fall = np.asarray(start.position)[:, None, :, 2] - np.asarray(states.position)[..., 2]
+    work = gravity * np.sum(mass * fall, axis=-1)
+    energy = motion + elastic_energy(ropes, states.position) - np.maximum(work, 0)
+    weight = gravity[:, 0] * np.sum(mass[:, 0], axis=-1) * np.sum(ropes.rest_length, axis=-1)
+    return np.max(energy, axis=1) / (elastic_energy(ropes, start.position) + weight)
+
+
+def turned(ropes, states):
+    """How far (rad) any segment ever turns, or stretches relative to its length, in a time step."""
+    speed = np.linalg.norm(np.diff(np.asarray(states.velocity), axis=2), axis=-1)
+    return ropes.time_step * np.max(speed / np.asarray(ropes.rest_length)[:, None], axis=(1, 2))
+
+
 @example(seed=105843, deviation=9.0)
+@example(seed=3580503874, deviation=3.0016628491122543)
 @given(seed=st.integers(0, 2**32 - 1), deviation=st.floats(0.0, 10.0))
 @settings(deadline=None, max_examples=25)
 def test_any_free_values_build_a_stable_rope_however_crumpled_and_shaken(seed, deviation):
-    """Three seconds from a crumpled start; let alone, it gains no energy.
+    """Three seconds from a crumpled start: nothing diverges, and let alone, it gains no energy.
 
     At load L symplectic Euler keeps an ellipse around the energy, of which it shows up to
-    1 / (1 - sqrt(L) / 2) = 20 times the start's at `LIMIT` while its stiffness is constant. 58 was
-    measured at nine sigma, cause not found. An instability shows e^100.
+    1 / (1 - sqrt(L) / 2) times a still start's: 20 at `LIMIT`, 2 with a quarter of the time step,
+    whose load is a quarter of it at most. This is for constant stiffness: that of a stretched
+    segment turns with it, and `TURN` in one time step is too much, as seen below with one spring.
+    The examples are ropes that turn further and show 58 and 202 times. Who turns is told by the
+    finer integration, so that no rope is excused by diverging.
     """
     rng = np.random.default_rng(seed)
     ropes = build(random_free(rng, deviation))
@@ -68,17 +97,16 @@ def test_any_free_values_build_a_stable_rope_however_crumpled_and_shaken(seed, d
     assert np.all(load <= LEGAL)
     start = crumpled(ropes, rng)
     shaken = run(ropes, start, whirled(rng))
-    assert np.all(np.isfinite(shaken.position))
-    assert np.all(np.isfinite(shaken.velocity))
-    alone = run(ropes, start, jnp.zeros((BATCH, 300, 1, 3)))
-    mass, gravity = np.asarray(ropes.node_mass)[:, None], np.asarray(ropes.gravity)[:, None]
-    motion = 0.5 * np.sum(mass * np.sum(np.asarray(alone.velocity) ** 2, axis=-1), axis=-1)
-    fall = np.asarray(start.position)[:, None, :, 2] - np.asarray(alone.position)[..., 2]
-    work = gravity * np.sum(mass * fall, axis=-1)
-    stored = elastic_energy(ropes, start.position)
-    weight = gravity[:, 0] * np.sum(mass[:, 0] * np.sum(ropes.rest_length, axis=-1)[:, None], -1)
-    energy = motion + elastic_energy(ropes, alone.position) - np.maximum(work, 0)
-    assert np.all(energy <= 100 * (stored + weight)[:, None])
+    for leaf in jax.tree.leaves(shaken):
+        assert np.all(np.isfinite(leaf))
+    finer = dataclasses.replace(ropes, substeps=4 * ropes.substeps)
+    alone, finely = (run(each, start, jnp.zeros((BATCH, 300, 1, 3))) for each in (ropes, finer))
+    for each, states, limit in ((ropes, alone, LEGAL), (finer, finely, LEGAL / 4)):
+        gain = gained(each, start, states)
+        assert np.all(np.isfinite(gain))
+        calm = turned(each, finely) <= TURN
+        assert np.all(calm) or deviation > 0.5
+        assert np.all(gain[calm] <= shown(limit))
 
 
 @pytest.mark.parametrize("deviation", [0.0, 1.0])
@@ -227,6 +255,31 @@ def test_the_bound_is_sharp(term, float64):
         states = run(loaded(rope, load), at_rest(start), actions)
         growth = float(jnp.abs(states.position[-1] - hanging(rope)).max()) / 1e-6
         assert (not growth < 1e3) == diverges, (load, growth)
+
+
+@pytest.mark.parametrize(("turn", "least", "most"), [(TURN, 19.0, 20.0), (0.5, 1e3, 1e7)])
+def test_the_limit_is_for_segments_that_turn_little_in_a_time_step(turn, least, most, float64):
+    """A mass thrown in any direction on a single spring of rest length l0 and load `LIMIT`.
+
+    Up to `TURN` it shows as much energy as theory says. At half a radian per time step (35 m/s for
+    7 cm and 1 ms) the turning stiffness pumps it up until the spring is some hundred times as
+    long, hence as good as linear.
+    """
+    rope = Rope.uniform(
+        nodes=4, gravity=0.0, stretch_stiffness=[300.0, 0.0, 0.0], bend_stiffness=0.0, **NONE,
+        control_period=1e-3, substeps=1,
+    )  # fmt: skip
+    rope = loaded(rope, LIMIT)
+    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    start = at_rest(jnp.broadcast_to(bent(rope, np.random.default_rng(0), 0.0), (64, 4, 3)))
+    speed = turn * float(rope.rest_length[0]) / rope.time_step
+    thrown = speed * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
+    start = eqx.tree_at(lambda s: s.velocity, start, start.velocity.at[:, 1].set(thrown))
+    states = run(rope, start, jnp.zeros((64, 1000, 1, 3)))
+    motion = 0.5 * rope.node_mass[1] * jnp.sum(jnp.square(states.velocity[:, :, 1]), axis=-1)
+    energy = motion + rope.elastic_energy(states.position)
+    ratio = float(jnp.max(energy)) / float(0.5 * rope.node_mass[1] * speed**2)
+    assert least < ratio < most
 
 
 @jax.jit

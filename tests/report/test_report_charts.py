@@ -39,7 +39,7 @@ def test_a_band_does_not_bridge_a_gap():
     low, high = TIME.copy(), TIME + 1.0
     low[50:60] = np.nan
     curves = Curves(TIME, {"x": TIME}, {"x": (low, high)})
-    bands = traces(horizon(curves, {"x": 1}), fill="toself")
+    bands = traces(horizon(curves, {"x": 1}, "m"), fill="toself")
     assert [len(band["x"]) for band in bands] == [100, 282]
 
 

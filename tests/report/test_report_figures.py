@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from palpate.errors import PalpateError
-from palpate.report import Curves, Motion, motion_animation, motion_figure
+from palpate.report import Curves, Motion, motion_figure
 from synthetic_evidence import chain
 
 TIME, OBSERVED = chain(points=6, seconds=1.0)
@@ -37,35 +37,17 @@ def test_a_figure_shows_the_motion(tmp_path):
     assert pictures[0] != pictures[1]
 
 
-@pytest.mark.parametrize("suffix", [".webp", ".gif"])
-def test_an_animation_moves_in_real_time(tmp_path, suffix):
-    out = motion_animation(tmp_path / f"swing{suffix}", MOTION, rate=5.0)
-    with Image.open(out) as picture:
-        assert picture.n_frames == 5
-        first = np.asarray(picture.convert("RGB")).copy()
-        picture.seek(3)
-        assert (np.asarray(picture.convert("RGB")) != first).any()
-        assert picture.info["duration"] == 200
-
-
 @pytest.mark.parametrize("points", [1, 3])
 def test_one_point_that_stands_still_can_be_drawn(tmp_path, points):
     still = Motion("", TIME, {"cart": np.zeros((len(TIME), points, 3))})
     assert motion_figure(tmp_path / "cart.png", still, [0.0]).exists()
-    assert motion_animation(tmp_path / "cart.gif", still, rate=2.0).exists()
 
 
 def test_what_cannot_be_drawn_is_refused(tmp_path):
     with pytest.raises(PalpateError, match=r"suffix '\.jpg': expected \.png or \.svg"):
         motion_figure(tmp_path / "a.jpg", MOTION, [0.0])
-    with pytest.raises(PalpateError, match=r"expected \.webp or \.gif"):
-        motion_animation(tmp_path / "a.mp4", MOTION)
     with pytest.raises(PalpateError, match="at least one instant"):
         motion_figure(tmp_path / "a.png", MOTION, [])
     lost = Motion("", TIME, {"observed": OBSERVED * np.nan})
-    for draw in (
-        lambda: motion_figure(tmp_path / "a.png", lost, [0.0]),
-        lambda: motion_animation(tmp_path / "a.gif", lost),
-    ):
-        with pytest.raises(PalpateError, match="nothing but gaps"):
-            draw()
+    with pytest.raises(PalpateError, match="nothing but gaps"):
+        motion_figure(tmp_path / "a.png", lost, [0.0])

@@ -108,10 +108,10 @@ def test_a_rope_driven_otherwise_is_refused() -> None:
         TASK.starts(model, jax.random.key(0), 4)
 
 
-def test_outcome_tells_rest_from_motion(model) -> None:
+def test_outcome_tells_rest_from_motion(model, starts) -> None:
     """Three ropes swing on, come to rest after half a second, and hang from a moving gripper."""
     models = randomise(model, jax.random.key(0), 0.0, 3)
-    start = jax.tree.map(lambda leaf: leaf[-3:], TASK.starts(model, jax.random.key(4), 9))
+    start = jax.tree.map(lambda leaf: leaf[-3:], starts)
     hanging = jnp.stack([jnp.zeros(NODES), jnp.zeros(NODES), -0.2 * jnp.arange(NODES)], axis=-1)
     position = jnp.broadcast_to(hanging, (3, 200, NODES, 3))
     velocity = jnp.zeros_like(position)
@@ -122,6 +122,28 @@ def test_outcome_tells_rest_from_motion(model) -> None:
     assert float(outcome["settling_time"][1]) == pytest.approx(0.51, abs=1e-6)
     period = 2 * np.pi / (1.2024 * np.sqrt(9.81))
     assert float(outcome["settling_periods"][1]) == pytest.approx(0.51 / period, rel=1e-4)
+
+
+def test_one_start_alone_can_be_drawn(model) -> None:
+    start = TASK.starts(model, jax.random.key(4), 1)
+    assert start.state.position.shape == (1, NODES, 3)
+
+
+class AtRest(RopeStabilization):
+    """Its ropes have no energy left, whatever they do."""
+
+    def energy_share(self, models, start, states) -> jax.Array:
+        return jnp.zeros(states.velocity.shape[:2])
+
+
+@pytest.mark.parametrize(("steps", "success"), [(50, 0), (99, 0), (100, 1)])
+def test_an_episode_shorter_than_a_second_is_no_success(model, steps, success) -> None:
+    still = jnp.zeros((1, steps, NODES, 3))
+    models = randomise(model, jax.random.key(0), 0.0, 1)
+    states, start = RopeState(still, still), Start(None, jnp.zeros((1, 1, 3)))
+    outcome = AtRest().outcome(models, start, states, still[:, :, :1])
+    np.testing.assert_array_equal(outcome["success"], [success])
+    assert bool(jnp.isfinite(outcome["settling_time"][0])) == success
 
 
 def test_energy_share_is_the_same_compiled_and_not(model) -> None:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.worlds import rope as rope_world
 from palpate.worlds.rope import START_POSES, Disturbance, RopeConfiguration, RopeWorld
+from palpate.worlds.world import DivergedError
 from small_rope import FREE, QUIET, SMALL, STILL, rope
 
 
@@ -206,5 +208,28 @@ def test_a_diverged_simulation_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working folder
     world = rope(time_step=1e-3, **FREE)
     world.reset(0, start="helix")
-    with pytest.raises(PalpateError, match=r"diverged at .* a smaller time_step than 0.001 s"):
+    sentence = r"diverged at .* a smaller time_step than 0.001 s"
+    with pytest.raises(DivergedError, match=sentence):
         [world.step(STILL) for _ in range(300)]
+    with pytest.raises(DivergedError, match=sentence):  # and so it stays until the next reset
+        world.step(STILL)
+    world.reset(0)
+    assert world.step(STILL).markers[-1] == pytest.approx([0, 0, 0.5], abs=1e-3)
+
+
+def test_a_rope_that_diverges_while_it_is_shaken_is_not_started(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    world = rope()
+    world.reset(0)
+
+    def violent(period):
+        world._data.qvel[:] = 1e9
+        return np.zeros((3, 3))
+
+    monkeypatch.setattr(rope_world, "shake_commands", violent)
+    with pytest.raises(DivergedError):
+        world.reset(0, start="shaken")
+    with pytest.raises(PalpateError, match=r"stepped after reset\(seed\)"):
+        world.step(STILL)
+    world.reset(0)
+    assert world.step(STILL).markers[-1] == pytest.approx([0, 0, 0.5], abs=1e-3)

@@ -136,6 +136,12 @@ def test_a_start_that_is_no_curve_is_refused(start, sentence):
         rope(bodies=5, markers=6).reset(0, start=start)
 
 
+@pytest.mark.parametrize("start", ["straight", "shaken"])
+def test_an_azimuth_that_is_no_angle_is_refused(start):
+    with pytest.raises(PalpateError, match="finite angle in radians, not nan"):
+        rope().reset(0, start=start, azimuth=math.nan)
+
+
 @pytest.mark.parametrize("seed", [-1, True])
 def test_a_seed_that_is_none_is_refused(seed):
     with pytest.raises(PalpateError, match="a seed is a whole number"):

@@ -5,7 +5,6 @@ other ropes; the stages are the commands of the same names, each in a folder bel
 """
 
 import dataclasses
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from palpate.experiments.rope_options import (
 from palpate.report import build_report, motion_figure, read_evidence
 from palpate.result import Figure, Result, read_result
 from palpate.runs import RESULT
-from palpate.storage import read_json, write_json
+from palpate.storage import write_json
 
 PICTURE = "picture.png"  # the README's
 INSTANTS = (0.8, 1.6, 2.4, 3.2)  # s, of the motion in the picture
@@ -50,8 +49,7 @@ def run(options: Demo, size: Size = Size()) -> Path:
     out = options.out or folders.RUNS / "demo"
     print(f"demo: about {size.minutes} minutes on two cores, written to {out}", flush=True)
     if options.fresh and out.is_dir():
-        folders.start_over(out)
-    began = time.monotonic()
+        folders.start_over(out, "demo")
     seed = options.seed
     recorded = RecordRope(out=out / "record", seed=seed, trials=size.trials, duration=size.duration)
     recording = record.run(recorded)
@@ -81,6 +79,7 @@ def run(options: Demo, size: Size = Size()) -> Path:
             policy=trained, out=out / "evaluate", seed=seed + 1, ropes=size.ropes
         )
     )
+    stages = [recording.parent, identified, trained, evaluated]
     figures = _figures(identified, evaluated, recorded.length)
     result = Result(
         name="demo",
@@ -91,16 +90,16 @@ def run(options: Demo, size: Size = Size()) -> Path:
             "tip error": "motions of the recorded rope that were not fitted",
             "time to 1 %": f"{size.ropes} other ropes from four poses each",
         },
-        wall_time_s=time.monotonic() - began,
+        wall_time_s=sum(read_result(stage / RESULT).wall_time_s for stage in stages),
     )
     write_json(out / RESULT, result.to_dict())
-    stages = [recording.parent, identified, trained, evaluated]
     notes = read_result(evaluated / RESULT).settings["notes"]
     build_report([out, *stages], out / folders.REPORT, "A rope, from recording to rest", notes)
     _draw(out / PICTURE, identified, evaluated)
     tip, success, periods, seconds, still = (figure.value for figure in figures)
     print()
-    print(f"tip error {tip:.4f} m per metre of rope, {size.duration:g} s ahead, unseen motions")
+    error = "unknown" if tip is None else f"{tip:.4f} m per metre of rope"
+    print(f"tip error {error}, {size.duration:g} s ahead, unseen motions")
     if seconds is None:
         print("time to 1 % energy: never; a longer training would help")
     else:
@@ -118,11 +117,12 @@ def _draw(path: Path, identified: Path, evaluated: Path) -> None:
 
 
 def _figures(identified: Path, evaluated: Path, length: float) -> list[Figure]:
-    tip = next(
-        figure["value"]
-        for figure in read_json(identified / RESULT)["figures"]
-        if figure["name"] == "tip_rmse_m"
-    )
-    known = {figure.name: figure for figure in read_result(evaluated / RESULT).figures}
+    known = {
+        figure.name: figure
+        for run in (identified, evaluated)
+        for figure in read_result(run / RESULT).figures
+    }
+    tip = known["tip_rmse_m"].value
+    share = None if tip is None else tip / length
     names = ("success_rate", "time_to_1pct_periods", "time_to_1pct_s", "success_rate.held_still")
-    return [Figure("tip_rmse_per_length", tip / length, "m/m"), *(known[name] for name in names)]
+    return [Figure("tip_rmse_per_length", share, "m/m"), *(known[name] for name in names)]

@@ -3,23 +3,28 @@
 import dataclasses
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from palpate.errors import PalpateError
 from palpate.experiments.options import Options
 from palpate.report import build_report
-from palpate.runs import CONFIGURATION, RESULT, Run
+from palpate.report.evidence import EVIDENCE, RENDERINGS
+from palpate.runs import CONFIGURATION, ENVIRONMENT, RESULT, Run
 from palpate.storage import plain, read_json, write_bytes
 
 RUNS = Path("runs")
-RECORDING, MODEL, POLICY, REPORT = (
+RECORDING, MODEL, POLICY, REPORT, TABLE = (
     "recording.npz",
     "model.json",
     "policy.safetensors",
     "report.html",
+    "table.txt",
 )
+_TOLD = (REPORT, EVIDENCE, TABLE, *(f"rendering{suffix}" for suffix in RENDERINGS))
+_WHERE = ("out", "fresh")  # options that do not decide the outcome
 _SUFFIXES = {Path(name).suffix for name in (RECORDING, MODEL, POLICY, REPORT)}
 
 
@@ -36,7 +41,11 @@ def open_run(
     and as `Run.open`.
     """
     if options.out is not None and not _is_file(options.out, product):
-        return Run.open(options.out, configuration, fresh=options.fresh)
+        again = options.fresh and (options.out / CONFIGURATION).exists()
+        run = Run.open(options.out, configuration, fresh=options.fresh)
+        if again:
+            _remove(run.path, (product, *_TOLD) if product else _TOLD)
+        return run
     numbered = sorted(_numbered(name))
     if not options.fresh:
         asked = plain(configuration, "configuration")
@@ -73,25 +82,54 @@ def told(options: Options, command: str) -> dict[str, Any]:
     """What decides a command's outcome, for its configuration: all that was said but where to."""
     given = {"command": command, **dataclasses.asdict(options)}
     return {
-        name: value
-        for name, value in given.items()
-        if name not in ("out", "fresh") and value is not None
+        name: value for name, value in given.items() if name not in _WHERE and value is not None
     }
 
 
-def start_over(folder: Path) -> None:
-    """Empty every run in `folder` and below; what else stands there is not touched."""
-    for configuration in sorted(folder.rglob(CONFIGURATION)):
-        Run.open(configuration.parent, read_json(configuration), fresh=True).close()
-        configuration.unlink()
+def command(options: Options, words: str) -> str:
+    """The command line that gives `words`, what to do, and all these options but where to."""
+    said = ["palpate", *words.split()]
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if field.name in _WHERE or (value == field.default and field.name != "seed"):
+            continue
+        said.append(f"--{field.name.replace('_', '-')}")
+        if not isinstance(value, bool):
+            said += map(str, value if isinstance(value, tuple) else (value,))
+    return shlex.join(said)
+
+
+def start_over(folder: Path, words: str) -> None:
+    """Empty every run in `folder` and below, and remove what was told of them together.
+
+    What commands do not write is not touched. Raises `PalpateError`, and removes nothing, when a
+    run below was begun by another command than `words` ("reproduce rope-model").
+    """
+    configurations = sorted(folder.rglob(CONFIGURATION))
+    for configuration in configurations:
+        began = read_json(configuration.parent / ENVIRONMENT)["command"]
+        if f" {words} " not in f" {began} ":
+            raise PalpateError(
+                f"{configuration.parent} holds a run of `{began}`, which --fresh would remove: "
+                f"expected a folder with nothing but `palpate {words}` in it; give another --out"
+            )
+    for configuration in configurations:
+        with Run.open(configuration.parent, read_json(configuration), fresh=True) as run:
+            _remove(run.path, (RECORDING, MODEL, POLICY, *_TOLD))
+            configuration.unlink()
+        _remove(folder, (RESULT, REPORT, EVIDENCE))  # what was told of all of them
 
 
 def product_of(path: Path, product: str, command: str) -> Path:
     """The `product` of an earlier command, given as its file or as the folder of the run.
 
-    Raises `PalpateError` when there is neither.
+    Raises `PalpateError` when there is neither, or when that run is not finished.
     """
     suffix = Path(product).suffix
+    folder = path if path.is_dir() else path.parent
+    if (folder / CONFIGURATION).exists() and not (folder / RESULT).exists():
+        began = read_json(folder / ENVIRONMENT).get("command")
+        raise PalpateError(f"{folder} holds a run that is not finished: `{began}` goes on with it")
     if path.is_file() and path.suffix != suffix:
         raise PalpateError(
             f"{path} is no {Path(product).stem}: expected the folder that `palpate {command}` "
@@ -123,6 +161,11 @@ def _is_file(out: Path, product: str | None) -> bool:
         file = f", or a file that ends in {wanted}" if wanted else ""
         raise PalpateError(f"--out {out} has to be a folder{file}")
     return False
+
+
+def _remove(folder: Path, names: Iterable[str]) -> None:
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
 
 
 def _numbered(name: str) -> Iterator[tuple[int, Path]]:

@@ -4,6 +4,7 @@ Nothing here knows what was recorded: `options.prepare` and `options.start` do.
 """
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,9 @@ from palpate.recording import Aligned, Recording, join
 from palpate.recording_files import read_recording
 from palpate.recording_markers import repair_markers
 from palpate.report import write_evidence
-from palpate.result import Figure, Result
+from palpate.report.charts import quantiles
+from palpate.result import Figure, Result, read_result
 from palpate.runs import RESULT, Run
-from palpate.storage import read_json
 
 HELD_OUT = 0.25  # of the trials, where no recording for validation is given
 UNITS = {"m": (100.0, "cm")}  # a person reads these errors in another unit
@@ -76,10 +77,10 @@ def run(options: Identify) -> Path:
         if not run.finished:
             identified = fit(start, data, settings, run)
             _write(run, name, options, data, identified)
-        result = read_json(run.path / RESULT)
+        result = read_result(run.path / RESULT)
         _print(result)
         title = f"What was found out about the {options.family}"
-        folders.hand_over(options, run, title, folders.MODEL, result["warnings"])
+        folders.hand_over(options, run, title, folders.MODEL, result.warnings)
         return run.path
 
 
@@ -100,16 +101,14 @@ def read(options: Identify) -> Data:
     observation = options.observation
     if fitted.trials[0][observation].values.ndim == 3:
         fitted = repair_markers(fitted, observation)
-    for note in fitted.notes:
-        print(f"note: {note}")
-    fitted = options.prepare(fitted)
+    fitted = _prepared(fitted, options, "")
     action = options.action(fitted)
     period = _period(fitted, observation, options.rate)
     aligned = fitted.align(period, observation, action)
     if validation is None:
         scored = aligned
     else:
-        validation = options.prepare(validation)
+        validation = _prepared(validation, options, "validation, ")
         scored = validation.align(period, observation, action)
     unit = fitted.trials[0][observation].unit
     return Data(fitted, validation, aligned, scored, unit)
@@ -153,19 +152,22 @@ def fit(start: Model, data: Data, settings: Settings, run: Run | None = None) ->
     )
 
 
-def evidence(identified: Identified) -> dict[str, np.ndarray]:
-    """The errors over the horizon, and for a chain of points the median validation trial."""
+def evidence(identified: Identified, unit: str) -> dict[str, np.ndarray]:
+    """The errors over the horizon, and for a chain of points the median validation trial.
+
+    `unit`: of what is observed.
+    """
     error = identified.validation
     arrays = {
         "horizon.time": error.horizon,
         "horizon.identified": error.rmse,
         "horizon.start model": identified.start.rmse,
     }
-    if is_chain(error):
-        each = np.sqrt(np.nanmean(chain_error(error) ** 2, axis=-1))
-        low, high = np.nanquantile(each, (0.1, 0.9), axis=0)
+    if is_chain(error, unit):
+        low, high = quantiles(_root_mean_square(chain_error(error)), (0.1, 0.9))
         arrays |= {"horizon.identified.low": low, "horizon.identified.high": high}
-        trial = int(np.argsort(error.by_trial)[len(error.by_trial) // 2])
+        scored = np.isfinite(error.by_trial).sum()  # the others, NaN, are sorted last
+        trial = int(np.argsort(error.by_trial)[scored // 2])
         seen = np.asarray(error.windows.seen[trial])
         arrays["motion.time"] = error.horizon
         arrays["motion.observed"] = np.where(seen, error.windows.target[trial], np.nan)
@@ -173,15 +175,21 @@ def evidence(identified: Identified) -> dict[str, np.ndarray]:
     return arrays
 
 
-def is_chain(error: PredictionError) -> bool:
+def is_chain(error: PredictionError, unit: str) -> bool:
     """Whether what is observed is points in space, the last of which is called the tip."""
-    return error.windows.target.ndim == 4 and error.windows.target.shape[-1] == 3
+    return unit == "m" and error.windows.target.ndim == 4 and error.windows.target.shape[-1] == 3
 
 
 def chain_error(error: PredictionError) -> np.ndarray:
     """Distance (trials, times, points) of each point from where it was seen, NaN if it was not."""
     apart = np.where(error.windows.seen, error.prediction - error.windows.target, np.nan)
     return np.linalg.norm(apart, axis=-1)
+
+
+def _root_mean_square(error: np.ndarray) -> np.ndarray:
+    """Over the last axis; NaN is left out, and comes out where there is nothing else."""
+    count = np.isfinite(error).sum(axis=-1)
+    return np.sqrt(np.nansum(error**2, axis=-1) / np.where(count > 0, count, np.nan))
 
 
 def rows(identified: Identified) -> list[dict[str, Any]]:
@@ -209,6 +217,14 @@ def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
             for path in paths
         ]
     )
+
+
+def _prepared(recording: Recording, options: Identify, where: str) -> Recording:
+    """The recording as the family needs it; what was put right before and thereby is printed."""
+    prepared = options.prepare(recording)
+    for note in dict.fromkeys((*recording.notes, *prepared.notes)):
+        print(f"note: {where}{note}")
+    return prepared
 
 
 def _period(recording: Recording, observation: str, rate: float | None) -> float:
@@ -251,15 +267,17 @@ def _write(run: Run, name: str, options: Identify, data: Data, identified: Ident
             ],
         },
     )
-    write_evidence(run.path, evidence(identified))
-    scored = data.validation_aligned
+    write_evidence(run.path, evidence(identified, data.unit))
+    scored, error = data.validation_aligned, identified.validation
     result = Result(
         name=name,
         figures=figures,
         settings=run.configuration
         | {
+            "observation_unit": data.unit,
             "scored_trials": len(scored.length),
             "scored_duration_s": float(np.median(scored.length) - 1) * scored.period,
+            "end_s": float(error.horizon[error.last_seen]),
         },
         seeds=[options.seed],
         split={
@@ -269,42 +287,43 @@ def _write(run: Run, name: str, options: Identify, data: Data, identified: Ident
             else "none: the only trial was fitted, and the errors are those on it",
         },
         wall_time_s=run.elapsed,
+        parameters=parameters,
+        warnings=list(identified.intervals.warnings),
     )
-    warnings = list(identified.intervals.warnings)
-    run.finish(result.to_dict() | {"parameters": parameters, "warnings": warnings})
+    run.finish(result.to_dict())
 
 
 def _figures(identified: Identified, data: Data, wall_time: float) -> list[Figure]:
     scale, unit = UNITS.get(data.unit, (1.0, data.unit))
+    found, start = identified.validation, identified.start
 
-    def last(error: PredictionError) -> float:
-        return float(error.rmse[-1]) * scale
+    def end(error: PredictionError) -> float:
+        return float(error.rmse[error.last_seen])
+
+    def figure(name: str, error: float, start: float | None = None) -> Figure:
+        rival = None if start is None else f"start model {start * scale:.3g} {unit}"
+        return Figure(f"{name}_{unit}", _known(error * scale), unit, rival=rival)
 
     figures = [
-        Figure(
-            f"l1_{unit}",
-            identified.validation.mean_absolute * scale,
-            unit,
-            rival=f"start model {identified.start.mean_absolute * scale:.3g} {unit}",
-        ),
-        Figure(
-            f"rmse_at_end_{unit}",
-            last(identified.validation),
-            unit,
-            rival=f"start model {last(identified.start):.3g} {unit}",
-        ),
-        Figure(f"l1_fitted_trials_{unit}", identified.fit.mean_absolute * scale, unit),
+        figure("l1", found.mean_absolute, start.mean_absolute),
+        figure("rmse_at_end", end(found), end(start)),
+        figure("l1_fitted_trials", identified.fit.mean_absolute),
         Figure("wall_time_s", wall_time, "s"),
     ]
-    if is_chain(identified.validation):
-        miss = chain_error(identified.validation)[..., -1]
-        figures.append(Figure("tip_rmse_m", float(np.sqrt(np.nanmean(miss**2))), "m"))
+    if is_chain(found, data.unit):
+        (tip,) = _root_mean_square(chain_error(found)[..., -1].reshape(1, -1))
+        figures.append(Figure("tip_rmse_m", _known(float(tip)), "m"))
     return figures
 
 
-def _print(result: dict[str, Any]) -> None:
+def _known(value: float) -> float | None:
+    """None for what JSON lacks: the error of a model that diverged, or of what nobody saw."""
+    return value if math.isfinite(value) else None
+
+
+def _print(result: Result) -> None:
     """Parameters, what the data cannot tell, and the error."""
-    free = [row for row in result["parameters"] if not row["fixed"]]
+    free = [row for row in result.parameters if not row["fixed"]]
     cells = [("parameter", "identified", "90 % interval", "")]
     for row in free:
         note = "one value for all elements" if row["shared"] and np.size(row["value"]) > 1 else ""
@@ -312,18 +331,20 @@ def _print(result: dict[str, Any]) -> None:
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for line in cells:
         print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
-    if fixed := [row["name"] for row in result["parameters"] if row["fixed"]]:
+    if fixed := [row["name"] for row in result.parameters if row["fixed"]]:
         print(f"not identified: {', '.join(fixed)} (as given)")
     for row in free:
         if row["verdict"]:
             print(f"warning: {row['name']}: {row['verdict']}")
-    for warning in result["warnings"]:
+    for warning in result.warnings:
         print(f"warning: {warning}")
-    error, settings = result["figures"][0], result["settings"]
-    on = "validation" if isinstance(result["split"]["validation"], list) else "the fitted trial"
+    error, settings = result.figures[0], result.settings
+    fitted = isinstance(result.split, dict) and isinstance(result.split["validation"], str)
+    on = "the fitted trial" if fitted else "validation"
     count = settings["scored_trials"]
+    value = "unknown" if error.value is None else f"{error.value:.3f} {error.unit}"
     print(
-        f"mean absolute error (L1) {error['value']:.3f} {error['unit']} over "
+        f"mean absolute error (L1) {value} over "
         f"{count} {'trial' if count == 1 else 'trials'} of "
         f"{round(settings['scored_duration_s'], 1):g} s ({on})"
     )

@@ -168,6 +168,10 @@ class Evaluate(Options, ABC):
         """The model as the task drives it."""
 
     @abstractmethod
+    def check(self, policy: CommandPolicy) -> None:
+        """Raise `PalpateError` where the world cannot be controlled by this policy."""
+
+    @abstractmethod
     def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
         """Try the policy in the world; leaves evidence and checkpoints in the run."""
 

@@ -28,7 +28,7 @@ def run(options: Reproduce, name: str) -> Path:
     given = _given(name, module.reproduce, options)
     out = options.out or folders.RUNS / (f"{name}-quick" if options.quick else name)
     if options.fresh and out.is_dir():
-        folders.start_over(out)
+        folders.start_over(out, f"reproduce {name}")
     result = module.reproduce(out, **given)
     write_json(out / RESULT, result.to_dict())
     print("\n".join(result.lines()))

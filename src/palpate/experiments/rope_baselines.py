@@ -16,6 +16,8 @@ TUNING_STEPS = 500  # control periods of each trial: 5 s
 class HeldStill:
     """The gripper never moves: what the rope's own damping does."""
 
+    period = None
+
     def begin(self, seen: Seen) -> None:
         """See `Controller.begin`."""
 
@@ -51,7 +53,7 @@ class SwingDamper:
     """
 
     def __init__(self, base: RopeConfiguration, gains: Gains = TUNED):
-        self._gains, self._period = gains, base.control_period
+        self._gains, self.period = gains, base.control_period
         self._speed_limit, self._acceleration_limit = base.speed_limit, base.acceleration_limit
         self._estimator = VelocityEstimator(base.control_period)
 
@@ -74,7 +76,7 @@ class SwingDamper:
             - gains.velocity * self._command
         )
         self._command = _shortened(
-            self._command + self._period * _shortened(acceleration, self._acceleration_limit),
+            self._command + self.period * _shortened(acceleration, self._acceleration_limit),
             self._speed_limit,
         )
         return np.pad(self._command, ((0, 0), (0, 1)))

@@ -11,6 +11,7 @@ from palpate.experiments.rope_trials import (
     Controller,
     Episodes,
     Trial,
+    check_period,
     run_trials,
     settling_time,
     wilson_interval,
@@ -50,7 +51,8 @@ def evaluate(
     Markers are kept of `one_of_each_pose`. With a `run`, finished trials are saved and logged
     there, and one that was cut off goes on. The caller opens the run and finishes it.
 
-    Raises `PalpateError` when the ropes' control periods or markers differ.
+    Raises `PalpateError` when the ropes' control periods or markers differ, or a controller decides
+    in another period.
     """
     configuration = trials[0].configuration
     for name in ("control_period", "markers"):
@@ -59,6 +61,8 @@ def evaluate(
             raise PalpateError(
                 f"trials run side by side with one {name}, not {sorted(found)}: evaluate apart"
             )
+    for controller in controllers.values():
+        check_period(controller, trials)
     steps = math.ceil(
         TRIAL_PERIODS * max(trial.period for trial in trials) / configuration.control_period
     )
@@ -129,9 +133,10 @@ class Summary:
     `periods_with_failures` counts a failure with the length of its trial. `interval`: of the
     success rate, 95 %. `margin` and `time_margin`: 95 % half-widths of `periods` and `time`.
     `at_rest_at_once`: successes whose gripper is at rest when the first second of low energy has
-    passed. `final_speed`: of the gripper over the last second of all trials, mean, m/s.
-    `relapsed`: successes whose energy rose above 1 % again before the trial ended. `diverged`:
-    trials whose simulation ended early, which are failures.
+    passed. `final_speed`: of the gripper over the last second of all trials, mean, m/s; None if no
+    simulation got there. `relapsed`: successes whose energy rose above 1 % again, or whose
+    simulation ended, before the trial did. `diverged`: trials whose simulation ended early; they
+    are failures unless the rope had come to rest before.
     """
 
     trials: int
@@ -143,7 +148,7 @@ class Summary:
     margin: float | None
     periods_with_failures: float
     at_rest_at_once: int
-    final_speed: float
+    final_speed: float | None
     relapsed: int
     diverged: int
 
@@ -157,11 +162,12 @@ class Summary:
         periods = "never" if self.periods is None else f"{self.periods:.3f} periods"
         time = "" if self.time is None else f" ({self.time:.2f} s)"
         low, high = self.interval
+        speed = "" if self.final_speed is None else f", {self.final_speed:.3f} m/s in the end"
         return (
             f"{name:28s} {self.successes:4d} of {self.trials} at rest, 95 % interval "
             f"{low:.3f} to {high:.3f}; 1 % energy after {periods}{time}; failures counted as whole "
             f"trials: {self.periods_with_failures:.3f}; gripper at rest at once in "
-            f"{self.at_rest_at_once}, {self.final_speed:.3f} m/s in the end"
+            f"{self.at_rest_at_once}{speed}"
             + (f"; {self.relapsed} rose above 1 % again" if self.relapsed else "")
         )
 
@@ -182,6 +188,7 @@ def summarise(trials: Sequence[Trial], episodes: Episodes) -> Summary:
         margin = 1.96 * deviation / math.sqrt(successes)
         return float(values.mean()), float(margin) if math.isfinite(margin) else None
 
+    final_speed = episodes.gripper_speed[:, -round(STAY / step) :]
     seconds, periods = mean(time[settled]), mean((time / period)[settled])
     return Summary(
         trials=len(trials),
@@ -193,7 +200,7 @@ def summarise(trials: Sequence[Trial], episodes: Episodes) -> Summary:
         margin=periods[1],
         periods_with_failures=float((np.where(settled, time, length) / period).mean()),
         at_rest_at_once=int(np.isfinite(settling_times(trials, episodes, first=True)).sum()),
-        final_speed=float(np.nanmean(episodes.gripper_speed[:, -round(STAY / step) :])),
+        final_speed=None if np.isnan(final_speed).all() else float(np.nanmean(final_speed)),
         relapsed=int((settled & (_last_above(trials, episodes) > time)).sum()),
         diverged=len(episodes.failures),
     )
@@ -273,6 +280,8 @@ def write_trial_evidence(
     for name, episodes in evaluated.items():
         arrays[f"energy.{name}"] = episodes.energy / episodes.energy[:, :1]
     for place, trial in enumerate(one_of_each_pose(trials)):
+        if trial in some.failures and np.isnan(some.markers[place]).all():
+            continue  # it diverged while it was shaken: there is nothing to draw
         group = f"motion/{trials[trial].start}"
         arrays[f"{group}.time"] = time
         for name in shown:

@@ -24,6 +24,7 @@ from palpate.experiments.rope_recording import (
     record_rope,
     starting_rope,
 )
+from palpate.experiments.rope_swing import swing_half_life
 from palpate.identification.gradient import Settings, identify
 from palpate.identification.prediction import PredictionError, prediction_error
 from palpate.models.files import save_model
@@ -54,6 +55,7 @@ EXCITATION = (
     "five sinusoids per axis, 0.3 to 2.5 Hz, random phases, at 60 to 95 % of the speed and "
     f"acceleration limits, still in the last 35 % of {DURATION:.0f} s"
 )
+ROPE_HALF_LIFE = (2, 6)  # periods in which the free swing of a rope halves its amplitude
 FITTED_TRIALS, UNSEEN_TRIALS = 12, 8
 UNSEEN_SEEDS = 310_000  # the unseen motions' seeds start this far after the fitted ones'
 DAMPING = ("stretch_damping", "bend_damping", "grip_damping", "air_drag", "quadratic_drag")
@@ -75,6 +77,7 @@ def reproduce(
     minutes = (2 if quick else 5) + (0 if mocap is None else 1 if quick else 2)
     print(f"rope-model: two simulated ropes{' and a real one' if mocap else ''}, ~{minutes} min")
     print(f"excitation: {EXCITATION}")
+    earlier = 0.0  # s of work in processes that were cut off
     figures: list[Figure] = []
     evidence: dict[str, np.ndarray] = {}
     split: dict[str, Any] = {}
@@ -83,8 +86,15 @@ def reproduce(
         rope = starting_rope(fitted, mass=world.mass)
         source = {"world": constants(world), "trials": [len(fitted.length), len(unseen.length)]}
         print(f"{name}: {', '.join(f'{k} {v}' for k, v in source['world'].items())}")
-        errors = _compare(out / name, name, rope, fitted, unseen, settings, source)
+        half_life = swing_half_life(world)
+        print(
+            f"{name}: a small free swing halves its amplitude in {half_life:.2f} periods "
+            f"(a rope's: {ROPE_HALF_LIFE[0]} to {ROPE_HALF_LIFE[1]})"
+        )
+        errors, before = _compare(out / name, name, rope, fitted, unseen, settings, source)
+        earlier += before
         figures += _simulated_figures(name, world, errors, unseen)
+        figures.append(Figure(f"{name}.swing_half_life_periods", half_life, "periods"))
         evidence |= _evidence(name, errors)
         split[name] = {
             "fitted": f"{len(fitted.length)} trials, seeds from {seed}",
@@ -93,7 +103,9 @@ def reproduce(
     if mocap is None:
         print("real.*: left out; give --mocap DIR with dlo1_train.npz and dlo1_eval.npz")
     else:
-        figures += _real(out, mocap, settings, split)
+        found, before = _real(out, mocap, settings, split)
+        figures += found
+        earlier += before
     write_evidence(out, evidence)
     return Result(
         "rope-model",
@@ -106,7 +118,7 @@ def reproduce(
         },
         [seed],
         split,
-        time.monotonic() - began,
+        earlier + time.monotonic() - began,
     )
 
 
@@ -135,13 +147,19 @@ def _compare(
     unseen: Aligned,
     settings: Settings,
     source: dict[str, Any],
-) -> dict[str, PredictionError]:
-    """Errors on unseen trials of the fit, the undamped fit, and the model before fitting."""
+) -> tuple[dict[str, PredictionError], float]:
+    """Errors on unseen trials of the fit, the undamped fit, and the model before fitting.
+
+    And the seconds that earlier processes spent on these fits.
+    """
+    earlier = 0.0
     errors = {"before fitting": prediction_error(rope, unseen)}
     for label, start in (("damped", rope), ("undamped", undamped(rope))):
         configuration = {"data": name, "model": label, **source, **dataclasses.asdict(settings)}
         with Run.open(out / label, configuration) as run:
+            began = time.monotonic()
             model = identify(start, fitted, settings, run)
+            earlier += max(0.0, run.elapsed - (time.monotonic() - began))
             errors[label] = prediction_error(model, unseen)
             save_model(run.path / "model.json", model)
             if not run.finished:
@@ -150,7 +168,7 @@ def _compare(
             print(f"{name}: identified")
             for row in describe(model):
                 print(f"  {row['name']:18} {format_value(row['value'], row['unit'])}")
-    return errors
+    return errors, earlier
 
 
 def tip_errors(error: PredictionError) -> np.ndarray:
@@ -199,21 +217,24 @@ def _simulated_figures(
     ]
 
 
-def _real(out: Path, mocap: Path, settings: Settings, split: dict[str, Any]) -> list[Figure]:
-    """L1 on a real rope gripped at both ends, in centimetres."""
+def _real(
+    out: Path, mocap: Path, settings: Settings, split: dict[str, Any]
+) -> tuple[list[Figure], float]:
+    """L1 on a real rope gripped at both ends, in centimetres; and seconds as of `_compare`."""
     paths = [mocap / "dlo1_train.npz", mocap / "dlo1_eval.npz"]
     for path in paths:
         if not path.exists():
             raise PalpateError(f"there is no {path}: --mocap needs the folder with {path.name}")
     fitted, unseen = (read_recording(path, rate=RATE) for path in paths)
-    fitted, unseen = (
-        with_driven(recording, GRIPPED).align(1.0 / RATE, "markers")
-        for recording in (repair_markers(fitted), unseen)
-    )
+    recordings = [with_driven(recording, GRIPPED) for recording in (repair_markers(fitted), unseen)]
+    for recording in recordings:
+        for note in recording.notes:
+            print(f"note: {note}")
+    fitted, unseen = (recording.align(1.0 / RATE, "markers") for recording in recordings)
     driven = np.array(GRIPPED) % fitted.observation.shape[2]
     rope = starting_rope(fitted, driven.tolist())
     source = {"files": [fingerprint(path) for path in paths]}
-    errors = _compare(out / "real", "real", rope, fitted, unseen, settings, source)
+    errors, earlier = _compare(out / "real", "real", rope, fitted, unseen, settings, source)
     l1 = {label: 100.0 * error.mean_absolute for label, error in errors.items()}
     split["real"] = {"fitted": paths[0].name, "unseen": paths[1].name}
     by_trial = 100.0 * errors["damped"].by_trial
@@ -234,7 +255,7 @@ def _real(out: Path, mocap: Path, settings: Settings, split: dict[str, Any]) -> 
         ),
         Figure("real.worst_trial_l1_cm", float(by_trial.max()), "cm"),
         Figure("real.before_fitting.l1_cm", l1["before fitting"], "cm"),
-    ]
+    ], earlier
 
 
 def _evidence(name: str, errors: dict[str, PredictionError]) -> dict[str, np.ndarray]:

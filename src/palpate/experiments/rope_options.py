@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -199,6 +200,20 @@ class EvaluateRopeStabilization(Evaluate):
         """The rope moved by its gripper's velocity."""
         return _driven_by_velocity(model)
 
+    def check(self, policy: CommandPolicy) -> None:
+        """The simulated rope takes a command every so often, and there has to be one."""
+        from palpate.worlds.rope_configuration import RopeConfiguration
+
+        if self.ropes < 1:
+            raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
+        period = RopeConfiguration().control_period
+        if not math.isclose(policy.period, period, rel_tol=1e-4):
+            raise PalpateError(
+                f"the policy decides every {policy.period:.4g} s and the simulated rope takes a "
+                f"command every {period:.4g} s: train through a model identified at "
+                f"{1 / period:.4g} Hz, the rate of `palpate record rope`"
+            )
+
     def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
         """See `rope_evaluation.evaluate`."""
         from palpate.experiments import rope_evaluation
@@ -209,8 +224,6 @@ class EvaluateRopeStabilization(Evaluate):
         from palpate.tasks import RopeStabilization
         from palpate.worlds.rope_configuration import RopeConfiguration
 
-        if self.ropes < 1:
-            raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
         base = RopeConfiguration()
         trials = rope_evaluation.evaluation_trials(base, self.ropes, self.seed)
         controllers = {

@@ -27,10 +27,15 @@ from palpate.tasks.rope_stabilization import (
     STAY,
     RopeStabilization,
 )
-from palpate.worlds.rope import RopeConfiguration, RopeWorld
+from palpate.worlds.rope import RopeConfiguration, RopeObservation, RopeWorld
+from palpate.worlds.world import DivergedError
 
-# Here and not in the task: what a policy is judged by must not follow what it is trained for.
+# Here and not in the task: what a policy is judged by must not follow what it is trained for. That
+# is why the task's `outcome`, which has a milder rule of its own (the gripper's mean speed, a least
+# start energy), and `settling_time` are two.
 GRIPPER_AT_REST = 0.02  # m/s, the gripper's true speed when the second of low energy has passed
+
+SAME_PERIOD = 1e-3  # relative: that of a recording's clock is known no better
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,13 @@ class Seen:
 
 @runtime_checkable
 class Controller(Protocol):
-    """What moves the grippers of several worlds at once."""
+    """What moves the grippers of several worlds at once.
+
+    `period`: seconds from one decision to the next that it was made for; None: any.
+    """
+
+    @property
+    def period(self) -> float | None: ...
 
     def begin(self, seen: Seen) -> None:
         """New episodes start, of which this is the first observation."""
@@ -73,9 +84,9 @@ class Controller(Protocol):
 class Episodes:
     """What happened in trials, sampled once per control period from the start on.
 
-    `energy` (trials, times) in J is the true one; NaN after a simulation diverged. `gripper_speed`
-    (trials, times) in m/s. `markers` (kept trials, times, markers, 3) in m, as seen, of those
-    trials that were asked for. `failures`: why a simulation ended early, by trial.
+    `energy` (trials, times) in J is the true one, `gripper_speed` (trials, times) in m/s; both NaN
+    once a simulation has diverged. `markers` (kept trials, times, markers, 3) in m, as seen, of
+    those trials that were asked for. `failures`: why a simulation ended early, by trial.
     """
 
     energy: np.ndarray
@@ -111,6 +122,11 @@ class LearnedController:
 
         self._decide = decide
 
+    @property
+    def period(self) -> float:
+        """See `Controller`; by it commands change, and velocities are estimated."""
+        return self._policy.period
+
     def begin(self, seen: Seen) -> None:
         """See `Controller.begin`."""
         positions = self._positions(seen)
@@ -137,14 +153,26 @@ class LearnedController:
         return jnp.asarray(positions, jnp.float32)
 
 
+def check_period(controller: Controller, trials: Sequence[Trial]) -> None:
+    """Raise `PalpateError` if the controller was made for another control period than a trial's."""
+    period = controller.period
+    for own in {trial.configuration.control_period for trial in trials}:
+        if period is not None and not math.isclose(period, own, rel_tol=SAME_PERIOD):
+            raise PalpateError(
+                f"a controller that decides every {period:g} s does not fit ropes with a control "
+                f"period of {own:g} s: train it with a model of that period"
+            )
+
+
 def run_trials(
     trials: Sequence[Trial], controller: Controller, steps: int, kept: Sequence[int] = ()
 ) -> Episodes:
     """Run all trials side by side for `steps` control periods, on as many threads as cores.
 
     The markers of the trials numbered in `kept` are kept. A simulation that diverges ends its own
-    trial and no other.
+    trial and no other. Raises `PalpateError` when the controller decides in another period.
     """
+    check_period(controller, trials)
     recorder = _Recorder(trials, steps, kept)
     controller.begin(recorder.seen)
     shares = np.array_split(np.arange(len(trials)), devices.cores())
@@ -161,24 +189,29 @@ class _Recorder:
 
     def __init__(self, trials: Sequence[Trial], steps: int, kept: Sequence[int]):
         self._worlds = [RopeWorld(trial.configuration) for trial in trials]
-        self._latest = [
-            world.reset(trial.seed, start=trial.start)
-            for world, trial in zip(self._worlds, trials, strict=True)
-        ]
         self._kept = {trial: place for place, trial in enumerate(kept)}
-        self.episodes = Episodes.empty(
-            len(trials), steps + 1, len(kept), len(self._latest[0].markers)
-        )
+        markers = trials[0].configuration.markers
+        self.episodes = Episodes.empty(len(trials), steps + 1, len(kept), markers)
+        self._latest = [self._start(index, trial) for index, trial in enumerate(trials)]
         for trial in range(len(trials)):
-            self._keep(trial, 0)
+            if trial not in self.episodes.failures:
+                self._keep(trial, 0)
 
     @property
     def seen(self) -> Seen:
-        """The newest observations; of a world that diverged, its last one."""
+        """The newest observations; of a world that diverged, its last one (or it hanging)."""
         return Seen(
             np.stack([observation.markers for observation in self._latest]),
             np.stack([observation.gripper_position for observation in self._latest]),
         )
+
+    def _start(self, index: int, trial: Trial) -> RopeObservation:
+        world = self._worlds[index]
+        try:
+            return world.reset(trial.seed, start=trial.start)
+        except DivergedError as error:  # while it was shaken
+            self.episodes.failures[index] = str(error)
+            return world.reset(trial.seed)  # hanging: something to see for who sees all worlds
 
     def advance(self, step: int, commands: np.ndarray, share: np.ndarray) -> None:
         failures = self.episodes.failures

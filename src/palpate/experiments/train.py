@@ -49,6 +49,7 @@ def run(options: Train) -> Path:
                 "task": task.name,
                 "features": task.feature_names(model),
                 "action": options.action,
+                "command": folders.command(options, f"train {options.task}"),
                 "seed": options.seed,
                 "training": dataclasses.asdict(training),
                 "model": describe(model),
@@ -107,7 +108,8 @@ def figures_in_model(task: Task, model: Model, policy: Policy, seed: int) -> lis
         known = np.asarray(values)[np.isfinite(values)]
         value = float(known.mean()) if known.size else None
         better = "higher" if name == "success" else "lower"
-        figures.append(Figure(f"in_model.{name}", value, "", better=better))
+        unit = task.outcome_units.get(name, "")
+        figures.append(Figure(f"in_model.{name}", value, unit, better=better))
     return figures
 
 

@@ -194,7 +194,7 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
         lower[path], upper[path] = low, high
         share = float(np.mean(np.asarray(deviation[path]) > UNDECIDED))
         verdict[path] = _verdict(share, np.size(deviation[path]))
-    return Intervals(lower, upper, verdict, _undecided(coordinates, information, unravel))
+    return Intervals(lower, upper, verdict, _undecided(information, unravel))
 
 
 def _verdict(share: float, elements: int) -> str | None:
@@ -205,23 +205,41 @@ def _verdict(share: float, elements: int) -> str | None:
     return f"not told by the data for {round(share * elements)} of {elements} elements"
 
 
-def _undecided(coordinates: FreeParameters, information: np.ndarray, unravel: Any) -> tuple:
-    """Name a combination of several parameters that the data leave free although each has a say.
+def _undecided(information: Float[np.ndarray, "free free"], unravel: Any) -> tuple[str, ...]:
+    """Name combinations of several parameters that the data leave free although each has a say.
 
-    The eigenvector of least information, when it carries less than the prior and is spread over
-    several parameters: for masses and stiffnesses together without a measured force, say.
+    For masses and stiffnesses together without a measured force, say. Least information first.
     """
-    values, vectors = np.linalg.eigh(information)
-    if values[0] > 1.0:
-        return ()
-    shares = {
-        path: float(np.sum(np.square(np.asarray(part))))
-        for path, part in unravel(jnp.asarray(vectors[:, 0], jnp.zeros(()).dtype)).items()
-    }
-    involved = [path for path, share in shares.items() if share > 0.05]
-    if len(involved) < 2:
-        return ()
-    return (
+    combinations = []
+    for direction in _free_combinations(information):
+        # By the largest element: one stiffness beside the masses of all nodes counts as much.
+        relative = np.abs(direction) / np.max(np.abs(direction))
+        parts = unravel(jnp.asarray(relative, jnp.zeros(()).dtype)).items()
+        involved = tuple(path for path, part in parts if float(jnp.max(part)) > 0.1)
+        if len(involved) > 1 and involved not in combinations:
+            combinations.append(involved)
+    return tuple(
         f"the data cannot tell {', '.join(involved)} apart: scaled together they predict the same; "
-        "fix one of them (by weighing, or from a data sheet) or read only their ratios",
+        "fix one of them (by weighing, or from a data sheet) or read only their ratios"
+        for involved in combinations
     )
+
+
+def _free_combinations(information: Float[np.ndarray, "free free"]) -> list[np.ndarray]:
+    """Unit directions with less information than the prior's, which is one, least first.
+
+    Only among elements that alone have more: the others, which any direction may contain, are
+    undecided by themselves. Where the information is equal, eigenvectors are arbitrary mixtures of
+    one another; eliminated like equations, they are as many directions of few elements each.
+    """
+    decided = np.flatnonzero(np.diag(information) >= 1.0)
+    values, vectors = np.linalg.eigh(information[np.ix_(decided, decided)])
+    rows = np.zeros((int(np.sum(values < 1.0)), len(information)))
+    rows[:, decided] = vectors[:, values < 1.0].T
+    for i in range(len(rows)):
+        row, column = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
+        rows[[i, i + row]] = rows[[i + row, i]]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column] / rows[i, column], rows[i])
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return sorted(rows, key=lambda row: row @ information @ row)

@@ -131,6 +131,7 @@ class PredictionError:
 
     `mean_absolute` is over all coordinates seen (the measure of DEFORM's table), `by_trial` the
     same for each trial; `horizon` (s) and `rmse` (of the distance, all seen points) run over time.
+    NaN where nothing was seen: an error that is not known is not zero.
     """
 
     mean_absolute: float
@@ -140,6 +141,12 @@ class PredictionError:
     prediction: np.ndarray
     windows: Windows
 
+    @property
+    def last_seen(self) -> int:
+        """Index into `horizon` of the last time at which anything was seen, of whatever trial."""
+        seen = np.asarray(self.windows.seen)
+        return int(np.flatnonzero(seen.any((0, *range(2, seen.ndim))))[-1])
+
 
 @eqx.filter_jit
 def _predict(model: Model, windows: Windows) -> Array:
@@ -147,23 +154,35 @@ def _predict(model: Model, windows: Windows) -> Array:
 
 
 def prediction_error(model: Model, aligned: Aligned) -> PredictionError:
-    """Predict every trial open loop from its first two complete frames to its end."""
+    """Predict every trial open loop from its first two complete frames to its end.
+
+    Raises `PalpateError` when nothing is seen after those frames, in any trial.
+    """
     windows = WindowSource.of(aligned).whole()
     prediction = np.asarray(_predict(model, windows))
     seen = np.asarray(windows.seen)
+    if not seen.any():
+        raise PalpateError(
+            "nothing is seen after the first two complete frames of any trial, so there is nothing "
+            "to hold a prediction against: expected trials with more frames that are seen"
+        )
     error = np.where(seen, prediction - np.asarray(windows.target), 0.0)
     per_trial = tuple(range(1, error.ndim))
     per_time = (0, *range(2, error.ndim))
     axes = error.shape[-1] if error.ndim > 2 else 1
-    points = np.maximum(seen.sum(per_time) / axes, 1)
     return PredictionError(
-        mean_absolute=float(np.abs(error).sum() / max(seen.sum(), 1)),
-        by_trial=np.abs(error).sum(per_trial) / np.maximum(seen.sum(per_trial), 1),
+        mean_absolute=float(np.abs(error).sum() / seen.sum()),
+        by_trial=np.abs(error).sum(per_trial) / _or_nan(seen.sum(per_trial)),
         horizon=aligned.period * np.arange(1, error.shape[1] + 1),
-        rmse=np.sqrt(np.square(error).sum(per_time) / points),
+        rmse=np.sqrt(np.square(error).sum(per_time) / _or_nan(seen.sum(per_time) / axes)),
         prediction=prediction,
         windows=windows,
     )
+
+
+def _or_nan(count: np.ndarray) -> np.ndarray:
+    """The count to divide by, NaN in place of zero."""
+    return np.where(count > 0, count, np.nan)
 
 
 def observation_scale(aligned: Aligned) -> float:

@@ -2,5 +2,4 @@
 
 from palpate.learning.closed_loop import simulate as simulate
 from palpate.learning.self_supervised import Training as Training
-from palpate.learning.self_supervised import manifest as manifest
 from palpate.learning.self_supervised import train as train

@@ -5,11 +5,9 @@ moved by the task's symmetries and the model is perturbed anew in every iteratio
 longer in stages, and perturbations wider.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,7 +20,7 @@ from palpate.errors import PalpateError
 from palpate.learning.closed_loop import simulate
 from palpate.models.model import Model
 from palpate.networks.policy import CommandPolicy
-from palpate.parameters import describe, randomise
+from palpate.parameters import randomise
 from palpate.runs import Run, interruptible, progress
 from palpate.tasks.task import Start, Task
 
@@ -225,14 +223,3 @@ def _update(
         return state, metrics
 
     return update
-
-
-def manifest(task: Task, model: Model, training: Training, seed: int) -> dict[str, Any]:
-    """What `save_policy` should say of a policy beside its sizes and limits."""
-    return {
-        "task": task.name,
-        "features": task.feature_names(model),
-        "model": {"name": type(model).__name__, "parameters": describe(model)},
-        "training": dataclasses.asdict(training),
-        "seed": seed,
-    }

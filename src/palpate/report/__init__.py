@@ -5,7 +5,7 @@ page that opens without a network. Nothing here knows what kind of object was ha
 """
 
 from palpate.report.evidence import Curves, Evidence, Motion, read_evidence, write_evidence
-from palpate.report.figures import motion_animation, motion_figure
+from palpate.report.figures import motion_figure
 from palpate.report.page import build_report
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "Evidence",
     "Motion",
     "build_report",
-    "motion_animation",
     "motion_figure",
     "read_evidence",
     "write_evidence",

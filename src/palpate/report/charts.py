@@ -39,16 +39,16 @@ def tip(motion: Motion, looks: Mapping[str, int], height: int) -> Chart:
     return {"data": data, "layout": layout}
 
 
-def horizon(curves: Curves, looks: Mapping[str, int]) -> Chart:
-    """Prediction error in metres against seconds since the prediction began, with quantiles."""
+def horizon(curves: Curves, looks: Mapping[str, int], unit: str) -> Chart:
+    """Prediction error in `unit` against seconds since the prediction began, with quantiles."""
     data: list[dict[str, Any]] = []
     for label, values in curves.values.items():
         if label in curves.bands:
             data += _band(label, looks, curves.time, *curves.bands[label])
-        data.append(_line(label, looks, curves.time, values, "%{y:.4f} m"))
+        data.append(_line(label, looks, curves.time, values, f"%{{y:.4g}} {plain_text(unit)}"))
     layout = empty_layout(340)
     layout["xaxis"] = titled_axis("time since the prediction began (s)")
-    layout["yaxis"] = titled_axis("RMSE (m)") | {"rangemode": "tozero"}
+    layout["yaxis"] = titled_axis(f"RMSE ({plain_text(unit) or 1})") | {"rangemode": "tozero"}
     return {"data": data, "layout": layout}
 
 

@@ -6,12 +6,13 @@ folder and holds plain arrays, named by what they are:
     motion.time          (frames,)            s
     motion.<label>       (frames, points, 3)  m; a chain of points, its last one is called the tip
     horizon.time         (times,)             s since the prediction began
-    horizon.<label>      (times,)             m; root-mean-square error of the prediction
-    horizon.<label>.low, horizon.<label>.high  (times,)  m; quantiles around it, both or neither
+    horizon.<label>      (times,)             root-mean-square error of the prediction
+    horizon.<label>.low, horizon.<label>.high  (times,)  quantiles around it, both or neither
     energy.time          (times,)             s
     energy.<label>       (episodes, times)    energy relative to the start of its episode
 
 Several motions stand side by side as `motion/<group>.time`, `motion/<group>.<label>`. NaN is a gap.
+Errors are in the unit that "observation_unit" names in the settings of `result.json`, else in m.
 What else a report shows is read from the run's other files: figures from `result.json`, and from
 its "parameters" rows {name, value, unit, about, fixed, shared, lower, upper, verdict}, where value
 and 90 % interval are a number, a list of them or null; the learning curve from `metrics.jsonl`.
@@ -84,14 +85,15 @@ class Parameter:
 class Evidence:
     """All that a run's folder holds for a report; what is not there is empty or None.
 
-    `metrics` are the run's logged lines. `rendering` is a moving picture of the scene,
-    `rendering.webp`, `.gif` or `.png`, where the machine could render one.
+    `unit` is that of `horizon`. `metrics` are the run's logged lines. `rendering` is a moving
+    picture of the scene, `rendering.webp`, `.gif` or `.png`, where the machine could render one.
     """
 
     path: Path
     name: str
     motions: tuple[Motion, ...] = ()
     horizon: Curves | None = None
+    unit: str = "m"
     energy: Curves | None = None
     parameters: tuple[Parameter, ...] = ()
     metrics: tuple[dict[str, Any], ...] = ()
@@ -139,6 +141,7 @@ def read_evidence(run: str | Path) -> Evidence:
         raise PalpateError(f"{run} holds no run: expected {', '.join(known)} or some of them")
     motions, horizon, energy = _arrays(run / EVIDENCE)
     result = _object(run / RESULT)
+    settings = result.get("settings")
     configuration = _object(run / CONFIGURATION)
     renderings = (run / f"rendering{suffix}" for suffix in RENDERINGS)
     return Evidence(
@@ -146,6 +149,7 @@ def read_evidence(run: str | Path) -> Evidence:
         name=str(result.get("name") or run.resolve().name),
         motions=motions,
         horizon=horizon,
+        unit=str(settings.get("observation_unit", "m") if isinstance(settings, dict) else "m"),
         energy=energy,
         parameters=tuple(_rows(run / RESULT, result, "parameters", _parameter)),
         metrics=tuple(read_metrics(run)),

@@ -1,4 +1,4 @@
-"""Static figures and drawn animations for documents, by Matplotlib: no browser, no OpenGL.
+"""Static figures for documents, by Matplotlib: no browser, no OpenGL.
 
 What they show is what the page shows, in the same looks (`palpate.report.style`), on white.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _NOTHING = "the motion holds nothing but gaps: there is nothing to draw"
 _INK, _QUIET, _RULE = "#1c2127", "#5b6570", "#dfe3e7"
-_FIGURES, _ANIMATIONS = (".png", ".svg"), (".webp", ".gif")
+_SUFFIXES = (".png", ".svg")
 _SETTINGS: Any = {
     "font.size": 9,
     "axes.edgecolor": _RULE,
@@ -53,7 +53,10 @@ def motion_figure(
     import matplotlib
     from matplotlib.figure import Figure
 
-    out = _suffixed(out, _FIGURES)
+    out = Path(out)
+    if out.suffix not in _SUFFIXES:
+        expected = " or ".join(_SUFFIXES)
+        raise PalpateError(f"{out} has the suffix '{out.suffix}': expected {expected}")
     if not len(instants):
         raise PalpateError("a motion figure needs at least one instant, in seconds")
     labels = [*motion.chains, *(energy.values if energy else ())]
@@ -83,65 +86,6 @@ def motion_figure(
     return out
 
 
-def motion_animation(out: str | Path, motion: Motion, rate: float = 20.0) -> Path:
-    """Draw a motion as a looping picture at `rate` frames a second, seen from the side and above.
-
-    `out` is a `.webp` or `.gif`. It is what a machine without OpenGL shows in place of a rendered
-    scene. Raises `PalpateError` for another suffix or a file that cannot be written.
-    """
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from PIL import Image
-
-    out = _suffixed(out, _ANIMATIONS)
-    looks = {label: STYLES[index] for label, index in numbered(motion.chains).items()}
-    seen = {label: _from_above(chain) for label, chain in motion.chains.items()}
-    floor = _floor(motion)
-    limits = _limits([*seen.values(), floor])
-    times = np.arange(motion.time[0], motion.time[-1], 1.0 / rate)
-    frames = np.abs(motion.time[:, None] - times).argmin(axis=0)
-    pictures = []
-    with matplotlib.rc_context(_SETTINGS):
-        height = 4.8 * np.clip(np.ptp(limits[1]) / np.ptp(limits[0]), 0.4, 1.6)
-        figure = Figure(figsize=(4.8, height + 0.4), dpi=100)
-        canvas = FigureCanvasAgg(figure)
-        ax = figure.add_axes((0.0, 0.0, 1.0, height / (height + 0.4)))
-        ax.set(xlim=limits[0], ylim=limits[1], aspect="equal")
-        ax.set_axis_off()
-        ax.plot(*floor.T, color=_RULE, lw=0.8, zorder=0)
-        paths = {label: ax.plot([], [], color=looks[label].light, lw=1)[0] for label in seen}
-        chains = {label: _draw_chain(ax, seen[label][0], looks[label], label) for label in seen}
-        _legend(figure)
-        clock = ax.text(0.02, 0.02, "", transform=ax.transAxes, color=_QUIET)
-        for frame in frames:
-            for label, chain in seen.items():
-                recent = slice(
-                    max(0, int(np.searchsorted(motion.time, motion.time[frame] - 1))), frame + 1
-                )
-                paths[label].set_data(*chain[recent, -1].T)
-                line, end = chains[label]
-                line.set_data(*chain[frame].T)
-                end.set_data(*chain[frame, -1:].T)
-            clock.set_text(f"{motion.time[frame]:.2f} s")
-            canvas.draw()
-            pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-    buffer = io.BytesIO()
-    kind = out.suffix[1:]
-    more = {"quality": 75, "method": 4} if kind == "webp" else {"optimize": True}
-    pictures[0].save(
-        buffer,
-        format=kind,
-        save_all=True,
-        append_images=pictures[1:],
-        duration=round(1000 / rate),
-        loop=0,
-        **more,
-    )
-    write_bytes(out, buffer.getvalue())
-    return out
-
-
 # --- projections ------------------------------------------------------------------------------
 
 
@@ -154,30 +98,6 @@ def _in_plane(motion: Motion, chain: np.ndarray) -> np.ndarray:
     _, vectors = np.linalg.eigh(np.cov(level, rowvar=False, bias=True))
     along = vectors[:, -1] * np.sign(vectors[np.argmax(np.abs(vectors[:, -1])), -1])
     return np.stack([chain[..., :2] @ along, chain[..., 2]], axis=-1)
-
-
-def _from_above(points: np.ndarray, yaw: float = -0.9, pitch: float = 0.28) -> np.ndarray:
-    """An orthographic view of points (..., 3), turned about z and then tilted; radians."""
-    x, y, z = np.moveaxis(points, -1, 0)
-    right = np.cos(yaw) * x - np.sin(yaw) * y
-    away = np.sin(yaw) * x + np.cos(yaw) * y
-    return np.stack([right, np.cos(pitch) * z + np.sin(pitch) * away], axis=-1)
-
-
-def _floor(motion: Motion) -> np.ndarray:
-    """The lines of a grid beneath the motion as `_from_above` shows it, NaN between them."""
-    every = np.concatenate([chain.reshape(-1, 3) for chain in motion.chains.values()])
-    every = every[np.isfinite(every).all(axis=1)]
-    if not len(every):
-        raise PalpateError(_NOTHING)
-    low, high = every.min(axis=0), every.max(axis=0)
-    reach = 0.3 * np.linalg.norm(high - low)
-    lines = []
-    for share in np.linspace(-1, 1, 7):
-        for ends in ([[share, -1], [share, 1]], [[-1, share], [1, share]]):
-            level = (low + high)[:2] / 2 + reach * np.array(ends)
-            lines += [*np.column_stack([level, [low[2]] * 2]), [np.nan] * 3]
-    return _from_above(np.array(lines))
 
 
 def _limits(seen: Any) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -199,13 +119,12 @@ def _round_ticks(low: float, high: float) -> list[float]:
 # --- drawing ----------------------------------------------------------------------------------
 
 
-def _draw_chain(ax: "Axes", points: np.ndarray, style: Style, label: str) -> tuple[Any, Any]:
+def _draw_chain(ax: "Axes", points: np.ndarray, style: Style, label: str) -> None:
     look = {"color": style.light, "lw": style.width * 0.75, "marker": style.marker}
     look["linestyle"] = _dashes(style)
     every = max(1, round(len(points) / 8))
-    (line,) = ax.plot(*points.T, ms=3, markevery=(0, every), label=label, **look)
-    (end,) = ax.plot(*points[-1:].T, ms=6, color=style.light, marker=style.marker)
-    return line, end
+    ax.plot(*points.T, ms=3, markevery=(0, every), label=label, **look)
+    ax.plot(*points[-1:].T, ms=6, color=style.light, marker=style.marker)
 
 
 def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
@@ -244,13 +163,6 @@ def _legend(figure: "Figure") -> None:
         across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
         place = {"loc": "outside upper left", "ncols": across, "frameon": False}
         figure.legend(handles.values(), handles.keys(), handlelength=3.5, **place)
-
-
-def _suffixed(out: str | Path, known: tuple[str, ...]) -> Path:
-    out = Path(out)
-    if out.suffix not in known:
-        raise PalpateError(f"{out} has the suffix '{out.suffix}': expected {' or '.join(known)}")
-    return out
 
 
 def _save(figure: "Figure", out: Path) -> None:

@@ -65,7 +65,7 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
         ("Results", lambda e, looks: _results(e.figures)),
         ("Motion", _motion),
         ("Path of the tip", _tips),
-        ("Error against horizon", lambda e, looks: _horizon(e.horizon, looks)),
+        ("Error against horizon", lambda e, looks: _horizon(e.horizon, looks, e.unit)),
         ("Parameters", lambda e, looks: _parameters(e.parameters)),
         ("Learning", lambda e, looks: _learning(e.metrics)),
         ("Energy", lambda e, looks: _energy(e.energy, looks)),
@@ -164,7 +164,7 @@ def _tip(motion: Motion, looks: dict[str, int], height: int) -> str:
     return _caption(f"{caption}.") + _chart(charts.tip(motion, looks, height))
 
 
-def _horizon(curves: Curves | None, looks: dict[str, int]) -> str:
+def _horizon(curves: Curves | None, looks: dict[str, int], unit: str) -> str:
     if curves is None:
         return ""
     ends = []
@@ -172,11 +172,12 @@ def _horizon(curves: Curves | None, looks: dict[str, int]) -> str:
         known = np.flatnonzero(np.isfinite(values))
         if known.size:
             last = known[-1]
-            ends.append(f"{values[last]:.3g} m after {curves.time[last]:.3g} s ({label})")
+            error = f"{values[last]:.3g} {unit}".rstrip()
+            ends.append(f"{error} after {curves.time[last]:.3g} s ({label})")
     caption = "How far a prediction drifts the longer it runs without looking; lower is better"
     caption += f": {', '.join(ends)}." if ends else "."
     caption += " The band spans the quantiles over trials." if curves.bands else ""
-    return _caption(caption) + _chart(charts.horizon(curves, looks))
+    return _caption(caption) + _chart(charts.horizon(curves, looks, unit))
 
 
 def _parameters(rows: Sequence[Parameter]) -> str:

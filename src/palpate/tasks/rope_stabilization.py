@@ -1,6 +1,7 @@
 """Bring a swinging rope to rest by moving its end (SPiD, Long et al., arXiv 2602.03623)."""
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -41,6 +42,11 @@ class RopeStabilization(Task):
     """
 
     name: ClassVar[str] = "rope-stabilization"
+    outcome_units: ClassVar[Mapping[str, str]] = {
+        "settling_time": "s",
+        "settling_periods": "periods",
+        "final_speed": "m/s",
+    }
     duration: float = eqx.field(static=True, default=2.0)
     action_limit: float = eqx.field(static=True, default=1.5)  # m/s
     action_rate_limit: float = eqx.field(static=True, default=10.0)  # m/s^2
@@ -67,7 +73,7 @@ class RopeStabilization(Task):
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moving, still)
 
     def _from_motions(self, model: Rope, key: PRNGKeyArray, count: int) -> Start:
-        motions = -(-count // STATES_PER_MOTION)
+        motions = max(1, -(-count // STATES_PER_MOTION))  # none is no batch
         for_motion, for_time = jax.random.split(key)
         steps = round(MOTION / model.control_period)
         commands = self._random_commands(for_motion, motions, steps, model.control_period)
@@ -229,6 +235,7 @@ class RopeStabilization(Task):
         period, stay = models.control_period, round(STAY / models.control_period)
         below = jnp.cumsum(jnp.pad(share < STABILISED, ((0, 0), (1, 0))), axis=1, dtype=int)
         stays = below[:, stay:] - below[:, :-stay] == stay
+        stays = jnp.pad(stays, ((0, 0), (0, 1)))  # an episode may be shorter than that second
         speed = jnp.mean(jnp.linalg.norm(states.velocity[:, -stay:, 0], axis=-1), axis=1)
         success = jnp.any(stays, axis=1) & (speed < AT_REST)
         time = jnp.where(success, (jnp.argmax(stays, axis=1) + 1) * period, jnp.nan)

@@ -1,6 +1,7 @@
 """The contract of every task: where it starts, what a policy sees, what counts."""
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -29,6 +30,7 @@ class Task(eqx.Module):
     """
 
     name: ClassVar[str]
+    outcome_units: ClassVar[Mapping[str, str]] = {}  # of what `outcome` gives; "" if not named
     duration: eqx.AbstractVar[float]
     action_limit: eqx.AbstractVar[float]
     action_rate_limit: eqx.AbstractVar[float | None]

@@ -28,7 +28,7 @@ from palpate.worlds.rope_starts import (
     shake_commands,
     start_tangents,
 )
-from palpate.worlds.world import OffscreenCamera, World
+from palpate.worlds.world import DivergedError, OffscreenCamera, World
 
 __all__ = [
     "START_POSES",
@@ -84,7 +84,7 @@ class RopeWorld(World):
     target of a servo that lags 10 ms behind it. So the gripper's true motion is not quite the
     command, as with a real arm.
 
-    Raises `PalpateError` for an unknown start, a malformed action, or a diverged simulation.
+    Raises `PalpateError` for an unknown start or a malformed action, and `DivergedError`.
     """
 
     def __init__(self, configuration: RopeConfiguration | None = None):
@@ -137,9 +137,12 @@ class RopeWorld(World):
         """
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
             raise PalpateError(f"a seed is a whole number, 0 or greater, not {seed!r}")
+        self._history = []  # not to be stepped on if this start fails
         self._random = np.random.default_rng(seed)
         drawn = self._random.uniform(0, 2 * np.pi)
         azimuth = drawn if azimuth is None else float(azimuth)
+        if not math.isfinite(azimuth):
+            raise PalpateError(f"an azimuth is a finite angle in radians, not {azimuth}")
         turn = np.array([
             [math.cos(azimuth), -math.sin(azimuth), 0],
             [math.sin(azimuth), math.cos(azimuth), 0],
@@ -233,7 +236,7 @@ class RopeWorld(World):
                 self._disturb()
             mujoco.mj_step(self._model, data)
         if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
-            raise PalpateError(
+            raise DivergedError(
                 f"the rope's simulation diverged at {data.time:.3f} s; a smaller time_step than "
                 f"{configuration.time_step:g} s or a softer rope would work"
             )

@@ -19,12 +19,19 @@ if TYPE_CHECKING:
 GL_PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
 
 
+class DivergedError(PalpateError):
+    """A simulation became too fast for its time step: this episode is lost, and no other."""
+
+
 class World(ABC):
     """A piece of reality that is acted upon and observed once per control period.
 
     A world hides its parameters. An observation holds only what a sensor could see, with its
     noise and delay, and carries `time`: the seconds since `reset` at which it was measured.
     The same seed and the same actions give the same observations.
+
+    `reset` and `step` raise `DivergedError` when the simulation diverges; the next `reset` starts
+    afresh.
     """
 
     @property

@@ -1,0 +1,126 @@
+"""Combinations that the data leave free are named, beside parameters they say nothing of."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from palpate.identification.least_squares import _undecided, intervals
+from palpate.models.model import Model, rollout
+from palpate.parameters import FreeParameters, LogNormal, parameter
+from palpate.recording import Aligned
+from toys import CartState
+
+PRIOR = LogNormal(1.0, 0.5)
+
+
+class GearedCart(Model):
+    """mass a = gear action - friction v: without an action the gear is not seen at all."""
+
+    gear: Float[Array, "*batch"] = parameter("N", prior=PRIOR, about="force per action")
+    mass: Float[Array, "*batch"] = parameter("kg", prior=PRIOR, about="mass of the cart")
+    friction: Float[Array, "*batch"] = parameter("N s/m", prior=PRIOR, about="per velocity")
+    control_period = 0.05
+    overrides = ()
+    action_shape = (1,)
+    observation_shape = (1,)
+
+    def step(self, state, action):
+        force = self.gear * action - self.friction * state.velocity
+        velocity = state.velocity + self.control_period * force / self.mass
+        return CartState(state.position + self.control_period * velocity, velocity)
+
+    def observe(self, state):
+        return state.position
+
+    def initial_state(self, observations):
+        last = observations[..., -1, :]
+        if observations.shape[-2] < 2:
+            return CartState(last, jnp.zeros_like(last))
+        return CartState(last, (last - observations[..., -2, :]) / self.control_period)
+
+
+@pytest.mark.parametrize(
+    ("push", "together"), [(0.0, ("friction", "mass")), (1.0, ("friction", "gear", "mass"))]
+)
+def test_a_combination_is_named_whatever_else_is_undecided(push, together):
+    """A coasting cart shows friction per mass and nothing of its gear, a pushed one two ratios."""
+    cart = GearedCart(gear=1.0, mass=1.0, friction=1.0)
+    rng = np.random.default_rng(0)
+    actions = push * jnp.asarray(rng.normal(size=(4, 60, 1)), jnp.float32)
+    start = CartState(jnp.zeros((4, 1)), 2.0 * jnp.ones((4, 1)))
+    states = rollout(cart, start, actions)
+    position = np.concatenate([start.position[:, None], states.position], axis=1)
+    noisy = position + 1e-3 * rng.normal(size=position.shape)
+    aligned = Aligned(0.05, noisy.astype(np.float32), np.asarray(actions), np.full(4, 61))
+    coordinates = FreeParameters(cart)
+    found = intervals(coordinates, coordinates.initial, aligned)
+    assert (found.verdict["gear"] is None) == (push > 0.0)
+    assert [named(warning) for warning in found.warnings] == [together]
+
+
+def named(warning):
+    """The parameters that a warning calls inseparable."""
+    return tuple(warning.split(" tell ")[1].split(" apart")[0].split(", "))
+
+
+def warned(jacobian):
+    """What is named for the residuals' derivatives by parameter, {path: (residuals, elements)}."""
+    like = {path: jnp.zeros(columns.shape[1]) for path, columns in jacobian.items()}
+    _, unravel = ravel_pytree(like)
+    columns = np.concatenate([jacobian[path] for path in sorted(jacobian)], axis=1)
+    return [named(warning) for warning in _undecided(columns.T @ columns, unravel)]
+
+
+def derivatives(elements=1, size=30.0, seed=0):
+    return size * np.random.default_rng(seed).normal(size=(200, elements)) / np.sqrt(200)
+
+
+def test_undecided_parameters_alone_are_no_combination():
+    told, none = derivatives(3), np.zeros((200, 2))
+    assert warned({"told": told, "none": none, "little": derivatives(2, 0.3, 1)}) == []
+    assert warned({"none": none, "nothing": none}) == []
+    little = derivatives(1, 0.8, 1)  # less than the prior, their difference more
+    assert warned({"little": little, "as little": -little}) == []
+    assert warned({"told": told}) == []
+
+
+def test_elements_of_one_parameter_are_not_told_to_be_fixed():
+    told = derivatives()
+    assert warned({"shape": np.concatenate([told, -told], axis=1), "size": derivatives(1)}) == [
+        ("shape", "size")
+    ]
+    assert warned({"shape": np.concatenate([told, -told], axis=1)}) == []
+
+
+@pytest.mark.parametrize("left", [0.0, 1e-9, 0.1])
+def test_combinations_are_named_apart_however_their_eigenvectors_mix(left):
+    """Two of equal information, of elements in any order, beside parameters undecided alone."""
+    one, other, trace = derivatives(2, seed=0), derivatives(1, seed=1), derivatives(2, seed=2)
+    jacobian = {
+        "damping": -other + left * trace[:, :1] / 30,
+        "gravity": derivatives(1, seed=3),
+        "gripping": np.zeros((200, 1)),
+        "mass": one,
+        "stiffness": other,
+        "twisting": 1e-3 * derivatives(3, seed=4),
+        "width": -one + left * trace / 30,
+    }
+    found = warned(jacobian)
+    assert sorted(found) == [("damping", "stiffness"), ("mass", "width")]
+    told = jacobian | {"width": -one + 0.01 * trace}
+    assert warned(told)[0] == ("damping", "stiffness")
+    told = jacobian | {"damping": -other + 0.02 * trace[:, :1]}
+    assert warned(told)[0] == ("mass", "width")
+    told = jacobian | {"damping": -other + 0.2 * trace[:, :1]}
+    assert warned(told) == [("mass", "width")]
+
+
+def test_one_stiffness_is_named_beside_the_masses_of_many_nodes():
+    masses = derivatives(20)
+    stiffness = -np.sum(masses, axis=1, keepdims=True) / 0.3  # a prior three times as wide
+    shape = derivatives(2, seed=1)
+    assert warned({"mass": masses, "shape": shape, "stiffness": stiffness}) == [
+        ("mass", "stiffness")
+    ]

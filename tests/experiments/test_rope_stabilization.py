@@ -44,7 +44,7 @@ def calls(monkeypatch):
     monkeypatch.setattr(rope_stabilization, "NODES", 6)
     monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr(rope_stabilization, "identify", identify)
-    monkeypatch.setattr(rope_stabilization, "train", train)
+    monkeypatch.setattr("palpate.experiments.train.train", train)
     monkeypatch.setattr(rope_stabilization, "_left_when_still", lambda *_: figure())
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.05)
     return made

@@ -136,6 +136,19 @@ def test_energy_counts_motion_height_and_bending_as_the_seed_does(float64):
     assert difference == pytest.approx(0.03)  # the first segment lies at 90 degrees from down
 
 
+def test_a_grip_is_where_the_first_node_is_driven():
+    for driven, same in (((0,), False), ((5,), True), ((2, 5), True)):
+        loose = rope(driven=driven, grip_stiffness=0.0, grip_damping=0.0)
+        tight = eqx.tree_at(
+            lambda r: (r.grip_stiffness, r.grip_damping), loose, (jnp.asarray(0.03),) * 2
+        )
+        state = moving(loose)
+        still = jnp.zeros(loose.action_shape)
+        steps = [held.step(state, still).velocity for held in (loose, tight)]
+        stored = [held.elastic_energy(state.position) for held in (loose, tight)]
+        assert bool(jnp.all(steps[0] == steps[1])) == bool(stored[0] == stored[1]) == same
+
+
 @pytest.mark.parametrize("driven", [(0, 5), (5,), (0, 1)])
 def test_a_rope_held_otherwise_has_no_hanging_rest_to_count_from(driven):
     held = rope(driven=driven)

@@ -256,7 +256,9 @@ def test_a_rope_that_nothing_holds_keeps_both_momenta(float64):
     )
 
 
-def test_lanes_do_not_touch_each_other(float64):
+@pytest.mark.parametrize("lanes", [1, 2, 3, 16])
+def test_lanes_do_not_touch_each_other(lanes, monkeypatch, float64):
+    monkeypatch.setattr("palpate.models.rope.LANES", lanes)
     rng = np.random.default_rng(6)
     ropes = [uneven_rope(rng) for _ in range(3)]
     starts = [bent(rope, rng, 0.5, 0.1) for rope in ropes]

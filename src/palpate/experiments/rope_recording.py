@@ -81,6 +81,6 @@ def starting_rope(
     if rope.held_at_both_ends:
         # Two grips show how a rope is bent at rest and how its mass is spread.
         rope = declare(rope, rest_bend={"fixed": False}, node_mass={"fixed": False})
-    if {0, 1} <= set(rope.driven):  # the grip itself turns the first segment
+    if 0 not in rope.driven or 1 in rope.driven:  # no grip, or it turns the first segment itself
         rope = declare(rope, grip_stiffness={"fixed": True}, grip_damping={"fixed": True})
     return rope

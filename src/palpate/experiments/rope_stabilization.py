@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.experiments.folders import POLICY
 from palpate.experiments.rope_baselines import TUNED, HeldStill, SwingDamper
 from palpate.experiments.rope_evaluation import (
     TRIAL_PERIODS,
@@ -27,6 +28,7 @@ from palpate.experiments.rope_evaluation import (
     table,
     write_trial_evidence,
 )
+from palpate.experiments.rope_options import TrainRopeStabilization
 from palpate.experiments.rope_recording import (
     GRIPPER,
     MARKERS,
@@ -35,15 +37,16 @@ from palpate.experiments.rope_recording import (
     starting_rope,
 )
 from palpate.experiments.rope_trials import Episodes, LearnedController, Trial
+from palpate.experiments.train import trained
 from palpate.identification.gradient import Settings, identify
-from palpate.learning import Training, train
+from palpate.learning import Training
 from palpate.models.files import load_model, save_model
 from palpate.models.rope import Rope
-from palpate.networks import CommandPolicy, load_policy, save_policy
+from palpate.networks import CommandPolicy, load_policy
 from palpate.parameters import describe
 from palpate.recording import Recording
 from palpate.recording_files import read_recording, write_recording
-from palpate.result import Figure, Result, machine
+from palpate.result import Figure, Result
 from palpate.runs import RESULT, Run
 from palpate.storage import read_json
 from palpate.tasks import RopeStabilization
@@ -203,23 +206,11 @@ def trained_policy(
         **dataclasses.asdict(training),
     }
     with Run.open(path, configuration) as run:
-        file = run.path / "policy.safetensors"
         if not run.finished:
-            policy = train(task, model, training, seed, run)
-            manifest = {
-                "task": task.name,
-                "features": task.feature_names(model),
-                "action": "gripper velocity, m/s",
-                "command": command,
-                "seed": seed,
-                "training": dataclasses.asdict(training),
-                "model": describe(model),
-                "machine": machine(),
-                "wall_time_s": run.elapsed,
-            }
-            save_policy(file, policy, manifest)
+            action = TrainRopeStabilization.action
+            trained(task, model, training, seed, run, action=action, command=command)
             finish(run, NAME, "train", {})
-        return load_policy(file)
+        return load_policy(run.path / POLICY)
 
 
 def shipped_policy() -> tuple[CommandPolicy, dict[str, Any]]:
@@ -297,7 +288,7 @@ def _left_when_still(trials: list[Trial], episodes: Episodes) -> Figure:
         energy[math.floor(3.0 * trial.period / trial.configuration.control_period)] / energy[0]
         for trial, energy in zip(trials, episodes.energy, strict=True)
     ]
-    least = float(np.nanmin(shares))
+    least = float(np.nanmin(shares)) if np.any(np.isfinite(shares)) else None
     return Figure("least_energy_after_3_periods.held_still", least, "of its start", better="higher")
 
 

@@ -16,10 +16,10 @@ from palpate.experiments.options import Train
 from palpate.learning import Training, simulate, train
 from palpate.models.files import load_model
 from palpate.models.model import Model
-from palpate.networks import Policy, save_policy
+from palpate.networks import CommandPolicy, Policy, save_policy
 from palpate.parameters import describe
 from palpate.result import Figure, Result, machine, read_result
-from palpate.runs import RESULT
+from palpate.runs import RESULT, Run
 from palpate.tasks import task_named
 from palpate.tasks.task import Task
 
@@ -44,19 +44,15 @@ def run(options: Train) -> Path:
     }
     with folders.open_run(options, name, configuration, folders.POLICY) as run:
         if not run.finished:
-            policy = train(task, model, training, options.seed, run)
-            manifest = {
-                "task": task.name,
-                "features": task.feature_names(model),
-                "action": options.action,
-                "command": folders.command(options, f"train {options.task}"),
-                "seed": options.seed,
-                "training": dataclasses.asdict(training),
-                "model": describe(model),
-                "machine": machine(),
-                "wall_time_s": run.elapsed,
-            }
-            save_policy(run.path / folders.POLICY, policy, manifest)
+            policy = trained(
+                task,
+                model,
+                training,
+                options.seed,
+                run,
+                action=options.action,
+                command=folders.command(options, f"train {options.task}"),
+            )
             figures = figures_in_model(task, model, policy, options.seed)
             result = Result(
                 name=name,
@@ -73,6 +69,36 @@ def run(options: Train) -> Path:
         title = f"How a controller was trained for {options.task}"
         folders.hand_over(options, run, title, folders.POLICY)
         return run.path
+
+
+def trained(
+    task: Task,
+    model: Model,
+    training: Training,
+    seed: int,
+    run: Run,
+    *,
+    action: str,
+    command: str,
+) -> CommandPolicy:
+    """The policy that is trained in `run`, which keeps it with all that its reader has to know.
+
+    `action`: what the policy's output is; `command`: what makes it again.
+    """
+    policy = train(task, model, training, seed, run)
+    manifest = {
+        "task": task.name,
+        "features": task.feature_names(model),
+        "action": action,
+        "command": command,
+        "seed": seed,
+        "training": dataclasses.asdict(training),
+        "model": describe(model),
+        "machine": machine(),
+        "wall_time_s": run.elapsed,
+    }
+    save_policy(run.path / folders.POLICY, policy, manifest)
+    return policy
 
 
 def named_task(name: str) -> Task:

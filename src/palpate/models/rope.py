@@ -14,7 +14,8 @@ from palpate.models.model import Model
 from palpate.parameters import LogNormal, Normal, Parameter, parameter, parameters_of
 
 # Ropes integrated side by side: as many as a vector register holds numbers. Measured: 8 costs a
-# fifth more time forwards and a tenth backwards, 32 a tenth more of each.
+# fifth more time forwards and a tenth backwards, 32 a tenth more of each. Other processors have no
+# cache to stay in, and take the batch as a whole.
 LANES = 16
 
 
@@ -78,13 +79,13 @@ class Rope(Model):
         "N m/rad",
         prior=LogNormal(1e-5, 1.5),
         spread=0.5,
-        about="torque per radian by which the grip turns the first segment down",
+        about="torque per radian by which a grip at node 0 turns the first segment down",
     )
     grip_damping: Float[Array, "*batch"] = parameter(
         "N m s/rad",
         prior=LogNormal(1e-4, 1.5),
         spread=0.5,
-        about="torque of the grip against turning of the first segment",
+        about="torque of a grip at node 0 against turning of the first segment",
     )
     air_drag: Float[Array, "*batch"] = parameter(
         "N s/m",
@@ -229,7 +230,7 @@ class Rope(Model):
         return RopeState(position, (position - observations[..., -2, :, :]) / self.control_period)
 
     def step(self, state: RopeState, action: Float[Array, "*batch driven 3"]) -> RopeState:
-        """The state one control period later. A batch is integrated in blocks of `LANES` ropes."""
+        """The state one control period later. On CPUs a batch goes in blocks of `LANES` ropes."""
         state, increment = self._drive(state, action)
         rest_bend = self._rest_bend(state.position)
         coefficients = self._coefficients()
@@ -305,8 +306,9 @@ class Rope(Model):
         def per_node(value: Array) -> Array:
             return jnp.broadcast_to(value[..., None], (*value.shape, self.nodes))
 
-        def on_first_segment(value: Array) -> Array:
-            return rope_stability.spread(value[..., None], self.nodes - 1, 0)
+        def at_the_grip(value: Array) -> Array:
+            held = float(0 in self.driven)
+            return rope_stability.spread(held * value[..., None], self.nodes - 1, 0)
 
         return rope_kernel.Coefficients(
             rest_length=self.rest_length,
@@ -315,8 +317,8 @@ class Rope(Model):
             bend_stiffness=self.bend_stiffness,
             bend_damping=self.bend_damping,
             twist_stiffness=self.twist_stiffness,
-            grip_stiffness=on_first_segment(self.grip_stiffness),
-            grip_damping=on_first_segment(self.grip_damping),
+            grip_stiffness=at_the_grip(self.grip_stiffness),
+            grip_damping=at_the_grip(self.grip_damping),
             linear_drag=per_node(self.air_drag),
             quadratic_drag=per_node(self.quadratic_drag),
             step_per_mass=self.time_step * free / self.node_mass,
@@ -358,7 +360,7 @@ class Rope(Model):
 
     def _integrate_blocks(self, motion, coefficients, count: int) -> RopeState:
         """Integrate `count` ropes (leading axis) in blocks; parameters batched or shared."""
-        lanes = min(LANES, count)
+        lanes = min(LANES, count) if jax.default_backend() == "cpu" else count
         blocks = -(-count // lanes)
         missing = blocks * lanes - count
 
@@ -436,5 +438,5 @@ class Rope(Model):
             jnp.sum(stretch, axis=-1)
             + jnp.sum(bending, axis=-1)
             + jnp.sum(twist, axis=-1)
-            + self.grip_stiffness * from_down
+            + float(0 in self.driven) * self.grip_stiffness * from_down
         )

@@ -1,4 +1,4 @@
-"""Recordings on disk: our NPZ, foreign NPZ of marker positions, motion-capture CSV.
+"""Recordings on disk: our NPZ, foreign NPZ of marker positions, motion-capture CSV, logs of robots.
 
 Files come from anywhere, so nothing in them is believed: nothing is unpickled, sizes are checked
 before memory is taken, and what is damaged or does not fit is refused with one sentence.
@@ -10,6 +10,8 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,8 @@ from numpy.lib import format as npy
 
 from palpate.errors import PalpateError
 from palpate.recording import LARGEST, Channel, Recording, Role, Trial
+from palpate.recording_bag import InputTable, read_bag
+from palpate.recording_bag_files import is_bag
 from palpate.recording_csv import MarkerTable, read_csv
 from palpate.storage import DamagedFileError, write_bytes
 
@@ -34,13 +38,16 @@ def read_recording(
     rate: float | None = None,
     unit: str | None = None,
     up: str | None = None,
+    topics: Sequence[str] = (),
 ) -> Recording:
-    """Read a recording from `.npz` (ours or foreign) or `.csv`, in SI units and z up.
+    """Read a recording from `.npz` (ours or foreign), `.csv` or a log, in SI units and z up.
 
     A foreign NPZ holds `positions` (trials, frames, markers, 3) or (frames, markers, 3) and maybe
     `time` (frames,) or (trials, frames) in seconds; frames at the end of a trial where nothing
     was seen are padding. CSV is described at `palpate.recording_csv.read_csv`. Both become one
-    observation channel "markers" in each trial.
+    observation channel "markers" in each trial. Logs are MCAP files, rosbag2 folders or databases
+    and ROS 1 bags, described at `palpate.recording_bag.read_bag`; `topics` names which of their
+    topics to take, and besides "markers" they may give a driven "gripper" and a "command".
 
     `rate` (Hz) is for files without time, `unit` ("m", "cm", "mm") for files that do not say, and
     `up` ("x", "y", "z") names the axis that points up, by default y in a Motive export and z
@@ -54,19 +61,31 @@ def read_recording(
             raise PalpateError(f"{option} has to be one of {', '.join(known)}, not '{value}'")
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise PalpateError(f"the rate has to be a positive number of Hz, not {rate}")
+    inputs: list[tuple[InputTable, ...]] = []
     try:
+        if topics and not is_bag(path):
+            raise PalpateError("only logs have topics: leave topics out")
         if path.suffix.lower() == ".npz":
             found = _read_npz(path)
         elif path.suffix.lower() == ".csv":
             found = [(path.stem, read_csv(path))]
+        elif is_bag(path):
+            trials = read_bag(path, topics)
+            found = [(name, table) for name, table, _ in trials]
+            inputs = [driven for _, _, driven in trials]
         else:
-            raise PalpateError(f"unknown kind of recording '{path.suffix}': known are .npz, .csv")
+            raise PalpateError(
+                f"unknown kind of recording '{path.suffix}': known are .npz, .csv, .mcap, .db3, "
+                ".bag and the folder of a rosbag2"
+            )
         if isinstance(found, Recording):
             if unit not in (None, "m") or up not in (None, "z"):
                 raise PalpateError("the file says its units and axes itself: leave unit and up out")
             recording = found
         else:
             recording = _from_tables(found, str(path), rate, unit, up)
+            if any(inputs):
+                recording = _with_inputs(recording, inputs, unit or "m", up or "z")
         _check_rate(recording, rate)
     except PalpateError as error:
         raise type(error)(f"{path}: {error}") from error
@@ -265,15 +284,38 @@ def _markers(name: str, table: MarkerTable, rate: float | None, unit: str, up: s
     if never := [str(i) for i in np.flatnonzero(~seen.any(axis=0))]:
         notes.append(f"never seen: marker {', '.join(never)}")
     time = np.arange(len(positions)) / (rate or 1.0) if table.time is None else table.time
-    order, signs = _Z_UP[up]
-    # In float64 and rounded once; -0.0 is not worth keeping.
-    metres = positions[kept][..., order] * np.array(signs, np.float64) * _METRES[unit] + 0.0
+    metres = _in_metres(positions[kept], unit, up)
     if positions.dtype.kind == "f" and positions.dtype.itemsize <= 4:
         metres = metres.astype(np.float32)
     try:
         return Channel("markers", Role.OBSERVATION, time[kept], metres, "m", notes=tuple(notes))
     except PalpateError as error:
         raise PalpateError(f"trial '{name}': {error}") from error
+
+
+def _in_metres(values: np.ndarray, unit: str, up: str) -> np.ndarray:
+    """Positions or velocities (..., 3) in metres and z up, float64."""
+    order, signs = _Z_UP[up]
+    # In float64 and rounded once; -0.0 is not worth keeping.
+    return values[..., order] * np.array(signs, np.float64) * _METRES[unit] + 0.0
+
+
+def _with_inputs(
+    recording: Recording, inputs: list[tuple[InputTable, ...]], unit: str, up: str
+) -> Recording:
+    """The recording with what drove each of its trials, in metres and z up."""
+    trials = []
+    for trial, tables in zip(recording.trials, inputs, strict=True):
+        channels = dict(trial.channels)
+        for table in tables:
+            values = _in_metres(table.values, unit, up)
+            si = "m/s" if table.role is Role.COMMAND else "m"
+            try:
+                channels[table.name] = Channel(table.name, table.role, table.time, values, si)
+            except PalpateError as error:
+                raise PalpateError(f"trial '{trial.name}': {error}") from error
+        trials.append(replace(trial, channels=channels))
+    return replace(recording, trials=tuple(trials))
 
 
 def _check_length(trials: tuple[Trial, ...], unit: str) -> None:

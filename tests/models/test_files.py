@@ -116,8 +116,10 @@ def test_other_json_is_no_model(file, text):
 @pytest.mark.parametrize(
     ("place", "to", "text"),
     [
-        (("version",), 2, "FILE has version 2; this palpate reads version 1"),
-        (("version",), REMOVED, "FILE has version None; this palpate reads version 1"),
+        (("version",), 3, "FILE has version 3; this palpate reads versions 1 and 2"),
+        (("version",), [1], "FILE has version [1]; this palpate reads versions 1 and 2"),
+        (("version",), True, "FILE has version True; this palpate reads versions 1 and 2"),
+        (("version",), REMOVED, "FILE has version None; this palpate reads versions 1 and 2"),
         (("model",), "string", "FILE holds the unknown model 'string'; there are: rope"),
         (("model",), ["rope"], "FILE holds the unknown model '['rope']'; there are: rope"),
         (("model",), REMOVED, "FILE holds the unknown model 'None'; there are: rope"),

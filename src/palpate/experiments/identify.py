@@ -5,6 +5,7 @@ Nothing here knows what was recorded: `options.prepare` and `options.start` do.
 
 import dataclasses
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,12 @@ from palpate.experiments.options import Identify
 from palpate.identification.gradient import Settings, check_shapes, identify
 from palpate.identification.least_squares import Intervals, intervals
 from palpate.identification.prediction import PredictionError, prediction_error
+from palpate.identification.residual import (
+    Correction,
+    ResidualSettings,
+    check_correctable,
+    fit_residual,
+)
 from palpate.models.files import save_model
 from palpate.models.model import Model
 from palpate.parameters import (
@@ -35,6 +42,7 @@ from palpate.result import Figure, Result, read_result
 from palpate.runs import RESULT, Run
 
 HELD_OUT = 0.25  # of the trials, where no recording for validation is given
+RESIDUAL = "residual"  # the option, the folder of its run, and what the result says of it
 UNITS = {"m": (100.0, "cm")}  # a person reads these errors in another unit
 
 
@@ -51,13 +59,24 @@ class Data:
 
 @dataclasses.dataclass(frozen=True)
 class Identified:
-    """A fitted model, its intervals, and its errors beside those of the model it started from."""
+    """A fitted model, its intervals, and its errors beside those of the model it started from.
+
+    Where a correction was asked for, `physics` is the error without it; where it was kept, `fit`
+    and `validation` are with it.
+    """
 
     model: Model
     intervals: Intervals
     fit: PredictionError
     validation: PredictionError
     start: PredictionError
+    correction: Correction | None = None
+    physics: PredictionError | None = None
+
+    @property
+    def delivered(self) -> Model:
+        """What is handed over: the model, corrected where that was kept."""
+        return self.model if self.correction is None else self.correction.model
 
 
 def run(options: Identify) -> Path:
@@ -72,15 +91,22 @@ def run(options: Identify) -> Path:
     )
     check_shapes(start, data.fitted_aligned)
     check_shapes(start, data.validation_aligned)
+    if options.residual:  # now, and not after the physics was fitted
+        check_correctable(start, data.fitted_aligned)
     name = f"identify-{options.family}"
     with folders.open_run(options, name, _configuration(options, settings), folders.MODEL) as run:
         if not run.finished:
-            identified = fit(start, data, settings, run)
-            _write(run, name, options, data, identified)
+            identified, earlier = fit(start, data, settings, run), 0.0
+            if options.residual:
+                identified, earlier = _with_correction(identified, data, options, run)
+            _write(run, name, options, data, identified, run.elapsed + earlier)
         result = read_result(run.path / RESULT)
         _print(result)
         title = f"What was found out about the {options.family}"
-        folders.hand_over(options, run, title, folders.MODEL, result.warnings)
+        notes = list(result.warnings)
+        if RESIDUAL in result.settings:
+            notes.append(_told_of(result.settings[RESIDUAL]))
+        folders.hand_over(options, run, title, folders.MODEL, notes)
         return run.path
 
 
@@ -90,7 +116,7 @@ def read(options: Identify) -> Data:
     What is scored is scored as it was recorded: only what is fitted is repaired.
     """
     if not options.recordings:
-        raise PalpateError("no recording is named: expected at least one .npz or .csv file")
+        raise PalpateError("no recording is named: expected at least one file or log")
     raw = _read(options.recordings, options)
     if options.validate:
         fitted, validation = raw, _read(options.validate, options)
@@ -152,6 +178,30 @@ def fit(start: Model, data: Data, settings: Settings, run: Run | None = None) ->
     )
 
 
+def _with_correction(
+    identified: Identified, data: Data, options: Identify, run: Run
+) -> tuple[Identified, float]:
+    """With a network on top of the physics where that helps; the recording to score on is not seen.
+
+    And the seconds that earlier processes spent on it: it is a run of its own, below this one's.
+    """
+    settings = ResidualSettings(seed=options.seed)
+    configuration = {**run.configuration, RESIDUAL: dataclasses.asdict(settings)}
+    began = time.monotonic()
+    with Run.open(run.path / RESIDUAL, configuration, fresh=options.fresh) as own:
+        correction = fit_residual(identified.model, data.fitted_aligned, settings, own)
+        earlier = max(0.0, own.elapsed - (time.monotonic() - began))
+        if not own.finished:
+            own.finish({"kept": correction.kept, "reason": correction.reason})
+    found = dataclasses.replace(identified, correction=correction, physics=identified.validation)
+    if not correction.kept:
+        return found, earlier
+    fitted = prediction_error(correction.model, data.fitted_aligned)
+    held_out = data.validation is not None
+    scored = prediction_error(correction.model, data.validation_aligned) if held_out else fitted
+    return dataclasses.replace(found, fit=fitted, validation=scored), earlier
+
+
 def evidence(identified: Identified, unit: str) -> dict[str, np.ndarray]:
     """The errors over the horizon, and for a chain of points the median validation trial.
 
@@ -163,6 +213,8 @@ def evidence(identified: Identified, unit: str) -> dict[str, np.ndarray]:
         "horizon.identified": error.rmse,
         "horizon.start model": identified.start.rmse,
     }
+    if identified.physics is not None and identified.physics is not error:
+        arrays["horizon.physics alone"] = identified.physics.rmse
     if is_chain(error, unit):
         low, high = quantiles(_root_mean_square(chain_error(error)), (0.1, 0.9))
         arrays |= {"horizon.identified.low": low, "horizon.identified.high": high}
@@ -213,7 +265,13 @@ def _listed(value: Any) -> Any:
 def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
     return join(
         [
-            read_recording(path, rate=options.rate, unit=options.unit, up=options.up)
+            read_recording(
+                path,
+                rate=options.rate,
+                unit=options.unit,
+                up=options.up,
+                topics=options.topics or (),
+            )
             for path in paths
         ]
     )
@@ -251,13 +309,15 @@ def _configuration(options: Identify, settings: Settings) -> dict[str, Any]:
     }
 
 
-def _write(run: Run, name: str, options: Identify, data: Data, identified: Identified) -> None:
+def _write(
+    run: Run, name: str, options: Identify, data: Data, identified: Identified, wall_time: float
+) -> None:
     """The model, evidence and result into the run's folder; the result last."""
-    figures = _figures(identified, data, run.elapsed)
+    figures = _figures(identified, data, wall_time)
     parameters = rows(identified)
     save_model(
         run.path / folders.MODEL,
-        identified.model,
+        identified.delivered,
         {
             "recordings": dict(data.fitted.provenance),
             "figures": {figure.name: figure.value for figure in figures},
@@ -278,7 +338,8 @@ def _write(run: Run, name: str, options: Identify, data: Data, identified: Ident
             "scored_trials": len(scored.length),
             "scored_duration_s": float(np.median(scored.length) - 1) * scored.period,
             "end_s": float(error.horizon[error.last_seen]),
-        },
+        }
+        | _correction_settings(identified.correction, data),
         seeds=[options.seed],
         split={
             "fitted": [trial.name for trial in data.fitted.trials],
@@ -286,11 +347,34 @@ def _write(run: Run, name: str, options: Identify, data: Data, identified: Ident
             if data.validation
             else "none: the only trial was fitted, and the errors are those on it",
         },
-        wall_time_s=run.elapsed,
+        wall_time_s=wall_time,
         parameters=parameters,
         warnings=list(identified.intervals.warnings),
     )
     run.finish(result.to_dict())
+
+
+def _correction_settings(correction: Correction | None, data: Data) -> dict[str, Any]:
+    """What became of the correction, where one was asked for."""
+    if correction is None:
+        return {}
+    scale, _ = UNITS.get(data.unit, (1.0, data.unit))
+    told = {
+        "kept": correction.kept,
+        "reason": correction.reason,
+        "size": correction.size,
+        "held_out": [data.fitted.trials[index].name for index in correction.held_out],
+        "held_out_l1": [
+            scale * error.mean_absolute for error in (correction.physics, correction.corrected)
+        ],
+    }
+    return {RESIDUAL: told}
+
+
+def _told_of(correction: dict[str, Any]) -> str:
+    """The sentence for a person."""
+    size = f"; it is {correction['size']:.1%} of what the physics changes in a control period"
+    return f"correction by a network {correction['reason']}{size if correction['kept'] else ''}"
 
 
 def _figures(identified: Identified, data: Data, wall_time: float) -> list[Figure]:
@@ -310,6 +394,12 @@ def _figures(identified: Identified, data: Data, wall_time: float) -> list[Figur
         figure("l1_fitted_trials", identified.fit.mean_absolute),
         Figure("wall_time_s", wall_time, "s"),
     ]
+    if identified.physics is not None and identified.correction is not None:
+        alone = identified.physics.mean_absolute
+        ratio = _known(found.mean_absolute / alone)
+        figures.append(figure("l1_physics", alone))
+        figures.append(Figure("l1_ratio_to_physics", ratio, ""))
+        figures.append(Figure("correction_size", _known(identified.correction.size), ""))
     if is_chain(found, data.unit):
         (tip,) = _root_mean_square(chain_error(found)[..., -1].reshape(1, -1))
         figures.append(Figure("tip_rmse_m", _known(float(tip)), "m"))
@@ -348,6 +438,8 @@ def _print(result: Result) -> None:
         f"{count} {'trial' if count == 1 else 'trials'} of "
         f"{round(settings['scored_duration_s'], 1):g} s ({on})"
     )
+    if RESIDUAL in settings:
+        print(_told_of(settings[RESIDUAL]))
 
 
 def _interval(row: dict[str, Any]) -> str:

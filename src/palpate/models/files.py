@@ -5,38 +5,45 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.models.model import Model
+from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.models.rope import Rope
 from palpate.parameters import LogNormal, describe, parameters_of
 from palpate.storage import read_json, write_json
 
 MODELS: dict[str, type[Model]] = {"rope": Rope}
 _FORMAT = "palpate.model"
-_VERSION = 1
+_VERSIONS = {1: False, 2: True}  # whether it has a correction, which version 1 had no place for
 
 
 def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None = None) -> None:
     """Write a model as JSON; `about` is what it was made from (recordings, errors, intervals).
 
+    Of a `Residual`, the physics as any other, and the arrays of its network beside the parameters.
     What this instance declares differently (fixed, shared, other priors) is not kept: it belongs
     to the identification that used it. Raises `PalpateError` for a model that is not registered.
     """
-    names = [name for name, kind in MODELS.items() if type(model) is kind]
+    network = model.network if isinstance(model, Residual) else None
+    physics = model.physics if isinstance(model, Residual) else model
+    names = [name for name, kind in MODELS.items() if type(physics) is kind]
     if not names:
         raise PalpateError(
-            f"a model of type {type(model).__name__} cannot be saved; known: {', '.join(MODELS)}"
+            f"a model of type {type(physics).__name__} cannot be saved; known: {', '.join(MODELS)}"
         )
     write_json(
         path,
         {
             "format": _FORMAT,
-            "version": _VERSION,
+            "version": 1 if network is None else 2,
             "model": names[0],
-            "structure": {name: getattr(model, name) for name in _structure(type(model))},
-            "parameters": describe(model),
+            "structure": {name: getattr(physics, name) for name in _structure(type(physics))},
+            "parameters": describe(physics),
+            **({} if network is None else {"correction": _arrays(network)}),
             "about": dict(about or {}),
         },
     )
@@ -52,9 +59,11 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
         raise PalpateError(
             f"{path} is not a model: expected a JSON file written by `palpate identify`"
         )
-    if content.get("version") != _VERSION:
+    version = content.get("version")
+    if type(version) is not int or version not in _VERSIONS:
         raise PalpateError(
-            f"{path} has version {content.get('version')}; this palpate reads version {_VERSION}"
+            f"{path} has version {version}; this palpate reads versions "
+            + " and ".join(map(str, _VERSIONS))
         )
     kind = MODELS.get(str(content.get("model")))
     if kind is None:
@@ -86,8 +95,51 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
         if isinstance(declared[name].prior, LogNormal) and np.any(value < 0):
             raise PalpateError(f"'{name}' in {path} must not be negative, got {np.min(value):g}")
     try:
-        return kind(**values, **structure), about
+        model = kind(**values, **structure)
     except (TypeError, IndexError) as error:
+        raise PalpateError(f"{path} is damaged: {error}") from error
+    if _VERSIONS[version]:
+        model = _corrected(path, model, content.get("correction"))
+    return model, about
+
+
+def _arrays(network: SiteNetwork) -> dict[str, Any]:
+    return {field.name: getattr(network, field.name) for field in dataclasses.fields(network)}
+
+
+def _corrected(path: str | Path, physics: Model, content: Any) -> Residual:
+    """The physics with the network of a file on top of it, every array of which is checked."""
+    if not isinstance(content, dict):
+        raise PalpateError(f"{path} is damaged: its correction is missing")
+    _check_names(path, "correction", content, {f.name for f in dataclasses.fields(SiteNetwork)})
+    arrays: dict[str, Any] = {}
+    for name, value in content.items():
+        where = f"correction.{name}"
+        if name in ("weights", "biases"):
+            if not isinstance(value, list):
+                raise PalpateError(f"'{where}' in {path} is no list of layers: {value!r}")
+            layers = (_numbers(path, f"{where}[{i}]", layer) for i, layer in enumerate(value))
+            arrays[name] = tuple(jnp.asarray(layer, jnp.float32) for layer in layers)
+        else:
+            arrays[name] = jnp.asarray(_numbers(path, where, value), jnp.float32)
+    model = correctable(physics)
+    seen = jax.eval_shape(
+        lambda: model.residual_features(
+            model.initial_state(jnp.zeros((1, *model.observation_shape))),
+            jnp.zeros(model.action_shape),
+        )
+    )
+    if arrays["mean"].shape != seen.shape:
+        raise PalpateError(
+            f"'correction.mean' in {path} must have the shape {seen.shape}, "
+            f"got {arrays['mean'].shape}"
+        )
+    for name in ("deviation", "bound"):
+        if not np.all(arrays[name] > 0 if name == "deviation" else arrays[name] >= 0):
+            raise PalpateError(f"'correction.{name}' in {path} must be positive")
+    try:
+        return Residual(physics=physics, network=SiteNetwork(**arrays))
+    except (PalpateError, IndexError) as error:
         raise PalpateError(f"{path} is damaged: {error}") from error
 
 

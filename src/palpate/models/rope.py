@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
-from palpate.models import rope_kernel, rope_stability
+from palpate.models import rope_correction, rope_kernel, rope_stability
 from palpate.models.model import Model
 from palpate.parameters import LogNormal, Normal, Parameter, parameter, parameters_of
 
@@ -376,6 +376,32 @@ class Rope(Model):
             jax.tree.map(block, (motion, own)),
         )
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], result)
+
+    @property
+    def correction_shape(self) -> tuple[int, int]:
+        """(nodes, 3): see `models.residual.Correctable`."""
+        return self.nodes, 3
+
+    def residual_features(
+        self, state: RopeState, action: Float[Array, "*batch driven 3"]
+    ) -> Float[Array, "*batch nodes features"]:
+        """What a correction of each node may depend on: see `rope_correction.features`."""
+        state, increment = self._drive(state, action)
+        return rope_correction.features(self, state, state.velocity + self.substeps * increment)
+
+    def corrected(self, state: RopeState, correction: Float[Array, "*batch nodes 3"]) -> RopeState:
+        """The state with velocities (m/s, in the rope's own frame) added to its free nodes."""
+        frame = rope_correction.axes(self, state.position)
+        added = self.free_nodes()[:, None] * rope_correction.turned_out(correction, frame)
+        return RopeState(state.position, state.velocity + added)
+
+    def correction_between(
+        self, state: RopeState, following: RopeState
+    ) -> Float[Array, "*batch nodes 3"]:
+        """Change of the free nodes' velocities (m/s), in the rope's own frame at `state`."""
+        frame = rope_correction.axes(self, state.position)
+        change = self.free_nodes()[:, None] * (following.velocity - state.velocity)
+        return rope_correction.turned_in(change, frame)
 
     def stability_load(self) -> Float[Array, "*batch nodes"]:
         """How much of the explicit stability limit each node uses: see `rope_stability`."""

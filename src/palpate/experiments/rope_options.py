@@ -202,17 +202,7 @@ class EvaluateRopeStabilization(Evaluate):
 
     def check(self, policy: CommandPolicy) -> None:
         """The simulated rope takes a command every so often, and there has to be one."""
-        from palpate.worlds.rope_configuration import RopeConfiguration
-
-        if self.ropes < 1:
-            raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
-        period = RopeConfiguration().control_period
-        if not math.isclose(policy.period, period, rel_tol=1e-4):
-            raise PalpateError(
-                f"the policy decides every {policy.period:.4g} s and the simulated rope takes a "
-                f"command every {period:.4g} s: train through a model identified at "
-                f"{1 / period:.4g} Hz, the rate of `palpate record rope`"
-            )
+        _check_simulated(policy, self.ropes)
 
     def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
         """See `rope_evaluation.evaluate`."""
@@ -253,5 +243,105 @@ class EvaluateRopeStabilization(Evaluate):
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainRopeTracking(Train):
+    """Train a controller that leads the tip of a hanging rope along a path by moving its gripper.
+
+    It is trained on random smooth paths and follows any.
+
+    1. After `palpate identify rope R.npz`:     palpate train rope-tracking
+                                                    --model runs/identify-rope-001
+    """
+
+    task: ClassVar[str] = "rope-tracking"
+    action: ClassVar[str] = "gripper velocity, m/s"
+
+    observation_noise: float = NOISE
+    """Standard deviation of a marker's coordinate as the policy will see it, m."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRopeTracking(Evaluate):
+    """Try a controller on paths and in MuJoCo ropes that it was not trained for.
+
+    Beside it, in the same trials: a gripper held still, one that moves as the path does, and one
+    that moves as would suit a limp chain.
+
+    1. After `palpate train`:                   palpate evaluate rope-tracking
+                                                    --policy runs/train-rope-tracking-001
+    2. Along a path of your own (time,x,y,z):   palpate evaluate rope-tracking
+                                                    --policy P --paths mine.csv
+    """
+
+    task: ClassVar[str] = "rope-tracking"
+
+    ropes: int = 5
+    """Drawn around the rope that `palpate record` has by default; each on every path."""
+    paths: Annotated[tuple[str, ...], arg(metavar="NAME|FILE.csv ...")] = (
+        "lemniscate",
+        "egg",
+        "sine",
+    )
+    """Of these three, of random size, speed and direction, or from files, as they stand there."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+    def check(self, policy: CommandPolicy) -> None:
+        """The simulated rope takes a command every so often, and there has to be one."""
+        _check_simulated(policy, self.ropes)
+
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """See `rope_tracking_trials.follow`."""
+        from palpate.experiments import rope_tracking_trials as tracking
+        from palpate.experiments.rope_followers import LearnedFollower, blind_followers
+        from palpate.experiments.rope_recording import constants
+        from palpate.tasks import RopeTracking
+        from palpate.worlds.rope_configuration import RopeConfiguration
+
+        base, task = RopeConfiguration(), RopeTracking()
+        trials = tracking.path_trials(base, self.ropes, self.seed, self.paths)
+        followers = {"controlled": lambda paths: LearnedFollower(policy, task, paths)}
+        followed = tracking.follow(followers | blind_followers(base), trials, run)
+        tracking.write_path_evidence(run, trials, followed, "controlled")
+        figures = []
+        for name, whole in followed.items():
+            suffix = "" if name == "controlled" else f".{name.replace(' ', '_')}"
+            figures += tracking.figures(tracking.summarise(trials, whole), suffix)
+        return Evaluation(
+            figures=figures,
+            table=tracking.table(trials, followed),
+            settings={"trials": len(trials), **constants(base)},
+            split={"evaluated": f"{self.ropes} sampled ropes, seed {self.seed}"},
+        )
+
+
+def _check_simulated(policy: CommandPolicy, ropes: int) -> None:
+    """Raise `PalpateError` without a rope, or where one takes its commands at another rate."""
+    from palpate.worlds.rope_configuration import RopeConfiguration
+
+    if ropes < 1:
+        raise PalpateError(f"an evaluation has at least one rope, not {ropes}")
+    period = RopeConfiguration().control_period
+    if not math.isclose(policy.period, period, rel_tol=1e-4):
+        raise PalpateError(
+            f"the policy decides every {policy.period:.4g} s and the simulated rope takes a "
+            f"command every {period:.4g} s: train through a model identified at "
+            f"{1 / period:.4g} Hz, the rate of `palpate record rope`"
+        )
+
+
 def _driven_by_velocity(rope: Rope) -> Rope:
+    from palpate.models.rope import Rope as Physics
+
+    if not isinstance(rope, Physics):
+        raise PalpateError(
+            "a policy is trained and tried through the physics of a rope: expected a model "
+            "identified without --residual"
+        )
     return dataclasses.replace(rope, drive="velocity")

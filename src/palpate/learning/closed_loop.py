@@ -45,7 +45,8 @@ def simulate(
         seen = state
         if window is not None:
             window, seen = perceive(window, state, for_noise)
-        memory, action = policy(memory, task.features(seen, start.goal), start.goal, for_policy)
+        goal = task.goal_at(start.goal, index)
+        memory, action = policy(memory, task.features(seen, goal), goal, for_policy)
         state = models.step(state, action)
         return (state, memory, window), (state, action)
 

@@ -2,10 +2,11 @@
 
 from palpate.errors import PalpateError
 from palpate.tasks.rope_stabilization import RopeStabilization as RopeStabilization
+from palpate.tasks.rope_tracking import RopeTracking as RopeTracking
 from palpate.tasks.task import Start as Start
 from palpate.tasks.task import Task as Task
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (RopeStabilization,)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (RopeStabilization, RopeTracking)}
 
 
 def task_named(name: str) -> type[Task]:

@@ -51,6 +51,13 @@ class Task(eqx.Module):
         """The starts as the perturbed `models` (one for each, batch axis first) can have them."""
         return start
 
+    def goal_at(self, goal: Any, step: Array) -> Any:
+        """What is asked for `step` control periods after a start with this `goal`.
+
+        In the same form, so that `features` takes either. A goal does not move by default.
+        """
+        return goal
+
     @abstractmethod
     def features(self, state: Any, goal: Any) -> Float[Array, "*batch features"]:
         """What a policy sees of a state and of what is asked for."""

@@ -74,9 +74,20 @@ class TrainingState(eqx.Module):
 
 
 def train(
-    task: Task, model: Model, training: Training, seed: int, run: Run | None = None
+    task: Task,
+    model: Model,
+    training: Training,
+    seed: int,
+    run: Run | None = None,
+    *,
+    policy: CommandPolicy | None = None,
+    pool: Start | None = None,
 ) -> CommandPolicy:
     """A policy for the task, trained through the model.
+
+    With a `policy` training goes on from it: its network, normalisation and limits stay, and
+    `width` and `depth` do not count. With a `pool` episodes begin there, each start as likely as
+    any other, and `starts` does not count.
 
     With a `run`, every iteration's metrics are logged ("loss", "gradient_norm", "horizon" in
     control steps, "amplitude" of the perturbations, "learning_rate") and checkpoints are written;
@@ -87,24 +98,27 @@ def train(
     """
     key = jax.random.key(seed)
     for_starts, for_policy, for_updates = jax.random.split(key, 3)
-    pool = jax.jit(task.starts, static_argnums=2)(model, for_starts, training.starts)
-    policy = CommandPolicy.create(
-        for_policy,
-        task.features(pool.state, pool.goal),
-        model.action_shape,
-        period=model.control_period,
-        limit=task.action_limit,
-        rate_limit=task.action_rate_limit,
-        width=training.width,
-        depth=training.depth,
-    )
+    starts = pool
+    if starts is None:
+        starts = jax.jit(task.starts, static_argnums=2)(model, for_starts, training.starts)
+    if policy is None:
+        policy = CommandPolicy.create(
+            for_policy,
+            task.features(starts.state, starts.goal),
+            model.action_shape,
+            period=model.control_period,
+            limit=task.action_limit,
+            rate_limit=task.action_rate_limit,
+            width=training.width,
+            depth=training.depth,
+        )
     optimiser = _optimiser(training)
     arrays, static = eqx.partition(policy, eqx.is_array)
     state = TrainingState(arrays, optimiser.init(arrays), jnp.zeros((), int))
     done = 0
     if run is not None:
         done, state = run.restore(state) or (0, state)
-    state, pool, for_updates = everywhere((state, pool, for_updates))
+    state, starts, for_updates = everywhere((state, starts, for_updates))
     stages = _stages(task, model, training)
     bar = progress(range(done + 1, training.iterations + 1), "training", done=done)
     updates = {}
@@ -112,7 +126,9 @@ def train(
         for iteration in bar:
             horizon = stages[(iteration - 1) * len(stages) // training.iterations]
             if horizon not in updates:
-                updates[horizon] = _update(task, model, training, optimiser, pool, static, horizon)
+                updates[horizon] = _update(
+                    task, model, training, optimiser, starts, static, horizon
+                )
             state, metrics = updates[horizon](state, for_updates, jnp.asarray(iteration))
             metrics = {name: _finite(value) for name, value in metrics.items()}
             bar.show(loss=metrics["loss"], horizon=horizon)
@@ -191,13 +207,14 @@ def _update(
         return jax.value_and_grad(loss)(arrays)
 
     divided = data_parallel(value_and_gradient)
+    count = pool.command.shape[0]
 
     @jax.jit
     def update(state: TrainingState, key: PRNGKeyArray, iteration: Array):
         keys = jax.random.split(jax.random.fold_in(key, iteration), 4)
         amplitude = _amplitude(training, iteration)
         models = randomise(model, keys[0], amplitude, training.batch)
-        chosen = jax.random.randint(keys[1], (training.batch,), 0, training.starts)
+        chosen = jax.random.randint(keys[1], (training.batch,), 0, count)
         start = jax.tree.map(lambda leaf: leaf[chosen], pool)
         if training.augmentation:
             start = task.augment(start, keys[2])

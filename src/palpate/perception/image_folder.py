@@ -1,0 +1,157 @@
+"""Frames of a calibrated camera from a folder of pictures, in place of a simulated scene.
+
+The folder holds
+
+    camera.json     {"width", "height", "focal": [f_u, f_v], "centre": [c_u, c_v],
+                     "position": [x, y, z], "world_from_camera": [[...], [...], [...]]}
+    times.csv       one line for each frame: its file name and time in s, and the gripper's position
+                    then in m: name,time,x,y,z; the first line names the columns
+    colour/NAME     PNG or JPEG
+    depth/NAME.png  16 bits, millimetres along the optical axis, 0 where unknown; optional
+
+A video is first cut into such pictures; palpate reads no video files.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.storage import read_json, write_bytes, write_json, write_text
+from palpate.worlds.pinhole import Frame, Pinhole
+
+CAMERA, TIMES, COLOUR, DEPTH = "camera.json", "times.csv", "colour", "depth"
+COLUMNS = ["name", "time", "x", "y", "z"]
+
+
+def read_image_folder(path: str | Path) -> tuple[Pinhole, list[Frame], np.ndarray]:
+    """The camera, its frames in order of time, and the gripper at each: (frames, 3) in m.
+
+    Raises `PalpateError` that says which file is missing or not what it should be.
+    """
+    path = Path(path)
+    pinhole = _camera(path / CAMERA)
+    rows = _rows(path / TIMES)
+    has_depth = (path / DEPTH).is_dir()
+    frames = []
+    for name, moment, *_ in rows:
+        colour = _picture(path / COLOUR / name, "RGB")
+        if colour.shape[:2] != (pinhole.height, pinhole.width):
+            raise PalpateError(
+                f"{path / COLOUR / name} has {colour.shape[1]} x {colour.shape[0]} pixels and "
+                f"the camera {pinhole.width} x {pinhole.height}"
+            )
+        depth = None
+        if has_depth:
+            millimetres = _picture(path / DEPTH / f"{Path(name).stem}.png", "I;16")
+            depth = np.where(millimetres > 0, millimetres / 1e3, np.nan).astype(np.float32)
+        frames.append(Frame(moment, colour, depth))
+    return pinhole, frames, np.array([place for *_, place in rows])
+
+
+def write_image_folder(
+    path: str | Path, pinhole: Pinhole, frames: Sequence[Frame], gripper: np.ndarray
+) -> None:
+    """Write what `read_image_folder` reads; depth is rounded to whole millimetres, to 65 m."""
+    path = Path(path)
+    for folder in (COLOUR, DEPTH) if frames[0].depth is not None else (COLOUR,):
+        (path / folder).mkdir(parents=True, exist_ok=True)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for index, (frame, place) in enumerate(zip(frames, gripper, strict=True)):
+        name = f"{index:06d}.png"
+        write_bytes(path / COLOUR / name, _png(frame.colour))
+        if frame.depth is not None:
+            millimetres = np.nan_to_num(np.round(frame.depth * 1e3), nan=0.0, posinf=0.0)
+            depth = np.clip(millimetres, 0, 65535).astype(np.uint16)
+            write_bytes(path / DEPTH / name, _png(depth))
+        writer.writerow([name, f"{frame.time:.6f}", *(f"{part:.6f}" for part in place)])
+    write_text(path / TIMES, text.getvalue())
+    write_json(
+        path / CAMERA,
+        {
+            "width": pinhole.width,
+            "height": pinhole.height,
+            "focal": pinhole.focal,
+            "centre": pinhole.centre,
+            "position": pinhole.position,
+            "world_from_camera": pinhole.world_from_camera,
+        },
+    )
+
+
+def _camera(path: Path) -> Pinhole:
+    document = read_json(path)
+    names = ("width", "height", "focal", "centre", "position", "world_from_camera")
+    try:
+        width, height, focal, centre, position, rotation = (document[name] for name in names)
+        return Pinhole(
+            int(width),
+            int(height),
+            (float(focal[0]), float(focal[1])),
+            (float(centre[0]), float(centre[1])),
+            (float(position[0]), float(position[1]), float(position[2])),
+            tuple((float(row[0]), float(row[1]), float(row[2])) for row in rotation),
+        )
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise PalpateError(
+            f"{path} describes no camera: expected {', '.join(names)} ({error})"
+        ) from error
+
+
+def _rows(path: Path) -> list[tuple[str, float, tuple[float, ...]]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.reader(file))
+    except OSError as error:
+        raise PalpateError(f"cannot read {path}: {error.strerror or error}") from error
+    if not lines or lines[0] != COLUMNS:
+        raise PalpateError(f"{path} begins with the line {','.join(COLUMNS)}")
+    rows: list[tuple[str, float, tuple[float, ...]]] = []
+    for number, line in enumerate(lines[1:], 2):
+        try:
+            name, *numbers = line
+            moment, *place = map(float, numbers)
+            fits = len(place) == 3 and all(map(math.isfinite, (moment, *place)))
+        except ValueError:
+            fits = False
+        if not fits or Path(name).name != name:
+            raise PalpateError(
+                f"{path}, line {number}: expected a file name and four finite numbers, "
+                f"got {','.join(line)!r}"
+            )
+        if rows and moment <= rows[-1][1]:
+            raise PalpateError(f"{path}, line {number}: its time is not after the one before")
+        rows.append((name, moment, tuple(place)))
+    if not rows:
+        raise PalpateError(f"{path} names no frames")
+    return rows
+
+
+def _picture(path: Path, mode: str) -> np.ndarray:
+    from PIL import Image  # comes with matplotlib
+
+    try:
+        with Image.open(path, formats=("PNG", "JPEG")) as image:
+            if mode == "RGB":
+                return np.asarray(image.convert("RGB"))
+            if image.mode != mode:
+                raise PalpateError(f"{path} has the mode {image.mode}: expected 16 bits of depth")
+            return np.asarray(image)
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise PalpateError(f"{path} is no PNG or JPEG that can be read: {error}") from error
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()

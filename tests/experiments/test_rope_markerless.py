@@ -1,0 +1,83 @@
+"""What `reproduce rope-markerless` measures and keeps, at a size of seconds."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from palpate.experiments import rope_filming, rope_markerless
+from palpate.experiments.rope_filming import film
+from palpate.experiments.rope_trials import Trial
+from palpate.models.rope import Rope
+from palpate.runs import RESULT
+from palpate.worlds.camera import Sensor
+from palpate.worlds.rope import RopeConfiguration
+
+MODEL = Rope.uniform(nodes=11, substeps=4, bend_stiffness=2e-3, bend_damping=5e-4)
+
+
+def test_a_trial_is_kept_beside_what_it_is_compared_with():
+    trial = Trial(RopeConfiguration(), "straight", 3)
+    kept = film(
+        trial, model=MODEL, policy=None, steps=8, background="plain",
+        sensor=Sensor(sub_frames=2), shaken=False,
+    )  # fmt: skip
+    tracked, centre_line, alone, hanging = np.sqrt(kept.squared_error) * 100
+    assert tracked.max() < 2.0
+    assert np.isfinite(centre_line).tolist() == [step in (0, 6) for step in range(9)]
+    assert np.nanmax(centre_line) < 2.0
+    assert alone[0] == pytest.approx(tracked[0])
+    # The rope starts 60 degrees to the side: as far from hanging as its nodes from the gripper.
+    expected = 100 * np.sqrt(np.mean((np.arange(1, 11) / 10) ** 2))
+    assert hanging[0] == pytest.approx(expected, rel=1e-3)
+    miss = ((kept.tracked - kept.true)[:, 1:] ** 2).sum(-1).mean(-1)
+    assert kept.squared_error[0] == pytest.approx(miss, rel=1e-2, abs=1e-7)
+    assert np.nanmax(kept.hidden) == 0
+    assert kept.energy[0] > 0.2
+
+
+def test_a_simulation_that_diverges_leaves_nan(monkeypatch):
+    def diverge(*_):
+        raise rope_filming.DivergedError("too fast")
+
+    monkeypatch.setattr(rope_filming.FilmedRope, "step", diverge)
+    kept = film(
+        Trial(RopeConfiguration(), "straight", 3), model=MODEL, policy=None, steps=2,
+        background="plain", sensor=Sensor(sub_frames=1), shaken=False,
+    )  # fmt: skip
+    assert np.isfinite(kept.energy).tolist() == [True, False, False]
+
+
+def test_all_rows_are_filmed_once_and_resumed(tmp_path, monkeypatch):
+    chosen = ("released", "shaken", "stabilised", "stabilised, colour only")
+    monkeypatch.setattr(
+        rope_markerless, "ROWS", {name: rope_markerless.ROWS[name] for name in chosen}
+    )
+    draw = rope_markerless.evaluation_trials
+    monkeypatch.setattr(rope_markerless, "evaluation_trials", lambda *given: draw(*given)[:1])
+    monkeypatch.setattr(rope_markerless, "START_POSES", ("straight",))
+    monkeypatch.setattr(rope_markerless, "SWINGING", 0.08)
+    monkeypatch.setattr(rope_markerless, "TRIAL_PERIODS", 0.05)
+    monkeypatch.setattr(rope_markerless, "identified_rope", lambda *_: (MODEL, 1.0))
+    monkeypatch.setattr(rope_filming, "COMPILED", 1)
+    monkeypatch.setattr(rope_filming, "TIMED", 10)
+    result = rope_markerless.reproduce(tmp_path, quick=True)
+    found = {figure.name: figure for figure in result.figures}
+    assert found["node_rmse_cm"].bar == 1.0
+    assert found["node_rmse_cm"].value < 3.0
+    assert found["success_rate"].bar == 0.9
+    assert found["success_rate"].value == 0.0  # nothing comes to rest in a twentieth of a period
+    assert found["node_rmse_cm.hanging"].value > found["node_rmse_cm"].value
+    assert found["success_rate.held_still"].value == 0.0
+    assert found["frame_cpu_ms.p50"].value > 0
+    assert (tmp_path / "stabilised-colour-only" / RESULT).exists()
+    assert result.settings["weights"] == "shipped"
+
+    def never(*_, **__):
+        raise AssertionError("a finished row is filmed a second time")
+
+    monkeypatch.setattr(rope_markerless, "film", never)
+    again = rope_markerless.reproduce(tmp_path, quick=True)
+    same = dataclasses.asdict(found["node_rmse_cm"])
+    (figure,) = [figure for figure in again.figures if figure.name == "node_rmse_cm"]
+    assert dataclasses.asdict(figure) == same

@@ -1,0 +1,153 @@
+"""The rope's pixels and their order, on drawn curves and on pictures of the world."""
+
+import math
+
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.perception.centre_line import LinePoints, centre_line, line_points
+from palpate.perception.rope_segmentation import Appearance, Segmentation, segment
+from palpate.worlds.pinhole import Frame, Pinhole
+
+CAMERA = Pinhole.looking_at((0.0, 0.0, 0.0), (0.0, -2.5, 0.0), 320, 240, math.radians(60))
+ROPE = Appearance((0.85, 0.45, 0.15), 0.0)
+TOP = np.array([0.0, 0.0, 0.5])
+
+
+def curve(shape: str) -> np.ndarray:
+    """1 m of rope from TOP, (1001, 3)."""
+    s = np.linspace(0, 1, 1001)[:, None]
+    if shape == "straight":
+        return TOP + s * [0.5, 0.3, -math.sqrt(1 - 0.34)]
+    if shape == "arc":
+        return TOP + np.concatenate([1 - np.cos(2 * s), 0 * s, -np.sin(2 * s)], axis=1) / 2
+    # A loop that crosses itself: down, once around, and on down.
+    angle = 1.5 * np.pi * np.clip((s - 0.25) / 0.5, 0, 1)
+    heading = -0.5 * np.pi - 0.3 + angle
+    step = np.concatenate([np.cos(heading), 0 * s + 0.15, np.sin(heading)], axis=1) / 1000
+    step /= np.linalg.norm(step, axis=1, keepdims=True) * 1000
+    return TOP + np.cumsum(step, axis=0)
+
+
+def drawn(points: np.ndarray) -> Segmentation:
+    """Ideal pixels: the rope covers a pixel by how near it passes, 1.2 pixels wide."""
+    pixels, depth = CAMERA.project(points)
+    share, near = np.zeros((240, 320), np.float32), np.full((240, 320), np.nan, np.float32)
+    for (u, v), z in zip(pixels, depth, strict=True):
+        for row in range(int(v) - 1, int(v) + 3):
+            for column in range(int(u) - 1, int(u) + 3):
+                covered = np.clip(1.1 - math.hypot(u - column, v - row), 0, 1)
+                if covered > share[row, column]:
+                    share[row, column], near[row, column] = covered, z
+    return Segmentation(share, near)
+
+
+def miss(points: np.ndarray, missing: slice = slice(0, 0)) -> np.ndarray:
+    """Distances (11,) in m of the centre line's nodes from the true ones."""
+    kept = np.delete(points, missing, axis=0)
+    line = centre_line(line_points(drawn(kept)), CAMERA, TOP, 1.0)
+    nodes = line.nodes(np.full(10, 0.1))
+    return np.linalg.norm(nodes - points[::100], axis=-1)
+
+
+def test_ridges_lie_on_the_curve_to_a_fraction_of_a_pixel():
+    points = curve("arc")
+    found = line_points(drawn(points))
+    pixels, depth = CAMERA.project(points)
+    apart = np.linalg.norm(found.pixels[:, None] - pixels, axis=-1)
+    nearest = apart.argmin(1)
+    inner = (nearest > 20) & (nearest < 980)
+    assert apart.min(1)[inner].max() < 0.4
+    assert np.abs(found.depth - depth[nearest]).max() < 0.01
+    tangents = np.gradient(pixels, axis=0)[nearest]
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    assert np.abs((tangents * found.normals).sum(-1))[inner].max() < 0.25
+
+
+@pytest.mark.parametrize("shape", ["straight", "arc"])
+def test_nodes_of_a_whole_curve(shape):
+    assert miss(curve(shape)).max() < 0.01
+
+
+def test_a_gap_is_filled():
+    error = miss(curve("arc"), slice(400, 600))
+    assert error.max() < 0.02
+
+
+def test_a_hidden_tip_is_straight_on():
+    error = miss(curve("straight"), slice(800, 1001))
+    assert error.max() < 0.015
+
+
+def test_a_rope_that_crosses_itself_is_walked_around_its_loop():
+    points = curve("loop")
+    pixels, _ = CAMERA.project(points)
+    found = line_points(drawn(points))
+    line = centre_line(found, CAMERA, TOP, 1.0)
+    nearest = np.linalg.norm(found.pixels[line.order][:, None] - pixels, axis=-1)
+    # Near the crossing two places are as near; elsewhere the order is that along the rope.
+    two = (nearest < nearest.min(1, keepdims=True) + 1.5) & (nearest < 3)
+    place = nearest.argmin(1)
+    spread = np.array([np.flatnonzero(row).max() - np.flatnonzero(row).min() for row in two])
+    clear = spread < 60
+    assert clear.sum() > 60
+    assert (np.diff(place[clear]) > -10).all()
+    assert (spread > 300).any(), "the curve does cross itself"
+    assert miss(points).max() < 0.03
+
+
+def test_without_depth_the_rope_is_as_far_as_the_gripper():
+    found = line_points(drawn(curve("arc")))
+    flat = LinePoints(found.pixels, found.normals, np.full(len(found.depth), np.nan))
+    line = centre_line(flat, CAMERA, TOP, 1.0)
+    assert np.abs(line.points[:, 1]).max() < 1e-6
+    assert np.linalg.norm(line.nodes(np.full(10, 0.1)) - curve("arc")[::100], axis=-1).max() < 0.01
+
+
+def test_too_little_rope_is_refused():
+    few = LinePoints(np.zeros((3, 2)), np.ones((3, 2)), np.ones(3))
+    with pytest.raises(PalpateError, match="at least 4 points of the rope, 3 are seen"):
+        centre_line(few, CAMERA, TOP, 1.0)
+
+
+def painted(depth: bool = True) -> Frame:
+    """A grey wall 4 m away, a rope 2.5 m away, a thick and a thin thing of its colour behind it."""
+    colour = np.full((240, 320, 3), 150, np.uint8)
+    distance = np.full((240, 320), 4.0, np.float32)
+    orange = (173, 92, 31)
+    colour[60:200, 240:262] = orange
+    colour[60:200, 120] = orange
+    colour[70:180, 160] = orange
+    distance[70:180, 160] = 2.5
+    return Frame(0.0, colour, distance if depth else None)
+
+
+def test_only_what_is_thin_and_in_reach_is_rope():
+    found = segment(painted(), ROPE, CAMERA, TOP, 1.15)
+    rows, columns = np.nonzero(found.share)
+    assert set(columns) == {160}
+    assert rows.min() == 70
+    assert rows.max() == 179
+    assert found.share[100, 160] > 0.8
+    assert found.depth[100, 160] == pytest.approx(2.5)
+    assert np.isnan(found.depth[100, 120])
+
+
+def test_a_sensor_sees_the_rope_s_front():
+    thick = Appearance(ROPE.colour, 0.01)
+    found = segment(painted(), thick, CAMERA, TOP, 1.15)
+    assert found.depth[100, 160] == pytest.approx(2.5 + 0.25 * math.pi * 0.01)
+
+
+def test_without_depth_a_thin_thing_of_the_rope_s_colour_stays():
+    found = segment(painted(depth=False), ROPE, CAMERA, TOP, 1.15)
+    assert set(np.nonzero(found.share)[1]) == {120, 160}
+    assert found.depth is None
+
+
+def test_what_cannot_be_told_apart_is_refused():
+    with pytest.raises(PalpateError, match="is grey"):
+        Appearance((0.5, 0.5, 0.55), 0.005)
+    with pytest.raises(PalpateError, match="pictures of 320 x 240"):
+        segment(Frame(0.0, np.zeros((10, 10, 3), np.uint8), None), ROPE, CAMERA, TOP, 1.0)

@@ -111,7 +111,7 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         (
             "idenitfy rope R.npz",
             "unknown command 'idenitfy'; did you mean 'identify'? there are: demo, record, "
-            "identify, train, evaluate, report, reproduce",
+            "convert, identify, train, evaluate, export, serve, report, reproduce",
         ),
         ("identify rpoe R.npz", "unknown family 'rpoe'; did you mean 'rope'? there are: rope"),
         ("identify", "palpate identify needs a family first; there are: rope"),
@@ -119,12 +119,12 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         (
             "train rope-stabilisation",
             "unknown task 'rope-stabilisation'; did you mean 'rope-stabilization'? there are: "
-            "rope-stabilization",
+            "rope-stabilization, rope-tracking",
         ),
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: rope-model, "
-            "rope-stabilization, rope-ablation",
+            "rope-stabilization, rope-ablation, rope-tracking, rope-residual, rope-markerless",
         ),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),
         (
@@ -181,9 +181,13 @@ def test_words_that_do_not_fit(refused, words, sentence):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ("identify rope", "no recording is named: expected at least one .npz or .csv file"),
+        ("identify rope", "no recording is named: expected at least one file or log"),
         ("identify rope none.npz", "cannot read none.npz: No such file or directory"),
-        ("identify rope R.txt", "R.txt: unknown kind of recording '.txt': known are .npz, .csv"),
+        (
+            "identify rope R.txt",
+            "R.txt: unknown kind of recording '.txt': known are .npz, .csv, .mcap, .db3, .bag and "
+            "the folder of a rosbag2",
+        ),
         (
             "identify rope text.npz",
             "text.npz: the file is damaged or not NPZ (File is not a zip file)",

@@ -43,6 +43,11 @@ COMMANDS = {
         {"rope": "palpate.experiments.rope_options:RecordRope"},
         "family",
     ),
+    "convert": Command(
+        "turn a robot's log or any recording into another format",
+        "palpate.experiments.convert:run",
+        {"": "palpate.experiments.options:Convert"},
+    ),
     "identify": Command(
         "find an object's physical parameters from recordings of it",
         "palpate.experiments.identify:run",
@@ -52,14 +57,30 @@ COMMANDS = {
     "train": Command(
         "train a controller through an identified model",
         "palpate.experiments.train:run",
-        {"rope-stabilization": "palpate.experiments.rope_options:TrainRopeStabilization"},
+        {
+            "rope-stabilization": "palpate.experiments.rope_options:TrainRopeStabilization",
+            "rope-tracking": "palpate.experiments.rope_options:TrainRopeTracking",
+        },
         "task",
     ),
     "evaluate": Command(
         "try a controller in a world the model cannot see into",
         "palpate.experiments.evaluate:run",
-        {"rope-stabilization": "palpate.experiments.rope_options:EvaluateRopeStabilization"},
+        {
+            "rope-stabilization": "palpate.experiments.rope_options:EvaluateRopeStabilization",
+            "rope-tracking": "palpate.experiments.rope_options:EvaluateRopeTracking",
+        },
         "task",
+    ),
+    "export": Command(
+        "write a policy as ONNX, with a contract that says how to connect it",
+        "palpate.experiments.export:run",
+        {"": "palpate.experiments.options:Export"},
+    ),
+    "serve": Command(
+        "run a policy in real time, and brake when its eyes fail",
+        "palpate.experiments.serve:run",
+        {"": "palpate.experiments.options:Serve"},
     ),
     "report": Command(
         "write the page of one or several runs",
@@ -70,7 +91,14 @@ COMMANDS = {
         "repeat a headline experiment and hold its figures against their bars",
         "palpate.experiments.reproduce:run",
         dict.fromkeys(
-            ("rope-model", "rope-stabilization", "rope-ablation"),
+            (
+                "rope-model",
+                "rope-stabilization",
+                "rope-ablation",
+                "rope-tracking",
+                "rope-residual",
+                "rope-markerless",
+            ),
             "palpate.experiments.options:Reproduce",
         ),
         "experiment",

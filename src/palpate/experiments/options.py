@@ -62,21 +62,9 @@ class Record(Options, ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Identify(Options, ABC):
-    """Identification from recordings; each family says which channels, and from which model."""
+class Reading(Options):
+    """What a command has to be told about recordings that others have made."""
 
-    family: ClassVar[str]
-    observation: ClassVar[str]  # the channel that is predicted
-
-    recordings: Positional[
-        Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
-    ]
-    """What to fit: .npz of palpate, .npz with `positions`, or .csv of a motion-capture system."""
-    validate: Annotated[
-        tuple[Path, ...],
-        arg(metavar="FILE ...", help_behavior_hint="(default: a quarter of the trials)"),
-    ] = ()
-    """Recordings to score on and not to fit."""
     rate: Number = None
     """Hz, for files that carry no time."""
     unit: Annotated[
@@ -89,6 +77,30 @@ class Identify(Options, ABC):
         arg(metavar="{x,y,z}", help_behavior_hint="(default: what the file says, else z)"),
     ] = None
     """The axis that points up."""
+    topics: Annotated[
+        tuple[str, ...] | None,
+        arg(metavar="TOPIC ...", help_behavior_hint="(default: the only one with markers)"),
+    ] = None
+    """Of a robot's log: that of the markers, and those of the gripper's pose and velocity."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identify(Reading, ABC):
+    """Identification from recordings; each family says which channels, and from which model."""
+
+    family: ClassVar[str]
+    observation: ClassVar[str]  # the channel that is predicted
+
+    recordings: Positional[
+        Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
+    ]
+    """What to fit: .npz of palpate, .npz with `positions`, .csv of a motion-capture system, or a
+    robot's log: .mcap, .db3, .bag, or the folder of a rosbag2."""
+    validate: Annotated[
+        tuple[Path, ...],
+        arg(metavar="FILE ...", help_behavior_hint="(default: a quarter of the trials)"),
+    ] = ()
+    """Recordings to score on and not to fit."""
     free: Names = ()
     """Parameters to identify that otherwise would not be."""
     fixed: Names = ()
@@ -101,6 +113,8 @@ class Identify(Options, ABC):
         tuple[int, ...], arg(metavar="N ...", help_behavior_hint="(default: as many as needed)")
     ] = ()
     """At each of the growing horizons; fewer are faster and fit worse."""
+    residual: bool = False
+    """Fit a network to what the physics leaves over; kept if it helps on trials held out of it."""
 
     @abstractmethod
     def prepare(self, recording: Recording) -> Recording:
@@ -113,6 +127,30 @@ class Identify(Options, ABC):
     @abstractmethod
     def start(self, aligned: Aligned) -> Model:
         """The model an identification starts from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(Reading):
+    """Convert a recording: a robot's log into one of palpate's, any into what others can open.
+
+    What --out ends in says which: .npz is a recording of palpate, .rrd a file of the Rerun viewer.
+    With --lerobot it is the folder of a LeRobot dataset (v3.0).
+
+    1. A log into a recording:                  palpate convert R.mcap --out R.npz
+    2. To look at it in Rerun:                  palpate convert R.npz --out R.rrd
+    3. A dataset to learn from, at 50 Hz:       palpate convert R.npz --out R --lerobot --fps 50
+    """
+
+    out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(required)")] = None
+    """What to write."""
+    recording: Positional[Annotated[Path, arg(metavar="RECORDING", help_behavior_hint="")]]
+    """What `palpate identify` takes, too."""
+    lerobot: bool = False
+    """Write the folder of a LeRobot dataset."""
+    fps: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: the sensor's rate)")
+    ] = None
+    """Frames per second of a LeRobot dataset."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,3 +267,53 @@ class Reproduce(Options):
         Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: figures left out)")
     ] = None
     """With dlo1_train.npz and dlo1_eval.npz."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Options):
+    """Write a policy as ONNX, with a JSON contract beside it that says how to connect it.
+
+    Needs `pip install 'palpate[deploy]'`. The file is run by ONNX Runtime before it is handed over,
+    and gives the commands that the policy gives.
+
+    1. After `palpate train`:                   palpate export runs/train-rope-stabilization-001
+                                                    --onnx policy.onnx
+    """
+
+    policy: Positional[Annotated[Path, arg(metavar="POLICY", help_behavior_hint="")]]
+    """What `palpate train` wrote: its folder, or the policy file in it."""
+    onnx: Annotated[Path, arg(metavar="FILE")]
+    """Where to; the contract goes beside it, ending in .json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve(Options):
+    """Run a policy in real time: states in over Zenoh, commands out, until Ctrl-C.
+
+    Needs `pip install 'palpate[zenoh]'`. When a state is missing, late or impossible, the robot is
+    braked to rest, and moves again only after half a second of good states.
+
+    1. With a simulated robot, for a look:      palpate serve POLICY --simulate
+    2. With a robot's program that connects:    palpate serve POLICY --acceleration-limit 4
+    """
+
+    policy: Positional[Annotated[Path, arg(metavar="POLICY", help_behavior_hint="")]]
+    """What `palpate train` wrote: its folder, or the policy file in it."""
+    simulate: bool = False
+    """Start a simulated rope and robot, as a process of its own, and serve that."""
+    seconds: Annotated[
+        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: 10 simulated, else ever)")
+    ] = None
+    """How long."""
+    listen: str = "tcp/127.0.0.1:7447"
+    """Where the robot's program connects; whoever reaches it can move the robot."""
+    markers: Whole = None
+    """In each state, gripper and tip included."""
+    speed_limit: Annotated[
+        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: the policy's)")
+    ] = None
+    """Of the gripper, m/s."""
+    acceleration_limit: Annotated[
+        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: the policy's)")
+    ] = None
+    """Of the gripper, m/s^2; it brakes with this."""

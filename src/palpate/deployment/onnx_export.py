@@ -1,0 +1,139 @@
+"""A command policy as an ONNX graph.
+
+The graph is written with `onnx.helper`, node by node: a tanh network and two limits are about
+thirty nodes. A converter from JAX would pin a dozen packages for them and leave names and order to
+chance.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from palpate.deployment.extras import extra_module
+from palpate.networks import CommandPolicy
+from palpate.storage import write_bytes
+
+EXTRA = "deploy"
+_OPSET, _IR = 17, 8  # read by every ONNX Runtime from 1.12 (2022) on
+
+
+def onnx_model(policy: CommandPolicy) -> Any:
+    """The policy as an `onnx.ModelProto`: inputs `features`, `carry`; outputs `command`,
+    `carry_out`.
+
+    `features` are (batch, features) in the task's units; the others (batch, *action_shape) in the
+    action's. All are float32. The formula is that of `palpate.networks.CommandPolicy`.
+
+    Raises `PalpateError` without the extra `deploy`.
+    """
+    onnx = extra_module("onnx", EXTRA)
+    graph = _Graph(onnx)
+    shape = list(policy.action_shape)
+    centred = graph.add("Sub", "features", graph.constant(policy.mean))
+    seen = graph.add("Div", centred, graph.constant(policy.scale))
+    flat = graph.add("Flatten", "carry", axis=1)
+    previous = graph.add("Div", flat, graph.constant(policy.limit))
+    output = graph.add("Concat", seen, previous, axis=1)
+    for number, layer in enumerate(policy.network.layers):
+        if number:
+            output = graph.add("Tanh", output)
+        weight, bias = graph.constant(layer.weight), graph.constant(layer.bias)
+        output = graph.add("Gemm", output, weight, bias, transB=1)
+    output = graph.add("Reshape", output, graph.constant([-1, *shape], np.int64))
+
+    one, limit = graph.constant(1.0), graph.constant(policy.limit)
+    length = graph.add("Sqrt", graph.add("Add", graph.square(output), one))
+    direction = graph.add("Div", output, length)
+    if policy.rate_limit is None:
+        command = graph.add("Mul", direction, limit)
+    else:
+        change = graph.add("Mul", direction, graph.constant(policy.period * policy.rate_limit))
+        command = graph.add("Add", "carry", change)
+        square = graph.add("Max", graph.square(command), graph.constant(policy.limit**2))
+        share = graph.add("Div", limit, graph.add("Sqrt", square))
+        command = graph.add("Mul", command, share)
+    graph.add("Identity", command, output="command")
+    graph.add("Identity", command, output="carry_out")
+    inputs = {"features": policy.mean.shape, "carry": shape}
+    return graph.model(inputs, {"command": shape, "carry_out": shape})
+
+
+def write_onnx(path: str | Path, policy: CommandPolicy) -> None:
+    """Write `onnx_model(policy)` to a file.
+
+    Raises `PalpateError` without the extra `deploy`, and as `write_bytes`.
+    """
+    write_bytes(path, onnx_model(policy).SerializeToString(deterministic=True))
+
+
+def difference(path: str | Path, policy: CommandPolicy, steps: int, seed: int) -> float:
+    """The largest difference of any command between the file, run by ONNX Runtime, and the policy.
+
+    Over random features (mean and spread of what it was trained to see, and ten times that), each
+    fed with its own carry for `steps` calls. In the action's unit.
+
+    Raises `PalpateError` without the extra `deploy`.
+    """
+    runtime = extra_module("onnxruntime", EXTRA)
+    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    random, batch = np.random.default_rng(seed), 64
+    mean, scale = np.asarray(policy.mean), np.asarray(policy.scale)
+    spread = scale * np.where(np.arange(batch) < batch // 2, 1.0, 10.0)[:, None]
+    ours = theirs = np.zeros((batch, *policy.action_shape), np.float32)
+    worst, decide = 0.0, eqx.filter_jit(lambda policy, carry, seen: policy(carry, seen)[0])
+    for _ in range(steps):
+        features = (mean + spread * random.normal(size=spread.shape)).astype(np.float32)
+        ours = np.asarray(decide(policy, ours, features))
+        command, theirs = session.run(
+            ["command", "carry_out"], {"features": features, "carry": theirs}
+        )
+        worst = max(worst, float(np.abs(command - ours).max()))
+    return worst
+
+
+class _Graph:
+    """Nodes and constants in the order they were added, each result under a name of its own."""
+
+    def __init__(self, onnx: Any):
+        self._onnx = onnx
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+        self._sum_axis = self.constant([-1], np.int64)
+
+    def constant(self, value: Any, dtype: type = np.float32) -> str:
+        name = f"constant_{len(self._constants)}"
+        array = np.ascontiguousarray(value, dtype).reshape(np.shape(value))
+        self._constants.append(self._onnx.numpy_helper.from_array(array, name))
+        return name
+
+    def add(self, kind: str, *inputs: str, output: str = "", **attributes: Any) -> str:
+        output = output or f"{kind.lower()}_{len(self._nodes)}"
+        node = self._onnx.helper.make_node(kind, inputs, [output], **attributes)
+        self._nodes.append(node)
+        return output
+
+    def square(self, vector: str) -> str:
+        """The squared length along the last axis, which stays with size 1."""
+        return self.add("ReduceSum", self.add("Mul", vector, vector), self._sum_axis, keepdims=1)
+
+    def model(self, inputs: dict[str, Any], outputs: dict[str, Any]) -> Any:
+        helper = self._onnx.helper
+
+        def described(sizes: dict[str, Any]) -> list[Any]:
+            kind = self._onnx.TensorProto.FLOAT
+            return [
+                helper.make_tensor_value_info(name, kind, ["batch", *size])
+                for name, size in sizes.items()
+            ]
+
+        graph = helper.make_graph(
+            self._nodes, "policy", described(inputs), described(outputs), self._constants
+        )
+        opset = [helper.make_opsetid("", _OPSET)]
+        model = helper.make_model(
+            graph, opset_imports=opset, ir_version=_IR, producer_name="palpate"
+        )
+        self._onnx.checker.check_model(model, full_check=True)
+        return model

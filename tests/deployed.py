@@ -1,0 +1,152 @@
+"""What tests of the deployment share: a rope's policy, and a robot that can be made to fail."""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from palpate.deployment.intake import Intake
+from palpate.deployment.messages import StateMessage, encode_state
+from palpate.deployment.plausibility import ChainCheck
+from palpate.deployment.supervisor import Limits, Order, Supervisor
+from palpate.networks import CommandPolicy
+
+PERIOD = 0.01
+NODES, SPACING = 6, 0.1
+LIMITS = Limits(speed=1.5, acceleration=10.0, period=PERIOD)
+
+
+def manifest(nodes: int = NODES) -> dict:
+    """As `palpate train` writes it, shortened."""
+    return {
+        "task": "rope-stabilization",
+        "features": {
+            "node position relative to the gripper": f"({nodes - 1}, 3) m",
+            "node velocity": f"({nodes - 1}, 3) m/s",
+        },
+        "action": "gripper velocity, m/s",
+        "command": "palpate train rope-stabilization",
+        "seed": 0,
+        "model": [{"name": "rest_length", "value": [SPACING] * (nodes - 1), "unit": "m"}],
+    }
+
+
+@functools.cache
+def rope_policy(nodes: int = NODES, **changes) -> CommandPolicy:
+    """A policy that acts at random, and not a little."""
+    seen = jax.random.normal(jax.random.key(1), (32, 6 * (nodes - 1)))
+    policy = CommandPolicy.create(
+        jax.random.key(0),
+        0.3 * seen + 0.1,
+        (1, 3),
+        **{"period": PERIOD, "limit": 1.5, "rate_limit": 10.0, "width": 16} | changes,
+    )
+    return dataclasses.replace(policy, network=scaled(policy.network, 4.0))
+
+
+def scaled(network, factor: float):
+    """The network with all its weights multiplied."""
+    return jax.tree.map(lambda leaf: factor * leaf if eqx.is_array(leaf) else leaf, network)
+
+
+def shape(time: float, nodes: int = NODES) -> np.ndarray:
+    """A chain (nodes, 3) that swings by a few centimetres under a gripper at rest."""
+    along = SPACING * np.arange(nodes)
+    swing = 0.1 * along * np.sin(5 * time)
+    return np.stack([swing, 0 * along, 1.5 - along], axis=-1)
+
+
+def state(sequence: int, time: float, session: int = 7, markers=None, gripper=None) -> bytes:
+    """A message of that chain, unless it is told otherwise."""
+    markers = shape(time) if markers is None else markers
+    gripper = markers[0] if gripper is None else gripper
+    return encode_state(StateMessage(session, sequence, time, single(gripper), single(markers)))
+
+
+def single(values) -> np.ndarray:
+    """As a camera's driver gives it."""
+    return np.asarray(values, np.float32)
+
+
+class Pusher:
+    """A policy that always wants full speed ahead; remembers what it was shown."""
+
+    def __init__(self, wanted=(3.0, 0.0, 0.0)):
+        self.wanted = single(wanted)
+        self.seen: list[np.ndarray] = []
+        self.forgotten = 0
+
+    def forget(self) -> None:
+        self.forgotten += 1
+
+    def see(self, gripper: np.ndarray, markers: np.ndarray) -> None:
+        self.seen.append(markers)
+
+    def decide(self, command: np.ndarray) -> np.ndarray:
+        return self.wanted
+
+
+def supervisor(decision=None, limits: Limits = LIMITS, length: float = 0.5) -> Supervisor:
+    """One for that chain, or one of another length (m)."""
+    check = ChainCheck(np.full(NODES - 1, length / (NODES - 1)), limits.period)
+    return Supervisor(Intake(check, limits.period), decision or Pusher(), limits)
+
+
+class Bench:
+    """A supervisor, its time, and a robot that sends `shape` unless a test does otherwise.
+
+    Every order is kept; a tick comes 2 ms after a state does.
+    """
+
+    DELAY, OFFSET = 0.001, 100.0  # s; of messages, and between the clocks
+
+    def __init__(self, supervised: Supervisor):
+        self.supervised = supervised
+        self.step = 0
+        self.lag = 0.0  # s by which the ticks were held up for good
+        self.orders: list[Order] = []
+        self.times: list[float] = []
+
+    def message(self, **changes) -> tuple[float, bytes]:
+        """That of this step, as (arrival, bytes); `arrives` is a delay in s on top."""
+        time = self.step * PERIOD
+        arrives = changes.pop("arrives", 0.0)
+        given = {"sequence": self.step + 1, "time": time} | changes
+        return time + self.OFFSET + self.DELAY + arrives, state(**given)
+
+    def tick(self, *messages: tuple[float, bytes], after: float = 0.0) -> Order:
+        """One tick with these messages, held up by `after` s."""
+        self.lag += after
+        now = self.step * PERIOD + self.OFFSET + self.DELAY + 0.002 + self.lag
+        self.orders.append(self.supervised.tick(now, messages))
+        self.times.append(now)
+        self.step += 1
+        return self.orders[-1]
+
+    def good(self, count: int) -> Order:
+        """So many good states, one each tick."""
+        for _ in range(count):
+            order = self.tick(self.message())
+        return order
+
+    def silent(self, count: int) -> Order:
+        """So many ticks without a state."""
+        for _ in range(count):
+            order = self.tick()
+        return order
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """All orders, (ticks, 3) m/s."""
+        return np.array([order.velocity for order in self.orders])
+
+    def check_limits(self) -> None:
+        """No order, whatever happened, is faster or changes faster than is allowed."""
+        velocities = np.concatenate([np.zeros((1, 3)), self.velocities])
+        assert np.isfinite(velocities).all()
+        limits = LIMITS
+        assert np.linalg.norm(velocities, axis=1).max() <= limits.speed * (1 + 1e-6)
+        changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1)
+        assert changes.max() <= limits.change * (1 + 1e-5)

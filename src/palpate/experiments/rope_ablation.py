@@ -40,6 +40,7 @@ from palpate.tasks import RopeStabilization
 from palpate.tasks.rope_stabilization import STABILISED
 
 NAME = "rope-ablation"
+FIGURE = "ablation.png"
 FULL_TRAINING = "full"
 # What is left out, and the switch of `Training` that does it.
 LEFT_OUT = {
@@ -97,9 +98,10 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         evaluated = evaluate(controllers, trials, run)
         if not run.finished:
             write_trial_evidence(run, trials, evaluated, (FULL_TRAINING,))
-            draw(run.path / "ablation.png", trials, evaluated)
+            draw(run.path / FIGURE, trials, evaluated)
             finish(run, NAME, "evaluate", {})
         spent += wall_time(run)
+        print(f"figure: {run.path / FIGURE}")
     print("\n".join(table(trials, evaluated)))
     rows = []
     for name, episodes in evaluated.items():

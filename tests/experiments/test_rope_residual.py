@@ -25,7 +25,7 @@ def asked(monkeypatch):
             Figure("l1_ratio_to_physics", 0.8 if kept else 1.0, ""),
             Figure("correction_size", 0.1, ""),
         ]
-        told = {"residual": {"kept": kept, "reason": "kept" if kept else "dropped"}}
+        told = {"correction": {"kept": kept, "reason": "kept" if kept else "dropped"}}
         write_json(
             options.out / "result.json",
             Result("identify-rope", figures, told, [0], None, 60.0).to_dict(),

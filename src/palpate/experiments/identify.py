@@ -42,7 +42,8 @@ from palpate.result import Figure, Result, read_result
 from palpate.runs import RESULT, Run
 
 HELD_OUT = 0.25  # of the trials, where no recording for validation is given
-RESIDUAL = "residual"  # the option, the folder of its run, and what the result says of it
+RESIDUAL = "residual"  # the folder of its run
+CORRECTION = "correction"  # what the result's settings say of it
 UNITS = {"m": (100.0, "cm")}  # a person reads these errors in another unit
 
 
@@ -104,8 +105,8 @@ def run(options: Identify) -> Path:
         _print(result)
         title = f"What was found out about the {options.family}"
         notes = list(result.warnings)
-        if RESIDUAL in result.settings:
-            notes.append(_told_of(result.settings[RESIDUAL]))
+        if CORRECTION in result.settings:
+            notes.append(_told_of(result.settings[CORRECTION]))
         folders.hand_over(options, run, title, folders.MODEL, notes)
         return run.path
 
@@ -368,7 +369,7 @@ def _correction_settings(correction: Correction | None, data: Data) -> dict[str,
             scale * error.mean_absolute for error in (correction.physics, correction.corrected)
         ],
     }
-    return {RESIDUAL: told}
+    return {CORRECTION: told}
 
 
 def _told_of(correction: dict[str, Any]) -> str:
@@ -438,8 +439,8 @@ def _print(result: Result) -> None:
         f"{count} {'trial' if count == 1 else 'trials'} of "
         f"{round(settings['scored_duration_s'], 1):g} s ({on})"
     )
-    if RESIDUAL in settings:
-        print(_told_of(settings[RESIDUAL]))
+    if CORRECTION in settings:
+        print(_told_of(settings[CORRECTION]))
 
 
 def _interval(row: dict[str, Any]) -> str:

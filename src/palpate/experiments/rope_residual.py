@@ -4,7 +4,7 @@ Twice `palpate identify rope ... --residual`: on a rope simulated by the model i
 physics leaves nothing over and the correction has to drop itself, and with `mocap` on a real one.
 There the physics alone, in the same run, is the control; DEFORM's own gain is the rival.
 
-The constants below were written down before the first kept fit.
+How the network is fitted was chosen on trials held out of the real rope's training recording.
 """
 
 from pathlib import Path
@@ -78,7 +78,10 @@ def reproduce(
         {
             "quick": quick,
             "simulated": constants(),
-            **{f"{name}.residual": found.settings["residual"] for name, found in results.items()},
+            **{
+                f"{name}.residual": found.settings[identify.CORRECTION]
+                for name, found in results.items()
+            },
         },
         [seed],
         {name: found.split for name, found in results.items()},
@@ -131,7 +134,7 @@ def _identified(options: IdentifyRope) -> Result:
 def _figures(name: str, found: Result, headline: bool) -> list[Figure]:
     """What the correction did; of the real rope, the ratio that the bar is for."""
     values = {figure.name: figure.value for figure in found.figures}
-    ratio, kept = values["l1_ratio_to_physics"], bool(found.settings["residual"]["kept"])
+    ratio, kept = values["l1_ratio_to_physics"], bool(found.settings[identify.CORRECTION]["kept"])
     if headline:
         figures = [Figure("l1_ratio_to_physics", ratio, "", bar=0.90, rival=DEFORM)]
     else:

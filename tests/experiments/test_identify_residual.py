@@ -99,6 +99,13 @@ def test_what_became_of_the_correction_is_handed_over_and_told(recording, tmp_pa
     assert told["reason"] in capsys.readouterr().out
 
 
+def test_nothing_is_said_of_a_correction_that_was_not_asked_for(recording, tmp_path, capsys):
+    options = IdentifyCart(recordings=(recording,), iterations=(3, 3, 5), out=tmp_path / "run")
+    result = read_result(identify.run(options) / "result.json")
+    assert "correction" not in capsys.readouterr().out
+    assert "correction" not in result.settings
+
+
 def test_too_few_trials_are_refused_before_anything_is_fitted(recording, tmp_path):
     options = IdentifyCart(recordings=(recording,), residual=True, out=tmp_path / "run")
     with pytest.MonkeyPatch.context() as patch:

@@ -84,13 +84,13 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
     model, spent = identified_rope(out, size, seed)
     switches = {FULL_TRAINING: {}} | {name: {switch: False} for name, switch in LEFT_OUT.items()}
-    controllers, abouts = {}, {}
+    controllers, abouts, task = {}, {}, RopeStabilization()
     command = f"palpate reproduce {NAME} --seed {seed}{' --quick' if quick else ''}"
     for name, switch in switches.items():
         training = dataclasses.replace(size.training, **switch)
         path = out / f"train-{name.replace(' ', '-')}"
-        policy, abouts[name] = trained_policy(path, model, training, seed, command)
-        controllers[name] = LearnedController(policy, RopeStabilization())
+        policy, abouts[name] = trained_policy(path, task, model, training, seed, command)
+        controllers[name] = LearnedController(policy, task)
         spent += abouts[name]["wall_time_s"]
     trials = evaluation_trials(BASE, size.ropes, EVALUATION_SEEDS + seed)
     configuration = {"stage": "evaluate", "seed": seed, "trials": len(trials), "policies": abouts}

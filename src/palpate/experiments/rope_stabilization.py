@@ -50,6 +50,7 @@ from palpate.result import Figure, Result
 from palpate.runs import RESULT, Run
 from palpate.storage import read_json
 from palpate.tasks import RopeStabilization
+from palpate.tasks.task import Task
 from palpate.worlds.rope import START_POSES, RopeConfiguration
 
 BASE = RopeConfiguration()  # the rope that is recorded, and the middle of those evaluated
@@ -111,7 +112,9 @@ def reproduce(
         announce(NAME, size.minutes)
         model, spent = identified_rope(out, size, seed)
         command = f"palpate reproduce {NAME} --seed {seed}{' --quick' if quick else ''}"
-        policy, about = trained_policy(out / "train", model, size.training, seed, command)
+        policy, about = trained_policy(
+            out / "train", RopeStabilization(), model, size.training, seed, command
+        )
         spent += about["wall_time_s"]
     trials = evaluation_trials(BASE, size.ropes, EVALUATION_SEEDS + seed)
     evaluated, took = _evaluated(out / "evaluate", policy, about, trials, seed)
@@ -191,13 +194,12 @@ def _recorded(path: Path, trials: int, seed: int) -> tuple[Recording, float]:
 
 
 def trained_policy(
-    path: Path, model: Rope, training: Training, seed: int, command: str
+    path: Path, task: Task, model: Rope, training: Training, seed: int, command: str
 ) -> tuple[CommandPolicy, dict[str, Any]]:
     """The policy trained in the folder `path`, and its manifest; read if it is there already.
 
-    The manifest says by which `command`.
+    Its actions are the gripper's velocity. The manifest says by which `command` it is made.
     """
-    task = RopeStabilization()
     configuration = {
         "stage": "train",
         "seed": seed,
@@ -209,7 +211,7 @@ def trained_policy(
         if not run.finished:
             action = TrainRopeStabilization.action
             trained(task, model, training, seed, run, action=action, command=command)
-            finish(run, NAME, "train", {})
+            finish(run, task.name, "train", {})
         return load_policy(run.path / POLICY)
 
 

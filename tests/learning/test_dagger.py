@@ -18,7 +18,7 @@ from toys import Pendulum, PendulumDamping, PendulumState
 TASK = PendulumDamping(action_limit=12.0, action_rate_limit=200.0)
 MODEL = Pendulum(1.0, 0.2, control_period=0.05)
 SMALL = {"batch": 32, "starts": 256, "width": 16, "learning_rate": 3e-3, "observation_noise": 0.0}
-ONCE = {"stages": (1.0,), "noise_curriculum": False, **SMALL}
+ONCE = {"horizon_curriculum": False, "noise_curriculum": False, **SMALL}
 FURTHER = Training(iterations=200, **ONCE)
 TRIALS, STEPS = 24, 60
 

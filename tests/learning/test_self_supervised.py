@@ -10,11 +10,12 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
 from palpate.learning import Training, simulate, train
-from palpate.networks.policy import CommandPolicy
+from palpate.networks.policy import CommandPolicy, Policy
 from palpate.parameters import randomise
 from palpate.runs import Run
 from palpate.storage import plain
@@ -22,17 +23,30 @@ from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
 
 CART, PENDULUM = Cart(1.0, 0.5), Pendulum(1.0, 0.2)
 SMALL = {"batch": 32, "starts": 256, "width": 16, "learning_rate": 3e-3, "observation_noise": 0.0}
-ONE_STAGE = {**SMALL, "stages": (1.0,)}  # one compilation
+ONE_STAGE = {**SMALL, "horizon_curriculum": False}  # one compilation
 
 
 class Counting(CartToOrigin):
     """Notes the length of every episode whose loss is traced."""
 
+    stages = (0.25, 0.5, 1.0)
     traced: ClassVar[list[int]] = []
 
     def loss(self, models, start, states, actions):
         self.traced.append(actions.shape[1])
         return super().loss(models, start, states, actions)
+
+
+class Held(Policy):
+    """Always commands the same."""
+
+    command: jax.Array
+
+    def initial_carry(self, command):
+        return command
+
+    def __call__(self, carry, observation, goal, key):
+        return carry, self.command
 
 
 class Broken(CartToOrigin):
@@ -80,7 +94,7 @@ def test_learns_from_noisy_observations() -> None:
 
 def test_one_compilation_per_stage(tmp_path) -> None:
     Counting.traced.clear()
-    training = Training(iterations=12, stages=(0.25, 0.5, 1.0), **SMALL)
+    training = Training(iterations=12, **SMALL)
     _, lines = logged(tmp_path, Counting(), training)
     assert Counting.traced == [15, 30, 60]
     assert [line["horizon"] for line in lines] == [15] * 4 + [30] * 4 + [60] * 4
@@ -91,12 +105,47 @@ def test_switches_of_the_curricula(tmp_path) -> None:
     amplitudes = [line["amplitude"] for line in on]
     assert amplitudes == sorted(amplitudes)
     assert amplitudes[0] < 0.5 < amplitudes[-1] == 1.0
-    off = Training(iterations=3, horizon_curriculum=False, noise_curriculum=False, **SMALL)
+    off = Training(iterations=3, noise_curriculum=False, **ONE_STAGE)
     _, lines = logged(tmp_path / "off", CartToOrigin(), off)
     assert {(line["horizon"], line["amplitude"]) for line in lines} == {(60, 1.0)}
     none = Training(iterations=3, randomisation=False, augmentation=False, **ONE_STAGE)
     _, lines = logged(tmp_path / "none", CartToOrigin(), none)
     assert {line["amplitude"] for line in lines} == {0.0}
+
+
+class Sluggish(CartToOrigin):
+    """Commands act late."""
+
+    action_lag = 0.3
+
+
+def test_commands_act_through_a_lag(tmp_path) -> None:
+    """A first-order lag: the step response to a command that is held."""
+    task, steps, lag = CartToOrigin(), 20, jnp.array([0.0, 0.05, 0.2])
+    start = task.starts(CART, jax.random.key(0), 3)
+    start = eqx.tree_at(lambda s: s.command, start, jnp.zeros_like(start.command))
+    held = Held(jnp.ones_like(start.command))
+    states, actions = simulate(task, CART, held, start, steps, lag=lag)
+    assert jnp.all(actions == 1.0)
+    time = jnp.arange(1, steps + 1) * CART.control_period
+    risen = 1.0 - jnp.exp(-time / jnp.maximum(lag, 1e-6)[:, None])
+    expected = start.state
+    for step in range(steps):
+        applied = risen[:, step].reshape(start.command.shape)
+        expected = CART.step(expected, applied)
+    last = jax.tree.map(lambda leaf: leaf[:, -1], states)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), last, expected
+    )
+
+
+def test_training_knows_of_the_lag(tmp_path) -> None:
+    """The same seed, and other losses once perturbations have begun."""
+    training = Training(iterations=4, noise_curriculum=False, **ONE_STAGE)
+    _, prompt = logged(tmp_path / "prompt", CartToOrigin(), training)
+    _, late = logged(tmp_path / "late", Sluggish(), training)
+    assert prompt[0]["loss"] != late[0]["loss"]
+    assert abs(prompt[0]["loss"] / late[0]["loss"] - 1) < 0.2  # nothing else has changed
 
 
 def test_gives_up_without_finite_gradients(tmp_path) -> None:

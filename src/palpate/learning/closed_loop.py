@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 
 from palpate.models.model import Model
 from palpate.networks.policy import Policy
@@ -20,6 +20,7 @@ def simulate(
     steps: int,
     keys: Key[Array, " batch"] | None = None,
     noise: float = 0.0,
+    lag: Float[Array, " batch"] | None = None,
 ) -> tuple[Any, Array]:
     """States after each of `steps` decisions in closed loop, and the actions: (batch, time, ...).
 
@@ -27,6 +28,9 @@ def simulate(
     observations (standard deviation `noise`, in the observation's unit) and velocities estimated
     from them. `keys`: one of each episode, (batch,), so that its chance does not depend on the
     company it is in; a noisy episode needs one.
+
+    With a `lag` (s), commands act through a first-order lag of that time constant, as through a
+    robot's servo. The actions given back are the commands.
     """
     if keys is None:
         keys = jax.random.split(jax.random.key(0), jax.tree.leaves(start.state)[0].shape[0])
@@ -39,21 +43,28 @@ def simulate(
         before = observed - models.control_period * velocity
         return window, models.initial_state(jnp.stack([before, observed], axis=1))
 
-    def advance(loop: tuple[Any, Any, Array | None], index: Array) -> tuple[Any, Any]:
-        state, memory, window = loop
+    def follow(applied: Array, action: Array) -> Array:
+        if lag is None:
+            return action
+        left = jnp.exp(-models.control_period / jnp.maximum(lag, 1e-6))
+        return action + left.reshape(-1, *(1,) * (action.ndim - 1)) * (applied - action)
+
+    def advance(loop: tuple[Any, Any, Array | None, Array], index: Array) -> tuple[Any, Any]:
+        state, memory, window, applied = loop
         for_noise, for_policy = jax.vmap(jax.random.split, out_axes=1)(_fold_in(keys, index))
         seen = state
         if window is not None:
             window, seen = perceive(window, state, for_noise)
         goal = task.goal_at(start.goal, index)
         memory, action = policy(memory, task.features(seen, goal), goal, for_policy)
-        state = models.step(state, action)
-        return (state, memory, window), (state, action)
+        applied = follow(applied, action)
+        state = models.step(state, applied)
+        return (state, memory, window, applied), (state, action)
 
     window = None
     if noise:
         window = _past(models, start, estimator, noise, _fold_in(keys, steps))
-    loop = start.state, policy.initial_carry(start.command), window
+    loop = start.state, policy.initial_carry(start.command), window, start.command
     _, (states, actions) = jax.lax.scan(advance, loop, jnp.arange(steps))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (states, actions))
 

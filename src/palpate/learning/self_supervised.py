@@ -44,7 +44,6 @@ class Training:
     iterations: int = 4000
     batch: int = 128  # episodes per iteration
     starts: int = 10_000  # K, the pool of start states
-    stages: tuple[float, ...] = (0.5, 1.0)  # episode length, as shares of the task's duration
     amplitude_growth: float = 0.3  # share of the iterations until perturbations are at full width
     learning_rate: float = 1e-3
     final_learning_rate: float = 0.02  # share of it left in the end (cosine)
@@ -155,7 +154,7 @@ def _finite(value: Array) -> float | None:
 
 def _stages(task: Task, model: Model, training: Training) -> list[int]:
     """Episode lengths in control steps, one per stage."""
-    shares = training.stages if training.horizon_curriculum else training.stages[-1:]
+    shares = task.stages if training.horizon_curriculum else task.stages[-1:]
     return [max(1, round(share * task.duration / model.control_period)) for share in shares]
 
 
@@ -195,13 +194,13 @@ def _update(
 
     def value_and_gradient(shared, batch):
         arrays, common = shared
-        own, start, keys = batch
+        own, start, keys, lag = batch
         models = eqx.combine(own, common)
 
         def loss(arrays):
             policy = eqx.combine(arrays, static)
             noise = training.observation_noise
-            states, actions = simulate(task, models, policy, start, horizon, keys, noise)
+            states, actions = simulate(task, models, policy, start, horizon, keys, noise, lag)
             return jnp.mean(task.loss(models, start, states, actions))
 
         return jax.value_and_grad(loss)(arrays)
@@ -222,7 +221,14 @@ def _update(
         perturbed = jax.tree.map(lambda leaf, single: leaf.ndim > single.ndim, models, model)
         own, common = eqx.partition(models, perturbed)
         episodes = jax.random.split(keys[3], training.batch)
-        loss, gradient = divided((state.policy, common), (own, start, episodes))
+        lag = None
+        if task.action_lag:
+            lag = (
+                amplitude
+                * task.action_lag
+                * jax.random.uniform(jax.random.fold_in(keys[0], 1), (training.batch,))
+            )
+        loss, gradient = divided((state.policy, common), (own, start, episodes, lag))
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(norm) & jnp.isfinite(loss)
         changes, moments = optimiser.update(gradient, state.optimiser)

@@ -26,11 +26,17 @@ class Task(eqx.Module):
     """What is wanted of a model: start states, features, loss and success. A frozen pytree.
 
     `action_limit` and `action_rate_limit` bound the Euclidean norm of an action, in the model's
-    action unit and that per second (None: no limit); `duration` is the length of an episode in s.
+    action unit and that per second (None: no limit); `duration` is the length of an episode in s,
+    and `stages` the shares of it that episodes last as training goes on.
+
+    `action_lag`: the greatest time constant, s, of the lag behind which a robot follows commands.
+    Each training episode has its own; with 0 what is learnt may rely on a robot that has none.
     """
 
     name: ClassVar[str]
     outcome_units: ClassVar[Mapping[str, str]] = {}  # of what `outcome` gives; "" if not named
+    stages: ClassVar[tuple[float, ...]] = (0.5, 1.0)
+    action_lag: ClassVar[float] = 0.0
     duration: eqx.AbstractVar[float]
     action_limit: eqx.AbstractVar[float]
     action_rate_limit: eqx.AbstractVar[float | None]

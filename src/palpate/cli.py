@@ -95,6 +95,7 @@ COMMANDS = {
                 "rope-model",
                 "rope-stabilization",
                 "rope-ablation",
+                "rope-generalization",
                 "rope-tracking",
                 "rope-residual",
                 "rope-markerless",

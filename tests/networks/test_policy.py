@@ -57,6 +57,32 @@ def test_untrained_policy_hardly_acts() -> None:
     assert np.abs(drive(policy(), 1)).max() < 0.2 * RATE * PERIOD
 
 
+def test_similar_to_itself_is_a_call() -> None:
+    pilot, observation = policy(gain=10.0), jnp.linspace(-1.0, 7.0, 10).reshape(2, 5)
+    carry = jnp.full((2, 2, 3), 0.2)
+    _, called = pilot(carry, observation)
+    _, similar = pilot.similar(carry, observation, jnp.ones(2))
+    np.testing.assert_allclose(similar, called, rtol=1e-6)
+
+
+def test_a_similar_object_is_accelerated_alike_and_keeps_the_limits() -> None:
+    pilot, observation = policy(gain=10.0), jnp.linspace(-1.0, 7.0, 10).reshape(2, 5)
+    size, carry = jnp.array([0.25, 4.0]), jnp.full((2, 2, 3), 0.2)
+    _, command = pilot.similar(carry, observation, size)
+    root = jnp.sqrt(size)[:, None, None]
+    _, original = pilot(carry / root, observation)
+    np.testing.assert_allclose(command - carry, original - carry / root, atol=1e-6)
+    fast = policy(gain=1e4)
+    for _ in range(40):
+        carry, command = fast.similar(carry, observation, size)
+    np.testing.assert_allclose(jnp.linalg.norm(command, axis=-1), LIMIT, rtol=1e-5)
+
+
+def test_without_a_rate_limit_nothing_is_similar() -> None:
+    with pytest.raises(PalpateError, match="has no rate limit"):
+        policy(None).similar(jnp.zeros((1, 2, 3)), jnp.zeros((1, 5)), jnp.ones(1))
+
+
 def test_batch_equals_one_by_one() -> None:
     pilot = policy()
     observation = jax.random.normal(jax.random.key(1), (4, 5))

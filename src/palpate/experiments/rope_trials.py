@@ -55,10 +55,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the sensors of several worlds showed, stacked: the newest observation of each."""
+    """What the sensors of several worlds showed, stacked: the newest observation of each.
+
+    `time`: s since reset at which that was measured; NaN where nobody says.
+    """
 
     markers: np.ndarray  # (worlds, markers, 3) m
     gripper_position: np.ndarray  # (worlds, 3) m
+    time: float = math.nan
 
 
 @runtime_checkable
@@ -203,6 +207,7 @@ class _Recorder:
         return Seen(
             np.stack([observation.markers for observation in self._latest]),
             np.stack([observation.gripper_position for observation in self._latest]),
+            max(observation.time for observation in self._latest),
         )
 
     def _start(self, index: int, trial: Trial) -> RopeObservation:

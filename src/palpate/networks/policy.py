@@ -118,17 +118,46 @@ class CommandPolicy(Policy):
         key: Key[Array, "*batch"] | None = None,
     ) -> tuple[Array, Array]:
         """The command, as the next carry and as the action: (*batch, *action_shape)."""
+        command = self._moved(carry, self._direction(carry, observation))
+        return command, command
+
+    def similar(
+        self,
+        carry: Array,
+        observation: Float[Array, "*batch features"],
+        size: Float[Array, "*batch"],
+    ) -> tuple[Array, Array]:
+        """As a call, for an object `size` times as large that moves by gravity and inertia.
+
+        By Froude's similarity (1868) its lengths are `size` times as long, its times and velocities
+        sqrt(size) times, and its accelerations the same. `observation` is what the original would
+        show in its place: lengths over `size`, velocities over its root. The command is a velocity
+        with a rate limit; carry, action and limits are those of the object itself.
+
+        Raises `PalpateError` where the rate of the command has no limit.
+        """
+        if self.rate_limit is None:
+            raise PalpateError(
+                "similarity needs a policy whose network moves the command by an acceleration; "
+                "the command of this one has no rate limit"
+            )
+        root = jnp.sqrt(size).reshape(*size.shape, *(1,) * (carry.ndim - size.ndim))
+        command = self._moved(carry, self._direction(carry / root, observation))
+        return command, command
+
+    def _direction(self, carry: Array, observation: Array) -> Array:
+        """Where the network moves the command: a vector shorter than 1."""
         mean, scale = jax.lax.stop_gradient((self.mean, self.scale))
         seen = (observation - mean) / scale
         previous = carry.reshape(*observation.shape[:-1], -1) / self.limit
         network = jax.vmap(self.network) if observation.ndim == 2 else self.network
         output = network(jnp.concatenate([seen, previous], axis=-1)).reshape(carry.shape)
-        direction = output / jnp.sqrt(1.0 + jnp.sum(output**2, axis=-1, keepdims=True))
+        return output / jnp.sqrt(1.0 + jnp.sum(output**2, axis=-1, keepdims=True))
+
+    def _moved(self, carry: Array, direction: Array) -> Array:
         if self.rate_limit is None:
-            command = self.limit * direction
-        else:
-            command = _shorten(carry + self.period * self.rate_limit * direction, self.limit)
-        return command, command
+            return self.limit * direction
+        return _shorten(carry + self.period * self.rate_limit * direction, self.limit)
 
 
 def _shorten(vector: Array, limit: float) -> Array:

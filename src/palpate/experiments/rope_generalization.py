@@ -83,8 +83,8 @@ ROWS = {
     "25 Hz": _rope(observation_rate=25.0, observation_delay=0.03),
     "10 Hz": _rope(observation_rate=10.0, observation_delay=0.05),
 }
-ROPES = {"full": 25, "quick": 1}  # from each start pose
-PLAIN_ROPES = 5  # of them, with the policy as it is used otherwise
+ROPES = {"full": 15, "quick": 1}  # from each start pose
+PLAIN_ROPES = 3  # of them, with the policy as it is used otherwise
 CONTROLLED, PLAIN = "controlled", "as shipped"
 
 
@@ -142,7 +142,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     """
     size: Size = QUICK if quick else FULL
     announce(
-        NAME, {"recording": 1, "identification": 1 if quick else 2, "rows": 2 if quick else 25}
+        NAME, {"recording": 1, "identification": 1 if quick else 2, "rows": 2 if quick else 20}
     )
     policy, about = shipped_policy()
     model, spent = identified_rope(out, size, seed)

@@ -124,8 +124,8 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: rope-model, "
-            "rope-stabilization, rope-ablation, rope-generalization, rope-tracking, rope-residual, "
-            "rope-markerless",
+            "rope-stabilization, rope-ablation, rope-generalization, rope-tracking, rope-dagger, "
+            "rope-residual, rope-markerless",
         ),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),
         (

@@ -97,6 +97,7 @@ COMMANDS = {
                 "rope-ablation",
                 "rope-generalization",
                 "rope-tracking",
+                "rope-dagger",
                 "rope-residual",
                 "rope-markerless",
             ),

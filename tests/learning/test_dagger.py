@@ -12,6 +12,7 @@ from palpate.errors import PalpateError
 from palpate.learning import Training, dagger, loss_monitor, train
 from palpate.learning.loss_monitor import Comparison, Observed, Promise, calibrate, in_model
 from palpate.networks import CommandPolicy
+from palpate.runs import Run
 from palpate.tasks.task import Start
 from toys import Pendulum, PendulumDamping, PendulumState
 
@@ -171,3 +172,11 @@ def test_what_cannot_be_compared_is_refused():
 def untrained() -> CommandPolicy:
     key, seen = jax.random.key(0), jax.random.normal(jax.random.key(1), (8, 3))
     return CommandPolicy.create(key, seen, (1,), period=0.05, limit=6.0, rate_limit=60.0, width=4)
+
+
+def test_training_begins_in_the_pool_that_is_given(policy, tmp_path):
+    still = Start(PendulumState(jnp.zeros((3, 1)), jnp.zeros((3, 1))), jnp.zeros((3, 1)))
+    with Run.open(tmp_path, {}) as kept:
+        train(TASK, MODEL, Training(iterations=1, **ONCE), 0, kept, policy=policy, pool=still)
+        (line,) = kept.metrics()
+    assert line["loss"] < 0.05  # of a pendulum that hangs at rest, and is hardly moved

@@ -1,0 +1,139 @@
+"""The stages of rope-dagger on a small rope; identification and training are stood in for."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.experiments import rope_dagger, rope_evaluation, rope_stabilization
+from palpate.experiments.rope_baselines import HeldStill
+from palpate.experiments.rope_dagger import Follower, TakeOver, Work, nominal, whirled
+from palpate.learning import Training, dagger
+from palpate.learning.loss_monitor import Alarm
+from palpate.models.rope import Rope
+from palpate.networks import CommandPolicy
+from palpate.result import read_result
+from palpate.storage import write_json
+from palpate.tasks import RopeStabilization
+from palpate.worlds.rope import RopeConfiguration
+from small_rope import SMALL
+
+TINY = Work(rope_dagger.QUICK, Training(iterations=1, starts=20), 1, 2, 2, {"everything": 1})
+MODEL = Rope.from_rest_lengths(np.full(5, 0.2), 0.1, drive="velocity", substeps=4)
+
+
+def untrained() -> CommandPolicy:
+    seen = jax.random.normal(jax.random.key(1), (8, 30))
+    key = jax.random.key(0)
+    return CommandPolicy.create(key, seen, (1, 3), period=0.01, limit=1.5, rate_limit=10.0, width=4)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """A small rope, short trials, a policy nobody trained; returns the pools that were trained on.
+
+    In the first round everything is collected, and nothing later.
+    """
+    pools, left = [], [True]
+
+    def train(task, model, training, seed, run, *, policy, pool):
+        pools.append(pool)
+        return policy
+
+    def collected(alarm, comparison):
+        return np.full(comparison.observed.shape, bool(left and left.pop()))
+
+    for module in (rope_dagger, rope_stabilization):
+        monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
+    monkeypatch.setattr(rope_dagger, "QUICK_WORK", TINY)
+    monkeypatch.setattr(rope_dagger, "TRIAL_PERIODS", 0.6)
+    monkeypatch.setattr(rope_dagger, "identified_rope", lambda *_: (MODEL, 0.0))
+    monkeypatch.setattr(rope_dagger, "shipped_policy", lambda: (untrained(), {"seed": 0}))
+    monkeypatch.setattr(dagger, "train", train)
+    monkeypatch.setattr(Alarm, "collected", collected)
+    return pools
+
+
+def test_stages_hand_on_what_they_made(small, tmp_path, monkeypatch):
+    result = rope_dagger.reproduce(tmp_path, quick=True, seed=3)
+    mended, control = small
+    assert len(mended.command) == 2 * len(control.command) == 40
+    rows = {row.name: row for row in result.figures}
+    assert {name: row.bar for name, row in rows.items() if row.bar is not None} == {
+        "success_rate_before": 0.7,
+        "success_rate_after": 0.95,
+        "rounds": 3,
+        "success_rate_nominal_after": rows["success_rate_nominal_before"].value,
+    }
+    assert rows["rounds"].value == 1
+    assert {"success_rate_control", "success_rate_held_still"} <= set(rows)
+    assert (tmp_path / "collected.png").read_bytes().startswith(b"\x89PNG")
+    write_json(tmp_path / "result.json", result.to_dict())
+    read_result(tmp_path / "result.json")
+    (tmp_path / "result.json").unlink()
+
+    monkeypatch.setattr(rope_dagger, "run_trials", None)
+    monkeypatch.setattr(Alarm, "collected", lambda alarm, c: np.full(c.observed.shape, True))
+    monkeypatch.setattr(rope_dagger, "ROUNDS", 1)
+    again = rope_dagger.reproduce(tmp_path, quick=True, seed=3)
+    assert again.figures[0] == result.figures[0]
+
+
+def test_whirls_are_drawn_by_their_seed_within_the_limits():
+    situation = whirled(6, 7)
+    np.testing.assert_array_equal(situation.whirl, whirled(6, 7).whirl)
+    assert not np.array_equal(situation.whirl, whirled(6, 8).whirl)
+    speed = np.linalg.norm(situation.whirl, axis=-1)
+    acceleration = np.linalg.norm(np.diff(situation.whirl, axis=1), axis=-1) / 0.01
+    assert 0.7 < speed[:, -1].min() <= speed.max() < 0.8
+    assert acceleration.max() < situation.trials[0].configuration.acceleration_limit
+    turning = np.cross(situation.whirl[:, -2], situation.whirl[:, -1])[:, 2]
+    assert turning.min() < 0 < turning.max()
+
+
+def test_a_policy_takes_over_knowing_what_was_seen(monkeypatch):
+    monkeypatch.setattr(rope_dagger, "BASE", RopeConfiguration(**SMALL))
+    monkeypatch.setattr(rope_dagger, "WHIRL_DURATION", 0.3)
+    monkeypatch.setattr(rope_dagger, "TRIAL_PERIODS", 0.02)
+    situation = whirled(2, 5)
+    follower = Follower(untrained(), RopeStabilization())
+    episodes = rope_dagger.tried(follower, situation)
+    seen = follower.observed(30)
+    assert seen.states.position.shape == (2, situation.steps, 6, 3)
+    assert episodes.energy.shape == (2, situation.steps + 1)
+    np.testing.assert_allclose(seen.command[:, 0], situation.whirl[:, -1], rtol=1e-5)
+    # One control period changes a command by no more than its limit: it went on from the whirl's.
+    change = jnp.linalg.norm(seen.actions[:, 0] - seen.command, axis=-1)
+    assert float(change.max()) < 0.1 + 1e-4
+    # Velocities are those that the policy saw: of the gripper, nearly what it was told.
+    told = np.linalg.norm(situation.whirl[:, -2], axis=-1)
+    np.testing.assert_allclose(
+        np.linalg.norm(seen.states.velocity[:, 0, 0], axis=-1), told, rtol=0.1
+    )
+
+
+def test_who_is_no_follower_takes_over_as_well():
+    class Counting(HeldStill):
+        asked = 0
+
+        def command(self, seen):
+            self.asked += 1
+            return super().command(seen)
+
+    controller = Counting()
+    episodes = TakeOver(controller, np.full((1, 3, 3), 0.1))
+    seen = rope_dagger.Seen(np.zeros((1, 6, 3)), np.zeros((1, 3)))
+    episodes.begin(seen)
+    commands = [episodes.command(seen) for _ in range(5)]
+    assert [float(command.max()) for command in commands] == [0.1, 0.1, 0.1, 0.0, 0.0]
+    assert controller.asked == 2
+
+
+def test_nominal_trials_are_the_evaluations():
+    situation = nominal(2, 11)
+    assert situation.trials == rope_evaluation.evaluation_trials(rope_dagger.BASE, 2, 11)
+    assert situation.whirl.shape == (8, 0, 3)
+    assert situation.part(np.array([3])).trials == [situation.trials[3]]
+    assert dataclasses.replace(situation).steps == situation.part(np.array([0])).steps

@@ -88,7 +88,7 @@ def run_loop(
         began = deadline = clock()
         while True:
             deadline = min(deadline + period, max(supervisor.due, clock()))
-            _wait(clock, deadline)
+            wait_until(clock, deadline)
             now = clock()
             record.lateness.add(now - deadline)
             if now - deadline > LATE:
@@ -125,7 +125,7 @@ def run_loop(
         gc.unfreeze()
 
 
-def _wait(clock: Callable[[], float], deadline: float) -> None:
+def wait_until(clock: Callable[[], float], deadline: float) -> None:
     """Sleep until shortly before, because a sleep ends late; then watch the clock."""
     left = deadline - clock() - SPIN
     if left > 0:

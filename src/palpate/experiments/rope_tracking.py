@@ -75,7 +75,7 @@ _TRAINING = Training(iterations=2000, starts=4000, observation_noise=_NOISE)
 SIZE = dataclasses.replace(
     FULL,
     training=_TRAINING,
-    ropes=20,
+    ropes=10,
     minutes={"recording": 1, "identification": 3, "training": 11, "evaluation": 12},
 )
 SMALL = dataclasses.replace(
@@ -84,7 +84,7 @@ SMALL = dataclasses.replace(
     ropes=1,
     minutes={"recording": 1, "identification": 1, "training": 1, "evaluation": 3},
 )
-SLOW_ROPES = 2  # of them, for the planner that takes longer
+SLOW_ROPES = 1  # of them, for the planner that takes longer
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:

@@ -76,7 +76,8 @@ def _loss_over_time(axis: Any, period: float, one: Round) -> None:
     marked = one.collected[trial]
     axis.plot(time[marked], comparison.observed[trial, marked], "k|", ms=11, label="collected")
     axis.set(title=f"trial {trial}", xlabel="time (s)", ylabel="loss (as minimised)")
-    axis.legend(frameon=False, fontsize=8)
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 3}
+    axis.legend(frameon=False, fontsize=8, **below)
 
 
 def _scores(axis: Any, period: float, outcome: Outcome) -> None:
@@ -110,13 +111,15 @@ def _where(
     for (label, features), style in zip(seen.items(), STYLES, strict=False):
         every = np.linspace(0, len(features) - 1, min(SHOWN, len(features))).astype(int)
         some, values = features[every], np.asarray(of(starts[label].state))[every]
-        look = {"color": style.light, "marker": style.marker, "s": 7, "label": label, "lw": 0}
-        axes[0].scatter(*(some @ directions.T).T, alpha=0.6, **look)
+        few = len(some) < 100  # and easily lost among the others
+        look = {"color": style.light, "marker": style.marker, "s": 40 if few else 7, "lw": 0}
+        look |= {"label": label, "alpha": 0.9 if few else 0.6}
+        axes[0].scatter(*(some @ directions.T).T, **look)
         # Of a start of the pool the nearest is itself: the second is another.
         squares = (some**2).sum(1)[:, None] + (pool**2).sum(1) - 2 * some @ pool.T
         rank = 1 if features is pool else 0
         nearest = np.sqrt(np.maximum(np.partition(squares, rank, axis=1)[:, rank], 0))
-        axes[1].scatter(values, nearest, alpha=0.6, **look)
+        axes[1].scatter(values, nearest, **look)
     axes[0].set(title="where they lie", xlabel="first principal component", ylabel="second")
     axes[1].set(title="how far from training", xlabel=name, ylabel="nearest start (deviations)")
     axes[0].legend(frameon=False, fontsize=8)

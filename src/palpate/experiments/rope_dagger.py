@@ -2,7 +2,7 @@
 
 The shipped stabiliser takes over from a gripper that has whirled the rope in small fast circles,
 between its second and third way of turning as a whole (3.7 sqrt(g / L); the ways are at 2.76 and
-4.33). No motion that it was trained on comes near: it goes on whirling, at full speed and for good.
+4.33). No motion that it was trained on comes near: some ropes it whirls on, for good.
 Self-supervised DAgger notices, collects what it sees, and trains on through a model of the nominal
 rope that is identified here. Beside it the same extra training without what was collected.
 

@@ -5,7 +5,9 @@ samples, 3) in m, world frame, one sample a control period, the first at the sta
 """
 
 import time
+from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,10 +21,11 @@ from palpate.experiments.rope_trials import Controller, Seen
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
 from palpate.perception.velocity import VelocityEstimator
-from palpate.planning.sampling import Cem, Mppi, Plan, SamplingPlanner
+from palpate.planning.command_curve import CurvePlanner, Plan
+from palpate.planning.sampling import Cem, Mppi, SamplingPlanner
 from palpate.tasks import RopeTracking
 from palpate.tasks.paths import DesiredPath
-from palpate.tasks.rope_tracking import PREVIEW, grip_of_chain
+from palpate.tasks.rope_tracking import PREVIEW, grip_of_chain, hanging_rope
 from palpate.worlds.rope import RopeConfiguration
 
 # Of both sampling planners: the best of a dozen settings (deviation 0.05 to 0.6, temperature 0.02
@@ -135,39 +138,108 @@ class LearnedFollower:
         return np.asarray(action)[:, 0]
 
 
-class PlannedFollower:
-    """A sampling planner that decides anew in every control period, for one world after another.
+class PlannedController:
+    """A planner that decides anew in every control period, for one world after another.
 
     `spent` are the seconds of all its decisions.
     """
 
-    def __init__(self, planner: SamplingPlanner, paths: np.ndarray, seed: int):
+    def __init__(self, planner: CurvePlanner, seed: int):
         assert isinstance(planner.model, Rope)
-        self._planner, self.period = planner, planner.model.control_period
-        self._goal = DesiredPath(jnp.asarray(paths, jnp.float32), self.period)
+        self._planner, self._seed, self.period = planner, seed, planner.model.control_period
         self._observer = RopeObserver(planner.model.nodes - 1, self.period)
-        self._keys = jax.random.split(jax.random.key(seed), len(paths))
         self.spent: list[float] = []
 
     def begin(self, seen: Seen) -> None:
         """See `Controller.begin`."""
         self._observer.begin(seen)
-        self._plans: list[Plan] = [self._planner.init(jnp.zeros((1, 3)), k) for k in self._keys]
+        keys = jax.random.split(jax.random.key(self._seed), len(seen.markers))
+        self._planners = [self._planner] * len(keys)
+        self._plans: list[Plan] = [self._planner.init(jnp.zeros((1, 3)), key) for key in keys]
         self._step = 0
 
     def command(self, seen: Seen) -> np.ndarray:
         """See `Controller.command`."""
         self._step += 1
-        states = self._observer.state(seen)
-        ahead = self._goal.ahead(jnp.arange(self._planner.horizon), self._step)
+        states = self.states(seen)
+        ahead = self.goals_ahead(states)
         commands = []
         for world, plan in enumerate(self._plans):
             state, goals = jax.tree.map(lambda leaf, i=world: leaf[i], (states, ahead))
             began = time.perf_counter()
-            self._plans[world], command = self._planner(plan, state, goals)
+            self._plans[world], command = self._planners[world](plan, state, goals)
             commands.append(np.asarray(command)[0])
             self.spent.append(time.perf_counter() - began)
         return np.stack(commands)
+
+    def states(self, seen: Seen) -> RopeState:
+        """What the planner takes the ropes to be in, (worlds, nodes, 3)."""
+        return self._observer.state(seen)
+
+    @abstractmethod
+    def goals_ahead(self, states: RopeState) -> Any:
+        """What the planner is to reach, each leaf (worlds, horizon, ...)."""
+
+
+def as_of_model(model: Rope, states: RopeState) -> RopeState:
+    """Ropes seen, (worlds, nodes, 3), as the model can have them: its segments, as long as hanging.
+
+    Directions and turning rates of the segments are kept. How much a segment is longer than the
+    model's is noise, or another rope's length: the model's stiff springs would take a millimetre of
+    it for a force as large as the rope's weight, and plan for the recoil.
+    """
+    hanging = hanging_rope(model).position
+    length = jnp.linalg.norm(jnp.diff(hanging, axis=0), axis=-1, keepdims=True)
+    edge = jnp.diff(states.position, axis=-2)
+    seen_length = jnp.linalg.norm(edge, axis=-1, keepdims=True)
+    direction = edge / seen_length
+    turning = jnp.diff(states.velocity, axis=-2) / seen_length
+    turning = turning - direction * jnp.sum(turning * direction, axis=-1, keepdims=True)
+
+    def from_grip(grip: Array, steps: Array) -> Array:
+        return jnp.concatenate([grip, grip + jnp.cumsum(steps, axis=-2)], axis=-2)
+
+    return RopeState(
+        from_grip(states.position[..., :1, :], length * direction),
+        from_grip(states.velocity[..., :1, :], length * turning),
+    )
+
+
+class PlannedFollower(PlannedController):
+    """One that follows paths, and knows how long each rope is: it is measured as a trial begins."""
+
+    def __init__(self, planner: CurvePlanner, paths: np.ndarray, seed: int):
+        super().__init__(planner, seed)
+        self._goal = DesiredPath(jnp.asarray(paths, jnp.float32), self.period)
+        self._adapted = eqx.filter_jit(eqx.filter_vmap(as_of_model))
+
+    def begin(self, seen: Seen) -> None:
+        """See `Controller.begin`."""
+        super().begin(seen)
+        model = self._planner.model
+        assert isinstance(model, Rope)
+        sizes = _length(super().states(seen)) / _length(hanging_rope(model))
+        models = [
+            eqx.tree_at(lambda rope: rope.rest_length, model, model.rest_length * size).constrain()
+            for size in sizes
+        ]
+        self._planners = [
+            eqx.tree_at(lambda planner: planner.model, self._planner, model) for model in models
+        ]
+        self._models = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
+
+    def states(self, seen: Seen) -> RopeState:
+        """See `PlannedController.states` and `as_of_model`."""
+        return self._adapted(self._models, super().states(seen))
+
+    def goals_ahead(self, states: RopeState) -> Any:
+        """Where the tips should be, from one control period from now."""
+        return self._goal.ahead(jnp.arange(self._planner.horizon), self._step)
+
+
+def _length(state: RopeState) -> Float[Array, "*worlds"]:
+    """Of the polygon through the nodes, m."""
+    return jnp.sum(jnp.linalg.norm(jnp.diff(state.position, axis=-2), axis=-1), axis=-1)
 
 
 def planner(method: str, model: Rope, samples: int, iterations: int | None = None):

@@ -1,15 +1,9 @@
 """Sampling MPC: at every decision many random plans are tried in a model, and the good ones kept.
 
-A plan is a curve through a few knots x, interpolated linearly over the horizon, that becomes
-commands within their limits as in `networks.CommandPolicy`:
-
-    rate = rate_limit x / sqrt(1 + |x|^2),    command <- command + period rate, shortened to `limit`
-
-or command = limit x / sqrt(1 + |x|^2) where the rate has no limit. The plan of the last decision,
-moved on by one control period, is the middle of the next one's samples, and one of them.
+Plans are curves as in `planning.command_curve`. That of the last decision, moved on by one control
+period, is the middle of the next one's samples, and one of them.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -17,16 +11,13 @@ from typing import Any, Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.models.model import Model
-
-StageLoss = Callable[[Any, Array, Any], Float[Array, " samples"]]
+from palpate.planning.command_curve import CurvePlanner, Plan
+from palpate.planning.decision_time import most_within
 
 LEAST_SAMPLES = 16  # that `samples_within` starts from, and counts in
-TIMED = 20  # decisions that it times
 
 
 @runtime_checkable
@@ -73,31 +64,12 @@ class Cem:
         return jnp.zeros_like(losses).at[best].set(1.0 / count)
 
 
-class Plan(eqx.Module):
-    """What a planner carries from one decision to the next."""
+class SamplingPlanner(CurvePlanner):
+    """MPPI or CEM through any model; see `CurvePlanner`."""
 
-    knots: Float[Array, "knots *action"]
-    command: Array  # in force, in the action's unit
-    key: PRNGKeyArray
-
-
-class SamplingPlanner(eqx.Module):
-    """MPPI or CEM through any model: `init` once, then call it in every control period.
-
-    `stage_loss(states, commands, goal)` gives the loss of one instant for each of many states,
-    (samples,), after a control period with these commands. `goal` is what is asked for at that
-    instant. Limits are as in `tasks.Task`.
-    """
-
-    model: Model
-    stage_loss: StageLoss = eqx.field(static=True)
-    rule: Rule = eqx.field(static=True)
-    limit: float = eqx.field(static=True)
-    rate_limit: float | None = eqx.field(static=True)
+    rule: Rule = eqx.field(static=True, kw_only=True)
     samples: int = eqx.field(static=True, default=64)
     iterations: int = eqx.field(static=True, default=1)
-    knots: int = eqx.field(static=True, default=8)
-    spacing: int = eqx.field(static=True, default=10)  # control periods from knot to knot
     deviation: float = eqx.field(static=True, default=0.5)  # of a sampled knot from the plan
 
     def __check_init__(self) -> None:
@@ -108,23 +80,8 @@ class SamplingPlanner(eqx.Module):
                 f"period between them, got {', '.join(map(str, counts))}"
             )
 
-    @property
-    def horizon(self) -> int:
-        """Control periods that a plan looks ahead."""
-        return (self.knots - 1) * self.spacing
-
-    def init(self, command: Array, key: PRNGKeyArray) -> Plan:
-        """Before the first decision: `command`, of the model's action shape, is in force."""
-        return Plan(jnp.zeros((self.knots, *command.shape), command.dtype), command, key)
-
-    @eqx.filter_jit
-    def __call__(self, plan: Plan, state: Any, goals: Any) -> tuple[Plan, Array]:
-        """The plan moved on by one control period, and the command to hold for that period.
-
-        `state` is that of the model without a batch axis; each leaf of `goals` leads with an axis
-        of `horizon` instants, the first of which is one control period from now (None: no goal).
-        """
-        key, following = jax.random.split(plan.key)
+    def _improved(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
+        """The samples' weighted mean."""
         knots = plan.knots
         deviation = jnp.full_like(knots, self.deviation)
         for iteration in range(self.iterations):
@@ -137,87 +94,11 @@ class SamplingPlanner(eqx.Module):
             knots = jnp.tensordot(weights, tried, axes=1)
             if self.rule.narrows:
                 deviation = jnp.sqrt(jnp.tensordot(weights, (tried - knots) ** 2, axes=1))
-        command = self._command(knots[0], plan.command)
-        return Plan(self._curve(knots, 1.0), command, following), command
-
-    def _losses(self, tried: Array, command: Array, state: Any, goals: Any) -> Array:
-        """The summed stage losses of each sample."""
-
-        def many(leaf: Array) -> Array:
-            return jnp.broadcast_to(leaf, (self.samples, *leaf.shape))
-
-        def advance(motion: tuple[Any, Array, Array], goal: tuple[Array, Any]):
-            states, commands, total = motion
-            place, asked = goal
-            commands = self._command(_between(tried, place, axis=1), commands)
-            states = self.model.step(states, commands)
-            return (states, commands, total + self.stage_loss(states, commands, asked)), None
-
-        start = jax.tree.map(many, state), many(command), jnp.zeros(self.samples, tried.dtype)
-        places = jnp.arange(self.horizon) / self.spacing
-        (_, _, total), _ = jax.lax.scan(advance, start, (places, goals))
-        return total
-
-    def _command(self, knot: Array, command: Array) -> Array:
-        """The command after one control period; see the module."""
-        squared = jnp.sum(knot**2, axis=-1, keepdims=True)
-        direction = knot / jnp.sqrt(1.0 + squared)
-        if self.rate_limit is None:
-            return self.limit * direction
-        command = command + self.model.control_period * self.rate_limit * direction
-        length = jnp.sqrt(jnp.sum(command**2, axis=-1, keepdims=True))
-        return command * (self.limit / jnp.maximum(length, self.limit))
-
-    def _curve(self, knots: Array, periods: float) -> Array:
-        """The same curve from that many control periods later on; its end is held."""
-        places = jnp.arange(self.knots) + periods / self.spacing
-        return jax.vmap(lambda place: _between(knots, place, axis=0))(places)
-
-
-def _between(knots: Array, place: Array, axis: int) -> Array:
-    """Knots interpolated at a `place` counted in knots."""
-    last = knots.shape[axis] - 1
-    before = jnp.clip(jnp.floor(place).astype(int), 0, last - 1)
-    share = jnp.minimum(place - before, 1.0)
-    first = jax.lax.dynamic_index_in_dim(knots, before, axis, keepdims=False)
-    second = jax.lax.dynamic_index_in_dim(knots, before + 1, axis, keepdims=False)
-    return (1.0 - share) * first + share * second
+        return knots
 
 
 def samples_within(
     budget: float, decision: Callable[[int], Callable[[], Any]]
 ) -> tuple[int, float]:
-    """How many samples fit into `budget` seconds a decision, and the seconds that those take.
-
-    `decision(samples)` makes a function without arguments that takes one decision with so many.
-    The number, a multiple of 16, is doubled and then narrowed down until the fastest quarter of
-    some decisions is just within the budget: what else runs on a machine only adds.
-
-    Raises `PalpateError` when not even 16 fit.
-    """
-
-    def takes(samples: int) -> float:
-        decide = decision(samples)
-        jax.block_until_ready(decide())  # compiles
-        spent = []
-        for _ in range(TIMED):
-            began = time.perf_counter()
-            jax.block_until_ready(decide())
-            spent.append(time.perf_counter() - began)
-        return float(np.quantile(spent, 0.25))
-
-    units, took = 1, takes(LEAST_SAMPLES)
-    if took > budget:
-        raise PalpateError(
-            f"{LEAST_SAMPLES} samples already take {1e3 * took:.1f} ms a decision, more than the "
-            f"{1e3 * budget:.1f} ms allowed: shorten the horizon or simplify the model"
-        )
-    fits, beyond = (units, took), None
-    while beyond is None or beyond - fits[0] > max(1, fits[0] // 8):
-        units = 2 * fits[0] if beyond is None else (fits[0] + beyond) // 2
-        took = takes(units * LEAST_SAMPLES)
-        if took <= budget:
-            fits = units, took
-        else:
-            beyond = units
-    return fits[0] * LEAST_SAMPLES, fits[1]
+    """How many samples, a multiple of 16, fit into `budget` seconds a decision: `most_within`."""
+    return most_within(budget, decision, "sample", LEAST_SAMPLES)

@@ -1,0 +1,257 @@
+"""`palpate reproduce rope-rivals`: the policy that ships, and what else brings a rope to rest.
+
+In MuJoCo ropes drawn as for `rope-stabilization`, from the same four start poses, side by side: the
+shipped policy; one trained with the same settings through the undamped model (Lv et al. 2017) that
+was identified from the same recording; MPPI, CEM and gradient MPC through the damped model, with
+what fits into 10 ms a decision and with more; the tuned swing damper; a gripper held still. There
+is no bar: who is better is what is to be found out.
+
+Each stage is a run in a folder below `out`, and resumes there.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from palpate.errors import PalpateError
+from palpate.experiments.rope_baselines import TUNED, HeldStill, SwingDamper
+from palpate.experiments.rope_evaluation import (
+    evaluate,
+    evaluation_trials,
+    figures,
+    one_of_each_pose,
+    summarise,
+    table,
+    write_trial_evidence,
+)
+from palpate.experiments.rope_model import undamped
+from palpate.experiments.rope_planners import (
+    TUNING,
+    PlannedStabiliser,
+    decision_about,
+    decision_times,
+    stabilising_planner,
+)
+from palpate.experiments.rope_recording import GRIPPER, MARKERS, constants
+from palpate.experiments.rope_stabilization import (
+    BASE,
+    FULL,
+    QUICK,
+    Size,
+    announce,
+    finish,
+    identified_rope,
+    shipped_policy,
+    trained_policy,
+    wall_time,
+)
+from palpate.experiments.rope_trials import Controller, Episodes, LearnedController, Trial
+from palpate.identification.gradient import Settings, identify
+from palpate.models.files import load_model, save_model
+from palpate.models.rope import Rope
+from palpate.networks import CommandPolicy
+from palpate.parameters import describe
+from palpate.planning.gradient import iterations_within
+from palpate.planning.sampling import samples_within
+from palpate.recording_files import read_recording
+from palpate.result import Figure, Result
+from palpate.runs import RESULT, Run
+from palpate.storage import read_json, write_json
+from palpate.tasks import RopeStabilization
+
+NAME = "rope-rivals"
+BUDGET = 0.01  # s, a decision of a planner in a hurry
+EVALUATION_SEEDS = 960_000  # of ropes and noise, used by nothing else
+SHIPPED, UNDAMPED = "policy", "undamped policy"
+METHODS = {"mppi": samples_within, "cem": samples_within, "gradient": iterations_within}
+UNHURRIED = {"mppi": 2048, "cem": 2048, "gradient": 5}  # samples; iterations
+SIZE = dataclasses.replace(
+    FULL,
+    ropes=2,
+    minutes={"recording": 1, "identification": 5, "training": 9, "evaluation": 10},
+)
+SMALL = dataclasses.replace(
+    QUICK,
+    training=dataclasses.replace(QUICK.training, iterations=60, batch=64, starts=1600),
+    ropes=1,
+    minutes={"recording and identification": 1, "training": 1, "evaluation": 2},
+)
+# When quick: from how many start poses all are tried, and those unhurried, which have this share.
+POSES, SLOW_POSES, LESS = 2, 1, 4
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Identify with and without damping, train the rival policy and evaluate all below `out`.
+
+    `quick` is the same work at a smaller size. Raises `PalpateError` when `out` holds the stages of
+    another run, or when this installation has no shipped weights.
+    """
+    size = SMALL if quick else SIZE
+    announce(NAME, size.minutes)
+    policy, about = shipped_policy()
+    model, spent = identified_rope(out, size, seed)
+    lively, took = _identified_undamped(out, model, size, seed)
+    command = f"palpate reproduce {NAME} --seed {seed}{' --quick' if quick else ''}"
+    rival, rival_about = trained_policy(
+        out / "train-undamped", RopeStabilization(), lively, size.training, seed, command
+    )
+    sizes, measured = _sizes_within(out / "planners", model, seed)
+    spent += took + rival_about["wall_time_s"] + measured
+    hurried = _planned(model, sizes, "10 ms", seed)
+    more = {method: -(-most // (LESS if quick else 1)) for method, most in UNHURRIED.items()}
+    unhurried = _planned(model, more, "unhurried", seed)
+    trials = evaluation_trials(BASE, size.ropes, EVALUATION_SEEDS + seed)
+    trials = [trials[index] for index in one_of_each_pose(trials)[:POSES]] if quick else trials
+    chosen = one_of_each_pose(trials)[: SLOW_POSES if quick else None]
+    settings = {
+        "quick": quick,
+        "policies": {SHIPPED: about, UNDAMPED: rival_about},
+        "planners": dataclasses.asdict(TUNING),
+        "within_10_ms": sizes,
+        "unhurried": more,
+        "swing_damper": dataclasses.asdict(TUNED),
+        "world": constants(BASE),
+        "ropes": size.ropes,
+    }
+    others = _learned(policy, rival) | {
+        "swing damper": SwingDamper(BASE),
+        "held still": HeldStill(),
+    }
+    work = settings | {"seed": seed, "trials": len(trials)}
+    whole, times, took = _evaluated(out / "evaluate", work, others | hurried, trials)
+    some = [trials[index] for index in chosen]
+    slow, slow_times, took_more = _evaluated(out / "evaluate-unhurried", work, unhurried, some)
+    print("\n".join([*table(trials, whole), *table(some, slow)]))
+    same = {name: _part(whole[name], chosen) for name in (SHIPPED, *hurried)}
+    return Result(
+        NAME,
+        [
+            *(row for name in whole for row in _rows(trials, whole[name], name)),
+            *(row for name in slow for row in _rows(some, slow[name], name)),
+            *(row for name in same for row in _rows(some, same[name], f"{name} same trials")),
+            *_times(times | slow_times),
+        ],
+        settings,
+        [seed],
+        {
+            "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
+            "trained": f"{UNDAMPED}: through the undamped model of the same recording alone",
+            "planners tuned": "ropes of seed 7100, see `rope_planners`",
+            "evaluated": (
+                f"{len(trials)} trials of {size.ropes} sampled ropes, seed "
+                f"{EVALUATION_SEEDS + seed}; planners unhurried in the first of each pose"
+            ),
+        },
+        spent + took + took_more,
+    )
+
+
+def _identified_undamped(out: Path, model: Rope, size: Size, seed: int) -> tuple[Rope, float]:
+    """The rope without damping that suits the same recording best, and the seconds that took.
+
+    It starts from what was identified with damping.
+    """
+    settings = Settings(iterations=size.identification, seed=seed)
+    configuration = {"stage": "identify undamped", **dataclasses.asdict(settings)}
+    with Run.open(out / "identify-undamped", configuration) as run:
+        path = run.path / "model.json"
+        if not run.finished:
+            recording = read_recording(out / "record" / "recording.npz")
+            aligned = recording.align(BASE.control_period, MARKERS, GRIPPER)
+            every = (aligned.observation.shape[2] - 1) // (model.nodes - 1)
+            seen = dataclasses.replace(aligned, observation=aligned.observation[:, :, ::every])
+            start = dataclasses.replace(undamped(model), drive="position").constrain()
+            lively = identify(start, seen, settings, run)
+            save_model(path, lively)
+            finish(run, NAME, "identify undamped", {"parameters": describe(lively)})
+        lively, _ = load_model(path)
+        if not isinstance(lively, Rope):
+            raise PalpateError(f"{path} is no rope but {type(lively).__name__}: give another --out")
+        return dataclasses.replace(lively, drive="velocity"), wall_time(run)
+
+
+def _sizes_within(path: Path, model: Rope, seed: int) -> tuple[dict[str, int], float]:
+    """How many samples or iterations each planner has within the budget on this machine.
+
+    Zero where not even the least fits. Kept in `path`; with the seconds it took to find out.
+    """
+    with Run.open(path, {"stage": "planners", "seed": seed, "budget_s": BUDGET}) as run:
+        file = run.path / "sizes.json"
+        if not run.finished:
+            sizes = {}
+            for method, within in METHODS.items():
+                try:
+                    sizes[method], _ = within(
+                        BUDGET,
+                        lambda count, method=method: decision_about(
+                            stabilising_planner(method, model, count)
+                        ),
+                    )
+                except PalpateError as error:
+                    print(f"{method} has no place within {BUDGET:g} s: {error}", flush=True)
+                    sizes[method] = 0
+            write_json(file, sizes)
+            finish(run, NAME, "planners", {"sizes": sizes})
+        return read_json(file), wall_time(run)
+
+
+def _learned(policy: CommandPolicy, rival: CommandPolicy) -> dict[str, Controller]:
+    task = RopeStabilization()
+    return {SHIPPED: LearnedController(policy, task), UNDAMPED: LearnedController(rival, task)}
+
+
+def _planned(
+    model: Rope, sizes: Mapping[str, int], when: str, seed: int
+) -> dict[str, PlannedStabiliser]:
+    """Those of the planners that have a size."""
+    return {
+        f"{method} {when}": PlannedStabiliser(stabilising_planner(method, model, size), seed)
+        for method, size in sizes.items()
+        if size
+    }
+
+
+def _evaluated(
+    path: Path,
+    configuration: dict[str, Any],
+    controllers: Mapping[str, Controller],
+    trials: Sequence[Trial],
+) -> tuple[dict[str, Episodes], dict[str, list[float]], float]:
+    """What each controller does, how long planners take to decide (ms), and the seconds spent."""
+    with Run.open(path, configuration | {"controllers": list(controllers)}) as run:
+        evaluated = evaluate(controllers, trials, run)
+        if not run.finished:
+            write_trial_evidence(run, trials, evaluated, tuple(controllers))
+            planned = {n: c for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
+            finish(run, NAME, path.name, {"decision_ms": decision_times(planned)})
+        return evaluated, read_json(run.path / RESULT)["decision_ms"], wall_time(run)
+
+
+def _part(episodes: Episodes, chosen: Sequence[int]) -> Episodes:
+    """Of some of the trials, in this order; without markers."""
+    failures = {
+        place: episodes.failures[trial]
+        for place, trial in enumerate(chosen)
+        if trial in episodes.failures
+    }
+    chosen = list(chosen)
+    return Episodes(
+        episodes.energy[chosen], episodes.gripper_speed[chosen], episodes.markers[:0], failures
+    )
+
+
+def _rows(trials: Sequence[Trial], episodes: Episodes, name: str) -> list[Figure]:
+    return figures(summarise(trials, episodes), f".{_suffix(name)}")
+
+
+def _times(times: Mapping[str, Sequence[float]]) -> list[Figure]:
+    rows = []
+    for name, (median, late) in times.items():
+        rows.append(Figure(f"decision_ms_median.{_suffix(name)}", median, "ms"))
+        rows.append(Figure(f"decision_ms_p99.{_suffix(name)}", late, "ms"))
+    return rows
+
+
+def _suffix(name: str) -> str:
+    return name.replace(" ", "_")

@@ -1,0 +1,159 @@
+"""Rivals on a small rope; identification and training are stood in for."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.experiments import rope_evaluation, rope_rivals, rope_stabilization
+from palpate.experiments.rope_baselines import HeldStill
+from palpate.experiments.rope_followers import as_of_model
+from palpate.experiments.rope_planners import (
+    PlannedStabiliser,
+    energy_and_speed,
+    stabilising_planner,
+)
+from palpate.experiments.rope_stabilization import Size
+from palpate.experiments.rope_trials import Trial, run_trials
+from palpate.learning import Training
+from palpate.models.rope import Rope, RopeState
+from palpate.networks import CommandPolicy
+from palpate.result import read_result
+from palpate.storage import write_json
+from palpate.tasks.rope_tracking import hanging_rope
+from palpate.worlds.rope import RopeConfiguration
+from small_rope import SMALL
+
+TINY = Size(2, (1, 1, 1), Training(iterations=8, width=4), 1, dict.fromkeys(
+    ("recording", "identification", "training", "evaluation"), 1
+))  # fmt: skip
+
+
+def small_model(length: float = 1.0) -> Rope:
+    return Rope.uniform(length, 0.1, 6, drive="velocity", substeps=4, bend_stiffness=1e-4)
+
+
+def untrained(seed: int) -> CommandPolicy:
+    seen, key = jnp.ones((2, 30)), jax.random.key(seed)  # of six nodes
+    return CommandPolicy.create(key, seen, (1, 3), period=0.01, limit=1.5, rate_limit=10.0, width=4)
+
+
+def test_a_rope_of_another_length_is_taken_for_the_models() -> None:
+    """Its segments' directions and turning rates stay, and hanging it is the model at rest."""
+    model, other = small_model(), small_model(0.9)
+    as_of_small = eqx.filter_jit(as_of_model)
+    shift = jnp.array([0.1, -0.2, 1.5])
+    hanging = hanging_rope(other)
+    rest = as_of_small(model, RopeState(hanging.position[None] + shift, hanging.velocity[None]))
+    assert float(jnp.abs(model.energy(rest)[0])) < 1e-5
+    turn = jnp.array([0.0, 2.0, 0.0])  # rad/s about the grip, which moves
+    tilt = jnp.array([0.6, 0.0, -0.8]) * jnp.linspace(0, 0.9, 6)[:, None]
+    swinging = RopeState(tilt[None] + shift, jnp.cross(turn, tilt)[None] + 0.3)
+    taken = as_of_small(model, swinging)
+    length = np.linalg.norm(np.diff(np.asarray(taken.position[0]), axis=0), axis=-1)
+    np.testing.assert_allclose(
+        length, np.linalg.norm(np.diff(hanging_rope(model).position, axis=0), axis=-1), rtol=1e-5
+    )
+    arm = taken.position[0] - taken.position[0, :1]
+    np.testing.assert_allclose(jnp.cross(arm, tilt), 0.0, atol=1e-6)  # as before
+    np.testing.assert_allclose(taken.velocity[0], jnp.cross(turn, arm) + 0.3, atol=1e-5)
+    np.testing.assert_allclose(taken.position[0, 0], shift, atol=1e-6)
+
+
+def test_the_loss_counts_energy_and_speed() -> None:
+    model = small_model()
+    loss = energy_and_speed(model)
+    rest = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), hanging_rope(model))
+    moving = RopeState(rest.position, rest.velocity.at[1].add(1.0))
+    still, fast = jnp.zeros((2, 1, 3)), jnp.ones((2, 1, 3))
+    np.testing.assert_allclose(loss(rest, still, jnp.array(0.5)), 0.0, atol=1e-3)
+    of_moving = loss(moving, still, jnp.array(0.5))
+    assert float(of_moving[1]) == pytest.approx(np.log1p(0.5 * 0.1 * 3 / 0.5 / 0.01), rel=1e-3)
+    assert float(loss(rest, fast, jnp.array(0.5))[0]) == pytest.approx(1.5, rel=1e-2)
+
+
+@pytest.mark.parametrize(("method", "size"), [("gradient", 1), ("mppi", 96)])
+def test_planners_calm_a_rope_that_is_not_quite_the_models(method, size) -> None:
+    configuration = RopeConfiguration(**SMALL, length=1.05)
+    trials, steps = [Trial(configuration, "straight", 0)], 60
+    planned = PlannedStabiliser(stabilising_planner(method, small_model(), size), 0)
+    energy = run_trials(trials, planned, steps).energy
+    still = run_trials(trials, HeldStill(), steps).energy
+    assert energy[0, -1] < 0.6 * still[0, -1]
+    assert len(planned.spent) == steps
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Everything small, and what was asked of identification and training, in order."""
+    made = []
+
+    def identify(start, aligned, settings, run):
+        made.append(("identify", start, aligned))
+        return start
+
+    def train(task, model, training, seed, run):
+        made.append(("train", model, training))
+        return untrained(seed)
+
+    for module in (rope_stabilization, rope_rivals):
+        monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
+        monkeypatch.setattr(module, "identify", identify)
+    monkeypatch.setattr(rope_stabilization, "NODES", 6)
+    monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
+    monkeypatch.setattr("palpate.experiments.train.train", train)
+    monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.02)
+    monkeypatch.setattr(rope_rivals, "SMALL", TINY)
+    monkeypatch.setattr(rope_rivals, "UNHURRIED", {"gradient": 2})
+    monkeypatch.setattr(rope_rivals, "shipped_policy", lambda: (untrained(9), {"seed": 9}))
+
+    def too_slow(*_):
+        raise PalpateError("one iteration already takes 20 ms")
+
+    methods = {"mppi": lambda *_: (16, 0.001), "gradient": too_slow}
+    monkeypatch.setattr(rope_rivals, "METHODS", methods)
+    return made
+
+
+def test_stages_hand_on_what_they_made(calls, tmp_path, capsys) -> None:
+    result = rope_rivals.reproduce(tmp_path, quick=True, seed=3)
+    (_, first, seen), (_, limp, again), (_, trained, training) = calls
+    assert (first.drive, limp.drive, trained.drive) == ("position", "position", "velocity")
+    np.testing.assert_array_equal(again.observation, seen.observation)
+    for model in (limp, trained):
+        assert not np.any(model.bend_damping)
+        assert not np.any(model.air_drag)
+    assert training == TINY.training
+    assert result.settings["within_10_ms"] == {"mppi": 16, "gradient": 0}
+    assert "gradient has no place within 0.01 s: one iteration already" in capsys.readouterr().out
+    names = {row.name for row in result.figures}
+    assert {
+        "success_rate.policy",
+        "time_to_1pct_periods.undamped_policy",
+        "success_rate.mppi_10_ms",
+        "success_rate.gradient_unhurried",
+        "success_rate.policy_same_trials",
+        "decision_ms_median.mppi_10_ms",
+        "decision_ms_p99.gradient_unhurried",
+    } <= names
+    assert "success_rate.gradient_10_ms" not in names
+    assert all(row.bar is None for row in result.figures)
+    write_json(tmp_path / "result.json", result.to_dict())
+    read_result(tmp_path / "result.json")
+    repeated = rope_rivals.reproduce(tmp_path, quick=True, seed=3)
+    assert len(calls) == 3
+    assert repeated.figures == result.figures
+    with pytest.raises(PalpateError, match="seed was 3, now 4"):
+        rope_rivals.reproduce(tmp_path, quick=True, seed=4)
+
+
+def test_a_part_of_the_episodes_keeps_its_failures() -> None:
+    energy = np.arange(8.0).reshape(4, 2)
+    whole = rope_evaluation.Episodes(
+        energy, -energy, np.zeros((1, 2, 11, 3)), {2: "lost", 3: "too"}
+    )
+    part = rope_rivals._part(whole, [0, 2])
+    np.testing.assert_array_equal(part.energy, energy[[0, 2]])
+    assert part.failures == {1: "lost"}

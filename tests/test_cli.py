@@ -111,7 +111,7 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         (
             "idenitfy rope R.npz",
             "unknown command 'idenitfy'; did you mean 'identify'? there are: demo, record, "
-            "convert, identify, train, evaluate, export, serve, report, reproduce",
+            "convert, track, identify, train, evaluate, export, serve, report, reproduce",
         ),
         ("identify rpoe R.npz", "unknown family 'rpoe'; did you mean 'rope'? there are: rope"),
         ("identify", "palpate identify needs a family first; there are: rope"),
@@ -124,8 +124,8 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: rope-model, "
-            "rope-stabilization, rope-ablation, rope-generalization, rope-tracking, rope-dagger, "
-            "rope-residual, rope-markerless",
+            "rope-stabilization, rope-ablation, rope-rivals, rope-bound, rope-generalization, "
+            "rope-tracking, rope-dagger, rope-residual, rope-markerless",
         ),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),
         (

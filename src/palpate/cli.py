@@ -48,6 +48,12 @@ COMMANDS = {
         "palpate.experiments.convert:run",
         {"": "palpate.experiments.options:Convert"},
     ),
+    "track": Command(
+        "follow an object through a camera's pictures",
+        "palpate.experiments.track:run",
+        {"rope": "palpate.experiments.rope_options:TrackRope"},
+        "family",
+    ),
     "identify": Command(
         "find an object's physical parameters from recordings of it",
         "palpate.experiments.identify:run",
@@ -95,6 +101,8 @@ COMMANDS = {
                 "rope-model",
                 "rope-stabilization",
                 "rope-ablation",
+                "rope-rivals",
+                "rope-bound",
                 "rope-generalization",
                 "rope-tracking",
                 "rope-dagger",

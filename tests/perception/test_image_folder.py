@@ -34,6 +34,50 @@ def test_what_was_written_is_read(tmp_path, depth):
             assert other.depth is None
 
 
+@pytest.fixture
+def filmed(tmp_path):
+    """The same frames, smooth ones, with a lossless video in place of pictures."""
+    av = pytest.importorskip("av")
+    shade = np.linspace(0, 255, 16 * 24).reshape(16, 24)
+    smooth = [
+        Frame(n / 30, np.stack([shade, 255 - shade, 80 * n + 0 * shade], -1).astype(np.uint8), None)
+        for n in range(3)
+    ]
+    write_image_folder(tmp_path, CAMERA, smooth, np.zeros((3, 3)))
+    for picture in (tmp_path / "colour").iterdir():
+        picture.unlink()
+    (tmp_path / "colour").rmdir()
+    with av.open(str(tmp_path / "colour.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 24, 16, "bgr0"
+        for frame in smooth:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame.colour, format="rgb24")))
+        container.mux(stream.encode())
+    return smooth
+
+
+def test_a_video_takes_the_place_of_pictures(tmp_path, filmed):
+    _, read, _ = read_image_folder(tmp_path)
+    for one, other in zip(filmed, read, strict=True):
+        assert other.time == pytest.approx(one.time, abs=1e-6)
+        assert np.abs(one.colour.astype(int) - other.colour).max() <= 2
+
+
+def test_a_video_has_one_frame_for_each_line(tmp_path, filmed):
+    times = tmp_path / "times.csv"
+    kept = times.read_text()
+    times.write_text(kept[: kept.rstrip().rindex("\n") + 1])
+    with pytest.raises(PalpateError, match="more frames than the 2 lines"):
+        read_image_folder(tmp_path)
+    times.write_text(f"{kept}last.png,9.0,0,0,0\n")
+    with pytest.raises(PalpateError, match=r"3 frames, and times\.csv has 4 lines"):
+        read_image_folder(tmp_path)
+    times.write_text(kept)
+    (tmp_path / "colour.mkv").write_bytes(b"no video")
+    with pytest.raises(PalpateError, match="is no video that can be read"):
+        read_image_folder(tmp_path)
+
+
 def test_folders_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(PalpateError, match=r"camera\.json"):
         read_image_folder(tmp_path)

@@ -145,11 +145,12 @@ def product_of(path: Path, product: str, command: str) -> Path:
 def fingerprint(path: Path) -> dict[str, str]:
     """Name and content of an input, so that a run never goes on with another one.
 
-    The content of a folder, such as that of a rosbag2, is that of the files in it.
+    The content of a folder, such as that of a rosbag2, is that of the files in and below it.
     """
     try:
         if path.is_dir():
-            inside = [fingerprint(file) for file in sorted(path.iterdir()) if file.is_file()]
+            files = [file for file in sorted(path.rglob("*")) if file.is_file()]
+            inside = [(str(file.relative_to(path)), fingerprint(file)) for file in files]
             digest = hashlib.sha256(repr(inside).encode())
             return {"file": path.name, "sha256": digest.hexdigest()}
         with path.open("rb") as file:

@@ -11,7 +11,7 @@ import numpy as np
 from palpate.experiments.rope_trials import Trial
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
-from palpate.perception.centre_line import centre_line, line_points
+from palpate.perception.centre_line import FEWEST, centre_lines, line_points
 from palpate.perception.rope_segmentation import Appearance, segment
 from palpate.perception.rope_tracking import REACH, RopeTracker
 from palpate.tasks import RopeStabilization
@@ -172,8 +172,8 @@ def _keep_picture(
     pixels, _ = world.pinhole.project(nodes[1:])
     apart = np.linalg.norm(pixels[:, None] - points.pixels[None], axis=-1)
     kept.hidden[step] = np.mean(apart.min(axis=1, initial=np.inf) > 3.0)
-    if len(points.pixels) >= 4:
-        line = centre_line(points, world.pinhole, gripper, length)
+    if len(points.pixels) >= FEWEST:
+        line = centre_lines(seen, world.pinhole, gripper, length)[0]
         kept.squared_error[1, step] = _mean_square(line.nodes(rest_length) - nodes)
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from palpate.errors import PalpateError
 from palpate.experiments.options import (
@@ -15,6 +16,7 @@ from palpate.experiments.options import (
     Evaluation,
     Identify,
     Number,
+    Options,
     Record,
     Train,
 )
@@ -73,6 +75,27 @@ class RecordRope(Record):
         told = {name: value for name, value in vars(self).items() if name in constants}
         seeds = np.random.SeedSequence(self.seed).generate_state(self.trials)
         return record_rope(RopeConfiguration(**told), seeds.tolist(), self.duration)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackRope(Options):
+    """Follow a rope through a calibrated camera's pictures, with its identified model.
+
+    PICTURES is a folder with camera.json, times.csv, and colour/ (PNG or JPEG) or colour.mp4;
+    depth/ (16-bit PNG, millimetres) if the camera has it. docs/rope.md says what stands in them.
+
+    1. An orange rope, 1 cm thick:              palpate track rope PICTURES --colour 0.9 0.5 0.2
+                                                    --radius 0.005 --model M --out R.npz
+    """
+
+    pictures: Positional[Annotated[Path, arg(metavar="PICTURES", help_behavior_hint="")]]
+    """What the camera saw, and where the gripper was."""
+    model: Annotated[Path, arg(metavar="MODEL")]
+    """What `palpate identify` wrote: its folder, or the model file in it."""
+    colour: Annotated[tuple[float, float, float], arg(metavar="RED GREEN BLUE")]
+    """Of the rope in good light, each from 0 to 1."""
+    radius: float
+    """Of the rope, m."""
 
 
 @dataclass(frozen=True, kw_only=True)

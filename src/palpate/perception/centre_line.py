@@ -1,18 +1,29 @@
-"""From the rope's pixels to its centre line: an ordered curve from the gripper, gaps filled.
+"""From the rope's pixels to its centre line: a curve from the gripper, gaps filled.
 
 Points of the centre line are found to a fraction of a pixel as ridges of the picture (Steger 1998,
-IEEE TPAMI 20:113-125). They are put in order by walking from the gripper: to the next point
-straight ahead, across a crossing rather than around its corner, and over gaps to the point that
-continues best. A smooth curve through the points in order fills the gaps and takes the noise off.
+IEEE TPAMI 20:113-125). Where along the rope a pixel lies is told in one of two ways.
+
+With depth, by the shortest way from the gripper from pixel to pixel through space (the geodesic
+distances of Tenenbaum, de Silva and Langford 2000, Science 290:2319-2323): strands that cross or
+lie upon each other in the picture are apart in space, and gaps are crossed where they are narrow.
+
+Without, by walking through the picture: to the next point straight ahead, across a crossing rather
+than around its corner, and over gaps to the point that continues best. How far away the rope is
+then follows from its length, if it hangs in a vertical plane: of those, there is mostly one in
+which it leans towards the camera and one in which it leans away.
+
+A smooth curve in between takes the noise off.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 from scipy.interpolate import BSpline
+from scipy.sparse.csgraph import dijkstra
 
 from palpate.errors import PalpateError
 from palpate.perception.rope_segmentation import Segmentation
@@ -20,13 +31,20 @@ from palpate.worlds.pinhole import Pinhole
 
 SCALE = 1.2  # pixels, of the Gaussian whose derivatives find the ridge
 LEAST_CURVATURE = 0.04  # of a ridge, in shares of a pixel per pixel^2
-STEP = 2.5  # pixels: how far apart neighbouring points of the centre line are at most
+SAME_STRAND = 0.06  # m, in depth, within which neighbouring pixels show one
+FEWEST = 4  # points of a rope
+STRIDE = 0.035  # m: pixels that are nearer in space are surely of the same strand
+STEP = 2.5  # pixels: how far apart neighbouring points of a walk are at most
 MOMENTUM = 1.0  # weight of the direction so far against the next point's
 AHEAD = 1.5  # pixels: how far ahead the next point is expected
 PASSED = 1.6  # pixels from the walk, within which points have been passed
+GAP = 6.0  # pixels: beyond a gap this wide a walk may have left the rope
 REACH_OVER_GAP = 0.45  # of the rope: the widest gap that is bridged
 PIECES = 14  # cubic polynomials in the smooth curve
-STIFFNESS = 0.02  # weight of the curve's bending against one point's miss
+STIFFNESS = 2e-3  # weight of the curve's bending against one point's miss
+AZIMUTHS = 90  # of vertical planes that are tried
+SURELY = 0.5  # strides of misfit by which one line is better than the other beyond doubt
+MISFIT = 0.1  # of the logarithm of the length, up to which a plane may be the rope's
 
 
 @dataclass(frozen=True)
@@ -44,14 +62,21 @@ class LinePoints:
 
 @dataclass(frozen=True)
 class CentreLine:
-    """A curve from the gripper: `points` (n, 3) in m, and `along` (n,), its length up to each.
-
-    `order` (k,): the points of the picture that it passes, in order.
-    """
+    """A curve from the gripper: `points` (n, 3) in m, and `along` (n,), its length up to each."""
 
     points: np.ndarray
     along: np.ndarray
-    order: np.ndarray
+
+    @classmethod
+    def through(cls, points: np.ndarray) -> CentreLine:
+        """The curve through `points` (n, 3)."""
+        chords = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+        return cls(points, np.concatenate([[0.0], np.cumsum(chords)]))
+
+    @property
+    def length(self) -> float:
+        """In m, as far as the rope was seen."""
+        return float(self.along[-1])
 
     def nodes(self, rest_length: np.ndarray) -> np.ndarray:
         """Positions (segments + 1, 3) in m of nodes `rest_length` (segments,) m apart along it.
@@ -66,7 +91,10 @@ class CentreLine:
 
 
 def line_points(segmentation: Segmentation) -> LinePoints:
-    """The ridges of the segmented picture, and the median depth of the 3 x 3 pixels around."""
+    """The ridges of the segmented picture, and the median depth of the 3 x 3 pixels around.
+
+    Of those pixels that show the same strand.
+    """
     share = segmentation.share
     rows, columns = np.nonzero(share)
     if not len(rows):
@@ -103,6 +131,11 @@ def _depth_around(depth: np.ndarray | None, rows: np.ndarray, columns: np.ndarra
     around = np.stack(
         [padded[rows + row, columns + column] for row in range(3) for column in range(3)], axis=-1
     )
+    # Of two strands, one before the other, that which the pixel itself shows.
+    own = np.where(
+        np.isfinite(depth[rows, columns]), depth[rows, columns], np.fmin.reduce(around, 1)
+    )
+    around[~(np.abs(around - own[:, None]) < SAME_STRAND)] = np.nan
     around = np.sort(around, axis=-1)  # NaN comes last
     count = np.isfinite(around).sum(-1)
     low, high = np.maximum(count - 1, 0) // 2, count // 2
@@ -112,35 +145,125 @@ def _depth_around(depth: np.ndarray | None, rows: np.ndarray, columns: np.ndarra
     )
 
 
-def centre_line(
-    points: LinePoints, pinhole: Pinhole, gripper: np.ndarray, length: float
-) -> CentreLine:
-    """The curve through `points` from `gripper` (3,) m, for a rope of about `length` m.
+def centre_lines(
+    segmentation: Segmentation, pinhole: Pinhole, gripper: np.ndarray, length: float
+) -> list[CentreLine]:
+    """Curves from `gripper` (3,) m that the picture may show, the likeliest first.
 
-    Without depth every point is taken to be as far from the camera as the gripper.
-    Raises `PalpateError` when fewer than four points are seen.
+    For a rope of about `length` m. With depth there are two at most, for the two ways to put pixels
+    in order, which mostly agree.
+    Raises `PalpateError` when less than four points of a rope are seen.
     """
-    if len(points.pixels) < 4:
-        raise PalpateError(
-            f"a centre line needs at least 4 points of the rope, {len(points.pixels)} are seen"
-        )
+    found = line_points(segmentation)
+    _enough(len(found.pixels))
     start, distance = pinhole.project(gripper)
-    order = _walk(points, start, length * pinhole.focal[0] / float(distance))
-    pixels = np.concatenate([start[None], points.pixels[order]])
-    depth = np.concatenate([[distance], points.depth[order]])
-    if not np.isfinite(depth[1:]).any():
-        depth[1:] = distance
-    known = np.isfinite(depth)
+    order = walk(found, start, length * pinhole.focal[0] / float(distance))
+    if segmentation.depth is None:
+        pixels = np.concatenate([start[None], found.pixels[order]])
+        return _leaning(pixels, pinhole, gripper, length)
+    rows, columns = np.nonzero((segmentation.share > 0) & np.isfinite(segmentation.depth))
+    _enough(len(rows))
+    pixels = np.stack([columns, rows], axis=-1)
+    points = pinhole.back_project(pixels, segmentation.depth[rows, columns])
+    lines = [_through_space(np.concatenate([gripper[None], points]), length)]
+    order = order[np.isfinite(found.depth[order])]
+    if len(order):
+        walked = pinhole.back_project(found.pixels[order], found.depth[order])
+        lines.append(_in_order(np.concatenate([gripper[None], walked])))
+    misfits = [_misfit(line, points, length) for line in lines]
+    if misfits[-1] < misfits[0] - SURELY:
+        lines, misfits = lines[::-1], misfits[::-1]
+    return [
+        line for line, misfit in zip(lines, misfits, strict=True) if misfit < misfits[0] + SURELY
+    ]
+
+
+def _enough(count: int) -> None:
+    if count < FEWEST:
+        raise PalpateError(
+            f"a centre line needs at least {FEWEST} points of the rope, {count} are seen"
+        )
+
+
+def _through_space(points: np.ndarray, length: float) -> CentreLine:
+    """The curve through `points` (n, 3) from the first of them, in the order of the shortest way.
+
+    A way that leaves a strand is longer by as much as the gap is wider than `STRIDE`.
+    """
+    apart = np.linalg.norm(points[:, None] - points, axis=-1)
+    cost = apart * np.maximum(apart / STRIDE, 1.0)
+    cost[apart > REACH_OVER_GAP * length] = np.inf
+    far, before = dijkstra(cost, indices=0, return_predecessors=True)
+    order = np.argsort(far, kind="stable")[: np.isfinite(far).sum()]
+    along = np.zeros(len(points))
+    for point in order[1:]:
+        along[point] = along[before[point]] + apart[point, before[point]]
+    order = order[np.argsort(along[order], kind="stable")]
+    return CentreLine.through(_smooth_curve(along[order], points[order]))
+
+
+def _in_order(points: np.ndarray) -> CentreLine:
+    """The curve through `points` (n, 3) one after the other."""
+    step = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    parameter = np.concatenate([[0.0], np.cumsum(np.maximum(step, 1e-4))])
+    return CentreLine.through(_smooth_curve(parameter, points))
+
+
+def _misfit(line: CentreLine, points: np.ndarray, length: float) -> float:
+    """How badly a line explains `points` (n, 3) and has points itself, and the rope's length.
+
+    Mean distances in strides, of at most two each; a length that is wrong by a tenth is a stride.
+    """
+    apart = np.linalg.norm(line.points[:, None] - points, axis=-1)
+    far = [np.minimum(apart.min(axis) / STRIDE, 2.0).mean() for axis in (0, 1)]
+    return sum(far) + min(abs(math.log(max(line.length, 1e-3) / length)) / 0.1, 2.0)
+
+
+def _leaning(
+    pixels: np.ndarray, pinhole: Pinhole, gripper: np.ndarray, length: float
+) -> list[CentreLine]:
+    """Lines along `pixels` (n, 2) from the gripper's on that are as long as the rope."""
     step = np.linalg.norm(np.diff(pixels, axis=0), axis=-1)
     parameter = np.concatenate([[0.0], np.cumsum(np.maximum(step, 1e-3))])
-    depth = np.interp(parameter, parameter[known], depth[known])
-    seen = pinhole.back_project(pixels, depth)
-    curve = _smooth_curve(parameter / parameter[-1], seen)
-    chords = np.linalg.norm(np.diff(curve, axis=0), axis=-1)
-    return CentreLine(curve, np.concatenate([[0.0], np.cumsum(chords)]), order)
+    # Behind a gap there may be more of the rope, or something else of its colour.
+    ends = np.append(np.flatnonzero(step[FEWEST:] > GAP) + FEWEST + 1, len(pixels))
+    lines = [
+        line
+        for end in ends
+        for line in _in_planes(
+            _smooth_curve(parameter[:end], pixels[:end]), pinhole, gripper, length
+        )
+    ]
+    if lines:
+        return [line for _, line in sorted(lines, key=lambda each: each[0])]
+    _, distance = pinhole.project(gripper)
+    flat = pinhole.back_project(_smooth_curve(parameter, pixels), np.asarray(distance))
+    return [CentreLine.through(flat)]
 
 
-def _walk(points: LinePoints, start: np.ndarray, length: float) -> np.ndarray:
+def _in_planes(
+    pixels: np.ndarray, pinhole: Pinhole, gripper: np.ndarray, length: float
+) -> list[tuple[float, CentreLine]]:
+    """Where the line of `pixels` (n, 2) is as long as the rope in a vertical plane.
+
+    Each with how far the logarithm of its length is from the rope's.
+    """
+    rays = pinhole.directions(pixels)
+    azimuths = np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+    normals = np.stack([-np.sin(azimuths), np.cos(azimuths), 0 * azimuths], axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (normals @ (gripper - pinhole.position))[:, None] / (normals @ rays.T)
+        curves = pinhole.position + depth[..., None] * rays
+        lengths = np.linalg.norm(np.diff(curves, axis=1), axis=-1).sum(-1)
+        misfit = np.abs(np.log(lengths / length))
+    possible = (depth > 0).all(1) & (misfit < MISFIT)
+    misfit[~possible] = np.inf
+    neighbours = np.minimum(np.roll(misfit, 1), np.roll(misfit, -1))
+    fits = np.flatnonzero(possible & (misfit <= neighbours))
+    return [(float(misfit[index]), CentreLine.through(curves[index])) for index in fits]
+
+
+def walk(points: LinePoints, start: np.ndarray, length: float) -> np.ndarray:
     """Indices of the points in order from the pixel `start`, for a rope of `length` pixels.
 
     A rope that comes towards the camera appears longer, so the walk may be half as long again.
@@ -201,14 +324,15 @@ def _next(
 
 
 def _smooth_curve(parameter: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """A curve (101, 3) near `points` (n, 3), given at `parameter` (n,) from 0 to 1.
+    """A curve (101, k) near `points` (n, k), given at increasing `parameter` (n,) from 0 on.
 
     A cubic spline on evenly spaced knots whose neighbouring coefficients' second differences are
     penalised (P-splines: Eilers and Marx 1996, Stat. Sci. 11:89-121). The first point, the
     gripper's, is certain.
     """
     knots = np.arange(-3, PIECES + 4) / PIECES
-    basis = BSpline.design_matrix(np.clip(parameter, 0, 1 - 1e-9), knots, 3).toarray()
+    share = np.clip(parameter / max(float(parameter[-1]), 1e-9), 0, 1 - 1e-9)
+    basis = BSpline.design_matrix(share, knots, 3).toarray()
     weight = np.ones(len(points))
     weight[0] = 100.0
     bending = np.diff(np.eye(PIECES + 3), 2, axis=0)

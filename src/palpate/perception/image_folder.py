@@ -6,10 +6,9 @@ The folder holds
                      "position": [x, y, z], "world_from_camera": [[...], [...], [...]]}
     times.csv       one line for each frame: its file name and time in s, and the gripper's position
                     then in m: name,time,x,y,z; the first line names the columns
-    colour/NAME     PNG or JPEG
+    colour/NAME     PNG or JPEG; or a video, colour.mp4 (.mkv, .avi, .mov, .webm), whose frames in
+                    their order are the lines of times.csv: its own clock is not asked
     depth/NAME.png  16 bits, millimetres along the optical axis, 0 where unknown; optional
-
-A video is first cut into such pictures; palpate reads no video files.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from palpate.storage import read_json, write_bytes, write_json, write_text
 from palpate.worlds.pinhole import Frame, Pinhole
 
 CAMERA, TIMES, COLOUR, DEPTH = "camera.json", "times.csv", "colour", "depth"
+FILMS = [f"{COLOUR}{suffix}" for suffix in (".mp4", ".mkv", ".avi", ".mov", ".webm")]
 COLUMNS = ["name", "time", "x", "y", "z"]
 
 
@@ -39,13 +39,15 @@ def read_image_folder(path: str | Path) -> tuple[Pinhole, list[Frame], np.ndarra
     pinhole = _camera(path / CAMERA)
     rows = _rows(path / TIMES)
     has_depth = (path / DEPTH).is_dir()
+    film = next((file for file in map(path.joinpath, FILMS) if file.is_file()), None)
+    pictures = None if film is None else _film(film, len(rows))
     frames = []
-    for name, moment, *_ in rows:
-        colour = _picture(path / COLOUR / name, "RGB")
+    for index, (name, moment, *_) in enumerate(rows):
+        colour = _picture(path / COLOUR / name, "RGB") if pictures is None else pictures[index]
         if colour.shape[:2] != (pinhole.height, pinhole.width):
             raise PalpateError(
-                f"{path / COLOUR / name} has {colour.shape[1]} x {colour.shape[0]} pixels and "
-                f"the camera {pinhole.width} x {pinhole.height}"
+                f"{film or path / COLOUR / name} has {colour.shape[1]} x {colour.shape[0]} pixels "
+                f"and the camera {pinhole.width} x {pinhole.height}"
             )
         depth = None
         if has_depth:
@@ -133,6 +135,32 @@ def _rows(path: Path) -> list[tuple[str, float, tuple[float, ...]]]:
     if not rows:
         raise PalpateError(f"{path} names no frames")
     return rows
+
+
+def _film(path: Path, count: int) -> list[np.ndarray]:
+    """The first `count` frames of a video; it has to have as many."""
+    try:
+        import av
+        from av.error import FFmpegError
+    except ImportError as error:
+        raise PalpateError(
+            f"reading {path} needs the package av: pip install 'palpate[video]', or cut the video "
+            f"into pictures in {path.parent / COLOUR}"
+        ) from error
+    pictures: list[np.ndarray] = []
+    try:
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                if len(pictures) == count:
+                    raise PalpateError(
+                        f"{path} has more frames than the {count} lines of {TIMES}: one for each"
+                    )
+                pictures.append(frame.to_ndarray(format="rgb24"))
+    except (FFmpegError, IndexError) as error:
+        raise PalpateError(f"{path} is no video that can be read ({error})") from error
+    if len(pictures) < count:
+        raise PalpateError(f"{path} has {len(pictures)} frames, and {TIMES} has {count} lines")
+    return pictures
 
 
 def _picture(path: Path, mode: str) -> np.ndarray:

@@ -49,10 +49,12 @@ class Segmentation:
 
     `share` (height, width): how much of each pixel it covers, 0 where it is not. `depth` (height,
     width), in m of the rope's axis, is NaN where it was not measured; None without a depth sensor.
+    `like_rope` (height, width): where the rope would not be seen, before something of its colour.
     """
 
     share: np.ndarray
     depth: np.ndarray | None
+    like_rope: np.ndarray
 
 
 def segment(
@@ -85,28 +87,40 @@ def segment(
     top, bottom, left, right = _window(pinhole, gripper, reach)
     share = np.zeros(frame.colour.shape[:2], np.float32)
     if bottom - top < 3 or right - left < 3:
-        return Segmentation(share, None if frame.depth is None else np.full_like(share, np.nan))
+        depth = None if frame.depth is None else np.full_like(share, np.nan)
+        return Segmentation(share, depth, np.zeros(share.shape, bool))
     picture = frame.colour[top:bottom, left:right].astype(np.float32) / 255
     tint = picture - picture.mean(-1, keepdims=True)
     along = tint @ hue
     across = np.sqrt(np.maximum((tint**2).sum(-1) - along**2, 0.0))
-    found = np.maximum(along - across, 0.0)
-    found -= ndimage.grey_opening(found, size=(WIDEST, WIDEST))
-    found = np.clip(found / (MOST_SHADE * strength), 0.0, 1.0)
-    found[found < LEAST_SHARE] = 0.0
+    found = np.clip(np.maximum(along - across, 0.0) / (MOST_SHADE * strength), 0.0, 1.0)
+    broad = ndimage.grey_opening(found, size=(WIDEST, WIDEST))
+    thin = found - broad
+    thin[thin < LEAST_SHARE] = 0.0
+    like_rope = np.zeros(share.shape, bool)
+    like_rope[top:bottom, left:right] = broad > LEAST_SHARE
     depth = None
     if frame.depth is not None:
         depth = np.full(share.shape, np.nan, np.float32)
         inside = depth[top:bottom, left:right]
         axis = frame.depth[top:bottom, left:right] + 0.25 * np.pi * rope.radius
+        found[found < LEAST_SHARE] = 0.0
         inside[:] = _within_reach(axis, found, pinhole, gripper, reach, (left, top))
+        near = np.isfinite(inside)
+        near &= ~ndimage.binary_opening(near, np.ones((WIDEST, WIDEST)))
+        inside[~near] = np.nan
         # A pixel on the rope's edge may show what lies behind, but has a neighbour that does not.
-        found *= ndimage.maximum_filter(np.isfinite(inside), size=3)
+        thin *= ndimage.binary_dilation(near, np.ones((3, 3)))
+        # Before something of its colour, the rope is what is near.
+        found = np.where(near & (broad > LEAST_SHARE), found, thin)
+        like_rope[:] = False
+    else:
+        found = thin
     labels, count = ndimage.label(found, structure=np.ones((3, 3)))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     found[sizes[labels] < LEAST_PIXELS] = 0.0
     share[top:bottom, left:right] = found
-    return Segmentation(share, depth)
+    return Segmentation(share, depth, like_rope)
 
 
 def _window(pinhole: Pinhole, gripper: np.ndarray, reach: float) -> tuple[int, int, int, int]:

@@ -14,3 +14,8 @@ def check_name(what: str, name: str, names: Iterable[str]) -> str:
     meant = difflib.get_close_matches(name, names, 1)
     guess = f"did you mean '{meant[0]}'? " if meant else ""
     raise PalpateError(f"unknown {what} '{name}'; {guess}there are: {', '.join(names)}")
+
+
+def suffix(label: str) -> str:
+    """What is said to a person, "MPPI 10 ms", as it stands in a figure's name: mppi_10_ms."""
+    return label.lower().replace(" ", "_")

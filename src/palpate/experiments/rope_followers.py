@@ -6,7 +6,7 @@ samples, 3) in m, world frame, one sample a control period, the first at the sta
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -235,6 +235,16 @@ class PlannedFollower(PlannedController):
     def goals_ahead(self, states: RopeState) -> Any:
         """Where the tips should be, from one control period from now."""
         return self._goal.ahead(jnp.arange(self._planner.horizon), self._step)
+
+
+def decision_times(planned: Mapping[str, Sequence[PlannedController]]) -> dict[str, list[float]]:
+    """Median and 99th percentile of each planner's decisions in this process, ms."""
+    spent = {name: np.concatenate([one.spent for one in some]) for name, some in planned.items()}
+    return {
+        name: (1e3 * np.quantile(values, (0.5, 0.99))).tolist()
+        for name, values in spent.items()
+        if len(values)
+    }
 
 
 def _length(state: RopeState) -> Float[Array, "*worlds"]:

@@ -7,7 +7,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.experiments.rope_followers import PlannedController, as_of_model
@@ -115,12 +114,3 @@ def decision_about(planner: CurvePlanner) -> Callable[[], Any]:
     plan = planner.init(jnp.zeros((1, 3)), jax.random.key(0))
     state, goals = hanging_rope(planner.model), jnp.ones(planner.horizon)
     return lambda: planner(plan, state, goals)
-
-
-def decision_times(planned: Mapping[str, PlannedController]) -> dict[str, list[float]]:
-    """Median and 99th percentile of each planner's decisions in this process, ms."""
-    return {
-        name: (1e3 * np.quantile(controller.spent, (0.5, 0.99))).tolist()
-        for name, controller in planned.items()
-        if controller.spent
-    }

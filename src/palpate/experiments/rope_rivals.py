@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import PalpateError
+from palpate.experiments.names import suffix
 from palpate.experiments.rope_baselines import TUNED, HeldStill, SwingDamper
 from palpate.experiments.rope_evaluation import (
     evaluate,
@@ -25,12 +26,12 @@ from palpate.experiments.rope_evaluation import (
     table,
     write_trial_evidence,
 )
+from palpate.experiments.rope_followers import decision_times
 from palpate.experiments.rope_model import undamped
 from palpate.experiments.rope_planners import (
     TUNING,
     PlannedStabiliser,
     decision_about,
-    decision_times,
     stabilising_planner,
 )
 from palpate.experiments.rope_recording import GRIPPER, MARKERS, constants
@@ -223,8 +224,13 @@ def _evaluated(
         evaluated = evaluate(controllers, trials, run)
         if not run.finished:
             write_trial_evidence(run, trials, evaluated, tuple(controllers))
-            planned = {n: c for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
-            finish(run, NAME, path.name, {"decision_ms": decision_times(planned)})
+            planned = {n: [c] for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
+            finish(
+                run,
+                NAME,
+                path.name,
+                {"decision_ms": decision_times({name: [one] for name, one in planned.items()})},
+            )
         return evaluated, read_json(run.path / RESULT)["decision_ms"], wall_time(run)
 
 
@@ -242,16 +248,12 @@ def _part(episodes: Episodes, chosen: Sequence[int]) -> Episodes:
 
 
 def _rows(trials: Sequence[Trial], episodes: Episodes, name: str) -> list[Figure]:
-    return figures(summarise(trials, episodes), f".{_suffix(name)}")
+    return figures(summarise(trials, episodes), f".{suffix(name)}")
 
 
 def _times(times: Mapping[str, Sequence[float]]) -> list[Figure]:
     rows = []
     for name, (median, late) in times.items():
-        rows.append(Figure(f"decision_ms_median.{_suffix(name)}", median, "ms"))
-        rows.append(Figure(f"decision_ms_p99.{_suffix(name)}", late, "ms"))
+        rows.append(Figure(f"decision_ms_median.{suffix(name)}", median, "ms"))
+        rows.append(Figure(f"decision_ms_p99.{suffix(name)}", late, "ms"))
     return rows
-
-
-def _suffix(name: str) -> str:
-    return name.replace(" ", "_")

@@ -10,7 +10,7 @@ Each stage is a run in a folder below `out`, and resumes there.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from palpate.experiments.names import suffix
 from palpate.experiments.rope_followers import (
     LearnedFollower,
     PlannedFollower,
     blind_followers,
+    decision_times,
     planner,
 )
 from palpate.experiments.rope_recording import constants
@@ -208,22 +210,12 @@ def _evaluated(
             if not run.finished:
                 shown = next(iter(who))
                 write_path_evidence(run, which, followed, shown)
-                finish(run, NAME, folder, {"decision_ms": _decision_times(planned)})
+                finish(run, NAME, folder, {"decision_ms": decision_times(planned)})
             times = read_json(run.path / "result.json")["decision_ms"]
             spent += wall_time(run)
         stages.append((which, followed, times))
     (_, followed, times), (some, slow, more) = stages
     return followed, (some, slow), times | more, spent
-
-
-def _decision_times(planned: Mapping[str, list[PlannedFollower]]) -> dict[str, list[float]]:
-    """Median and 99th percentile of each planner's decisions in this process, ms."""
-    spent = {name: np.concatenate([p.spent for p in all]) for name, all in planned.items()}
-    return {
-        name: (1e3 * np.quantile(values, (0.5, 0.99))).tolist()
-        for name, values in spent.items()
-        if len(values)
-    }
 
 
 def _figures(
@@ -246,16 +238,12 @@ def _figures(
         rows += figures(summarise(trials, followed[TRAINED], chosen), f".{path}")
     for name, summary in (summaries | {MPPI_MORE: more}).items():
         if name != TRAINED:
-            rows += figures(summary, f".{_suffix(name)}")
+            rows += figures(summary, f".{suffix(name)}")
     for name, (median, late) in times.items():
-        rows.append(Figure(f"decision_ms_median.{_suffix(name)}", median, "ms"))
-        rows.append(Figure(f"decision_ms_p99.{_suffix(name)}", late, "ms"))
+        rows.append(Figure(f"decision_ms_median.{suffix(name)}", median, "ms"))
+        rows.append(Figure(f"decision_ms_p99.{suffix(name)}", late, "ms"))
     return rows
 
 
 def _ratio(own: float | None, rival: float | None) -> float | None:
     return None if own is None or rival is None else own / rival
-
-
-def _suffix(name: str) -> str:
-    return name.lower().replace(" ", "_")

@@ -225,12 +225,7 @@ def _evaluated(
         if not run.finished:
             write_trial_evidence(run, trials, evaluated, tuple(controllers))
             planned = {n: [c] for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
-            finish(
-                run,
-                NAME,
-                path.name,
-                {"decision_ms": decision_times({name: [one] for name, one in planned.items()})},
-            )
+            finish(run, NAME, path.name, {"decision_ms": decision_times(planned)})
         return evaluated, read_json(run.path / RESULT)["decision_ms"], wall_time(run)
 
 

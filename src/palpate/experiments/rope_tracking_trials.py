@@ -272,23 +272,29 @@ def write_path_evidence(
 
 
 def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followed]) -> None:
-    """A PNG from above: where the tip should have been and was, on the first trial of each path."""
+    """A PNG of the first trial on each path.
+
+    Where the tip should have been and was, from above; and how far from there it was over time.
+    """
     from matplotlib.figure import Figure as Canvas
 
     drawn = first_on_each_path(trials)
-    canvas = Canvas(figsize=(4 * len(drawn), 4.5), layout="constrained")
-    for axis, index in zip(np.ravel(canvas.subplots(1, len(drawn))), drawn, strict=True):
+    canvas = Canvas(figsize=(4 * len(drawn), 7.5), layout="constrained")
+    axes = canvas.subplots(2, len(drawn), squeeze=False)
+    for index, above, below in zip(drawn, *axes, strict=True):
         trial = trials[index]
         path = trial.path[: trial.steps + 1]
-        axis.plot(path[:, 0], path[:, 1], color="black", linewidth=3, alpha=0.3, label="desired")
+        above.plot(path[:, 0], path[:, 1], color="black", linewidth=4, alpha=0.25, label="desired")
+        time = np.arange(trial.steps + 1) * trial.trial.configuration.control_period
         for style, (name, whole) in zip(STYLES, followed.items(), strict=False):
-            tips = whole.tips[index]
-            axis.plot(
-                tips[:, 0], tips[:, 1], color=style.light, linestyle=(0, style.dash), label=name,
-                linewidth=1,
-            )  # fmt: skip
-        axis.set(title=trial.name, xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axis.legend(fontsize=8)
+            look = {"color": style.light, "linestyle": (0, style.dash), "linewidth": 1}
+            tips = whole.tips[index, : trial.steps + 1]
+            above.plot(tips[:, 0], tips[:, 1], label=name, **look)
+            below.semilogy(time, 100 * np.linalg.norm(tips - path, axis=1), **look)
+        above.set(title=trial.name, xlabel="x (m)", ylabel="y (m)", aspect="equal")
+        below.set(xlabel="time (s)", ylabel="distance of the tip from the path (cm)")
+    canvas.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
+                  fontsize=8, frameon=False)  # fmt: skip
     buffer = io.BytesIO()
     canvas.savefig(buffer, format="png", dpi=150)
     write_bytes(file, buffer.getvalue())

@@ -35,10 +35,8 @@ def results_page() -> str:
 
 def _row(figure: dict) -> str:
     met = {True: "yes", False: "**no**", None: ""}[figure["met"]]
-    numbers = {
-        key: "" if figure[key] is None else f"{figure[key]:.4g}"
-        for key in ("value", "bar", "seed_document", "rival", "spread")
-    }
+    keys = ("value", "bar", "seed_document", "rival", "spread")
+    numbers = {key: _cell(figure[key]) for key in keys}
     bound = "≥ " if figure["better"] == "higher" else "≤ "
     bar = bound + numbers["bar"] if numbers["bar"] else ""
     cells = (
@@ -50,6 +48,13 @@ def _row(figure: dict) -> str:
         *(numbers[key] for key in ("seed_document", "rival", "spread")),
     )
     return f"| {' | '.join(cells)} |"
+
+
+def _cell(entry: float | str | None) -> str:
+    """A number, or what a rival is said to reach in words."""
+    if entry is None or isinstance(entry, str):
+        return entry or ""
+    return f"{entry:.4g}"
 
 
 _generated = Path(__file__).parent / "_generated"

@@ -185,6 +185,10 @@ class _Decisions:
         self._carry = policy.initial_carry(jnp.zeros((1, 3)))
 
     def __call__(self, state: RopeState) -> np.ndarray:
+        """The command (3,) in m/s; none where the rope's state is not known, as on a robot."""
+        if not (np.isfinite(state.position).all() and np.isfinite(state.velocity).all()):
+            self._carry = self._policy.initial_carry(jnp.zeros((1, 3)))
+            return np.zeros(3)
         self._carry, action = _decide(self._policy, RopeStabilization(), self._carry, state)
         return np.asarray(action)[0]
 

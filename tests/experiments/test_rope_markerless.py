@@ -2,13 +2,15 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from palpate.experiments import rope_filming, rope_markerless
 from palpate.experiments.rope_filming import film
+from palpate.experiments.rope_stabilization import shipped_policy
 from palpate.experiments.rope_trials import Trial
-from palpate.models.rope import Rope
+from palpate.models.rope import Rope, RopeState
 from palpate.runs import RESULT
 from palpate.worlds.camera import Sensor
 from palpate.worlds.rope import RopeConfiguration
@@ -81,3 +83,13 @@ def test_all_rows_are_filmed_once_and_resumed(tmp_path, monkeypatch):
     same = dataclasses.asdict(found["node_rmse_cm"])
     (figure,) = [figure for figure in again.figures if figure.name == "node_rmse_cm"]
     assert dataclasses.asdict(figure) == same
+
+
+def test_nobody_commands_a_rope_that_is_not_known():
+    policy, _ = shipped_policy()
+    decide = rope_filming._Decisions(policy)
+    known = RopeState(jnp.ones((11, 3)), jnp.ones((11, 3)))
+    assert np.abs(decide(known)).max() > 0
+    unknown = RopeState(known.position.at[4, 1].set(jnp.nan), known.velocity)
+    np.testing.assert_array_equal(decide(unknown), np.zeros(3))
+    assert np.isfinite(decide(known)).all()

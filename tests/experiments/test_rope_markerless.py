@@ -93,3 +93,16 @@ def test_nobody_commands_a_rope_that_is_not_known():
     unknown = RopeState(known.position.at[4, 1].set(jnp.nan), known.velocity)
     np.testing.assert_array_equal(decide(unknown), np.zeros(3))
     assert np.isfinite(decide(known)).all()
+
+
+def test_a_state_that_was_not_known_is_no_small_error():
+    true = np.zeros((1, 3, 11, 3), np.float32)
+    tracked = true.copy()
+    tracked[0, 1, 4] = np.nan
+    true[0, 2] = np.nan  # the simulation has diverged: nobody is blamed
+    squared = np.array([[[1e-4, np.nan, np.nan]]], np.float32)
+    arrays = {"tracked": tracked, "true": true, "squared_error": squared}
+    assert rope_markerless._rmse(rope_markerless._missed(arrays)) == np.inf
+    tracked[0, 1] = 0.0
+    squared[0, 0, 1] = 1e-4
+    assert rope_markerless._rmse(rope_markerless._missed(arrays)) == pytest.approx(1.0)

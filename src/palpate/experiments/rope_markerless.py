@@ -181,13 +181,23 @@ def _filmed(
                                       strict=True):  # fmt: skip
                 for part in arrays:
                     arrays[part][place] = getattr(filming, part)
-            tracked = arrays["squared_error"][: chosen[-1] + 1, 0]
+            tracked = _missed(arrays)[: chosen[-1] + 1]
             bar.show(rmse_cm=_rmse(tracked))
-            run.log(step, rmse_cm=_rmse(tracked))
+            run.log(step, rmse_cm=_finite(_rmse(tracked)))
             run.save(step, arrays)
             if stop:
                 break
     return arrays
+
+
+def _missed(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Squared errors of the tracker (trials, times) in m^2; infinite where it knew no state.
+
+    NaN stays where there was no rope any more to be followed: a mean leaves that out.
+    """
+    known = np.isfinite(arrays["tracked"]).all((-2, -1))
+    there = np.isfinite(arrays["true"]).all((-2, -1))
+    return np.where(there & ~known, np.inf, arrays["squared_error"][:, 0])
 
 
 def _rmse(squared: np.ndarray) -> float:
@@ -203,8 +213,11 @@ def _figures(
     took: np.ndarray,
 ) -> list[Figure]:
     swinging = np.concatenate([filmed[name]["squared_error"] for name in ("released", "shaken")])
-    by_trial = np.sqrt(np.nanmean(swinging[:, 0], axis=-1)) * 100.0
-    spread = float(2.0 * by_trial.std() / math.sqrt(len(by_trial)))
+    missed = np.concatenate([_missed(filmed[name]) for name in ("released", "shaken")])
+    by_trial = np.sqrt(np.nanmean(missed, axis=-1)) * 100.0
+    spread = None
+    if np.isfinite(by_trial).all():
+        spread = float(2.0 * by_trial.std() / math.sqrt(len(by_trial)))
     rates = {
         name: summarise(_trials(row, counts, seed), _episodes(filmed[name]))
         for name, row in ROWS.items()
@@ -215,8 +228,8 @@ def _figures(
     low, high = rates["stabilised"].interval
     rows = [
         Figure(
-            "node_rmse_cm", _rmse(swinging[:, 0]), "cm", bar=RMSE_BAR,
-            rival=_rmse(swinging[:, 1]), spread=spread,
+            "node_rmse_cm", _finite(_rmse(missed)), "cm", bar=RMSE_BAR,
+            rival=_finite(_rmse(swinging[:, 1])), spread=spread,
         ),
         Figure(
             "success_rate", rates["stabilised"].success_rate, "", bar=SUCCESS_BAR, better="higher",
@@ -229,9 +242,7 @@ def _figures(
         rows.append(Figure(name, _finite(_rmse(swinging[:, place])), "cm"))
     for name, arrays in filmed.items():
         suffix = name.replace(", ", ".").replace(" ", "_")
-        rows.append(
-            Figure(f"node_rmse_cm.{suffix}", _finite(_rmse(arrays["squared_error"][:, 0])), "cm")
-        )
+        rows.append(Figure(f"node_rmse_cm.{suffix}", _finite(_rmse(_missed(arrays))), "cm"))
         if not ROWS[name].controlled:
             rows.append(Figure(f"hidden_share.{suffix}", float(np.nanmean(arrays["hidden"])), ""))
     for name, summary in rates.items():

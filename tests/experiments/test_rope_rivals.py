@@ -1,5 +1,8 @@
 """Rivals on a small rope; identification and training are stood in for."""
 
+import sys
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -114,10 +117,11 @@ def calls(monkeypatch):
 
     methods = {"mppi": lambda *_: (16, 0.001), "gradient": too_slow}
     monkeypatch.setattr(rope_rivals, "METHODS", methods)
+    monkeypatch.setattr(rope_rivals, "sac_installed", lambda: False)
     return made
 
 
-def test_stages_hand_on_what_they_made(calls, tmp_path, capsys) -> None:
+def test_stages_hand_on_what_they_made(calls, monkeypatch, tmp_path, capsys) -> None:
     result = rope_rivals.reproduce(tmp_path, quick=True, seed=3)
     (_, first, seen), (_, limp, again), (_, trained, training) = calls
     assert (first.drive, limp.drive, trained.drive) == ("position", "position", "velocity")
@@ -127,7 +131,10 @@ def test_stages_hand_on_what_they_made(calls, tmp_path, capsys) -> None:
         assert not np.any(model.air_drag)
     assert training == TINY.training
     assert result.settings["within_10_ms"] == {"mppi": 16, "gradient": 0}
-    assert "gradient has no place within 0.01 s: one iteration already" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "gradient has no place within 0.01 s: one iteration already" in printed
+    assert printed.count("not run: it needs the package stable-baselines3") == 2  # and in the table
+    assert "palpate[sac]" in result.settings["SAC"]
     names = {row.name for row in result.figures}
     assert {
         "success_rate.policy",
@@ -139,6 +146,9 @@ def test_stages_hand_on_what_they_made(calls, tmp_path, capsys) -> None:
         "decision_ms_p99.gradient_unhurried",
     } <= names
     assert "success_rate.gradient_10_ms" not in names
+    values = {row.name: row.value for row in result.figures}
+    assert values["success_rate.sac"] is None
+    assert values["simulated_steps.undamped_policy"] == 8 * 128 * 150
     assert all(row.bar is None for row in result.figures)
     write_json(tmp_path / "result.json", result.to_dict())
     read_result(tmp_path / "result.json")
@@ -147,6 +157,33 @@ def test_stages_hand_on_what_they_made(calls, tmp_path, capsys) -> None:
     assert repeated.figures == result.figures
     with pytest.raises(PalpateError, match="seed was 3, now 4"):
         rope_rivals.reproduce(tmp_path, quick=True, seed=4)
+    capsys.readouterr()
+    asked = install_sac(monkeypatch)
+    more = rope_rivals.reproduce(tmp_path, quick=True, seed=3)
+    assert len(calls) == 3  # the other stages stay
+    assert asked == [("train-sac", "velocity", TINY.training, rope_rivals.FEW_ROUNDS, 3)]
+    values = {row.name: row.value for row in more.figures}
+    assert values["success_rate.sac"] == 0.0  # untrained
+    assert values["simulated_steps.sac"] == 640
+    assert values["training_s.sac"] == 2.0
+    assert more.settings["SAC"]["environment_steps"] == 640
+    assert "not run" not in capsys.readouterr().out
+
+
+def install_sac(monkeypatch) -> list[tuple]:
+    """Let SAC be there, stood in for; what it is asked for."""
+    asked = []
+
+    def trained_actor(path, model, training, sac, seed):
+        asked.append((path.name, model.drive, training, sac.rounds, seed))
+        return untrained(seed), {"environment_steps": 640, "wall_time_s": 2.0}
+
+    stand_in = SimpleNamespace(
+        Sac=lambda rounds: SimpleNamespace(rounds=rounds), trained_actor=trained_actor
+    )
+    monkeypatch.setitem(sys.modules, "palpate.experiments.rope_sac", stand_in)
+    monkeypatch.setattr(rope_rivals, "sac_installed", lambda: True)
+    return asked
 
 
 def test_a_part_of_the_episodes_keeps_its_failures() -> None:

@@ -3,13 +3,17 @@
 In MuJoCo ropes drawn as for `rope-stabilization`, from the same four start poses, side by side: the
 shipped policy; one trained with the same settings through the undamped model (Lv et al. 2017) that
 was identified from the same recording; MPPI, CEM and gradient MPC through the damped model, with
-what fits into 10 ms a decision and with more; the tuned swing damper; a gripper held still. There
-is no bar: who is better is what is to be found out.
+what fits into 10 ms a decision and with more; SAC, which acts in the damped model and does not
+differentiate it; the tuned swing damper; a gripper held still. There is no bar: who is better is
+what is to be found out.
+
+SAC needs the extra `sac`, and is not run without it.
 
 Each stage is a run in a folder below `out`, and resumes there.
 """
 
 import dataclasses
+import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,6 +53,7 @@ from palpate.experiments.rope_stabilization import (
 )
 from palpate.experiments.rope_trials import Controller, Episodes, LearnedController, Trial
 from palpate.identification.gradient import Settings, identify
+from palpate.learning import Training
 from palpate.models.files import load_model, save_model
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
@@ -64,20 +69,22 @@ from palpate.tasks import RopeStabilization
 NAME = "rope-rivals"
 BUDGET = 0.01  # s, a decision of a planner in a hurry
 EVALUATION_SEEDS = 960_000  # of ropes and noise, used by nothing else
-SHIPPED, UNDAMPED = "policy", "undamped policy"
+SHIPPED, UNDAMPED, SAC = "policy", "undamped policy", "SAC"
 METHODS = {"mppi": samples_within, "cem": samples_within, "gradient": iterations_within}
 UNHURRIED = {"mppi": 2048, "cem": 2048, "gradient": 5}  # samples; iterations
 SIZE = dataclasses.replace(
     FULL,
     ropes=2,
-    minutes={"recording": 1, "identification": 5, "training": 9, "evaluation": 10},
+    minutes={"recording": 1, "identification": 5, "training": 9, "SAC": 10, "evaluation": 10},
 )
 SMALL = dataclasses.replace(
     QUICK,
     training=dataclasses.replace(QUICK.training, iterations=60, batch=64, starts=1600),
     ropes=1,
-    minutes={"recording and identification": 1, "training": 1, "evaluation": 2},
+    minutes={"recording and identification": 1, "training": 1, "SAC": 1, "evaluation": 2},
 )
+ROUNDS, FEW_ROUNDS = 60, 3  # of SAC: episodes that each of its environments goes through
+NOT_RUN = "not run: it needs the package stable-baselines3, pip install 'palpate[sac]'"
 # When quick: from how many start poses all are tried, and those unhurried, which have this share.
 POSES, SLOW_POSES, LESS = 2, 1, 4
 
@@ -89,7 +96,10 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     another run, or when this installation has no shipped weights.
     """
     size = SMALL if quick else SIZE
-    announce(NAME, size.minutes)
+    installed = sac_installed()
+    announce(NAME, {name: time for name, time in size.minutes.items() if installed or name != SAC})
+    if not installed:
+        print(f"{SAC}: {NOT_RUN}", flush=True)
     policy, about = shipped_policy()
     model, spent = identified_rope(out, size, seed)
     lively, took = _identified_undamped(out, model, size, seed)
@@ -123,7 +133,13 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     whole, times, took = _evaluated(out / "evaluate", work, others | hurried, trials)
     some = [trials[index] for index in chosen]
     slow, slow_times, took_more = _evaluated(out / "evaluate-unhurried", work, unhurried, some)
-    print("\n".join([*table(trials, whole), *table(some, slow)]))
+    free, free_about = {}, None
+    if installed:
+        rounds = FEW_ROUNDS if quick else ROUNDS
+        free[SAC], free_about, more_time = _model_free(out, model, size, rounds, trials, seed)
+        spent += more_time
+    unknown = [] if installed else [f"{SAC:28s} {NOT_RUN}"]
+    print("\n".join([*table(trials, whole | free), *unknown, *table(some, slow)]))
     same = {name: _part(whole[name], chosen) for name in (SHIPPED, *hurried)}
     return Result(
         NAME,
@@ -132,12 +148,15 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             *(row for name in slow for row in _rows(some, slow[name], name)),
             *(row for name in same for row in _rows(some, same[name], f"{name} same trials")),
             *_times(times | slow_times),
+            *_model_free_rows(trials, free.get(SAC)),
+            *_effort(size.training, rival_about, free_about),
         ],
-        settings,
+        settings | {SAC: free_about or NOT_RUN},
         [seed],
         {
             "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
             "trained": f"{UNDAMPED}: through the undamped model of the same recording alone",
+            f"{SAC} trained": "in the damped model alone, drawn as in our own training",
             "planners tuned": "ropes of seed 7100, see `rope_planners`",
             "evaluated": (
                 f"{len(trials)} trials of {size.ropes} sampled ropes, seed "
@@ -146,6 +165,11 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         },
         spent + took + took_more,
     )
+
+
+def sac_installed() -> bool:
+    """Whether the library of SAC is there."""
+    return importlib.util.find_spec("stable_baselines3") is not None
 
 
 def _identified_undamped(out: Path, model: Rope, size: Size, seed: int) -> tuple[Rope, float]:
@@ -195,6 +219,41 @@ def _sizes_within(path: Path, model: Rope, seed: int) -> tuple[dict[str, int], f
             write_json(file, sizes)
             finish(run, NAME, "planners", {"sizes": sizes})
         return read_json(file), wall_time(run)
+
+
+def _model_free(
+    out: Path, model: Rope, size: Size, rounds: int, trials: Sequence[Trial], seed: int
+) -> tuple[Episodes, dict[str, Any], float]:
+    """What SAC does after so many rounds of training, how it was trained, and the seconds spent."""
+    from palpate.experiments.rope_sac import Sac, trained_actor  # an extra, and it takes seconds
+
+    actor, about = trained_actor(out / "train-sac", model, size.training, Sac(rounds), seed)
+    work = {"stage": "evaluate SAC", "seed": seed, "trials": len(trials), "policy": about}
+    controllers = {SAC: LearnedController(actor, RopeStabilization())}
+    evaluated, _, took = _evaluated(out / "evaluate-sac", work, controllers, trials)
+    return evaluated[SAC], about, about["wall_time_s"] + took
+
+
+def _model_free_rows(trials: Sequence[Trial], episodes: Episodes | None) -> list[Figure]:
+    if episodes is None:  # not run
+        return [Figure(f"success_rate.{suffix(SAC)}", None, "", better="higher")]
+    return _rows(trials, episodes, SAC)
+
+
+def _effort(
+    training: Training, own: Mapping[str, Any], free: Mapping[str, Any] | None
+) -> list[Figure]:
+    """Control periods simulated to train, and the seconds that took: our method's and SAC's."""
+    task = RopeStabilization()
+    steps = task.duration / BASE.control_period * sum(task.stages) / len(task.stages)
+    effort = {UNDAMPED: (training.iterations * training.batch * round(steps), own["wall_time_s"])}
+    if free is not None:
+        effort[SAC] = free["environment_steps"], free["wall_time_s"]
+    rows = []
+    for name, (simulated, seconds) in effort.items():
+        rows.append(Figure(f"simulated_steps.{suffix(name)}", simulated, ""))
+        rows.append(Figure(f"training_s.{suffix(name)}", seconds, "s"))
+    return rows
 
 
 def _learned(policy: CommandPolicy, rival: CommandPolicy) -> dict[str, Controller]:

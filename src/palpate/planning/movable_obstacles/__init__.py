@@ -1,0 +1,1 @@
+"""Navigation among movable obstacles: maps, regions, the planner, and its plans."""

@@ -1,0 +1,85 @@
+"""`palpate plan namo`: a map in; a plan among movable obstacles, its picture and animation out."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from palpate.experiments import folders
+from palpate.experiments.namo_options import PlanNamo
+from palpate.planning.movable_obstacles.map_files import read_map
+from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, read_plan, write_plan
+from palpate.planning.movable_obstacles.planner import Planner
+from palpate.report.namo_picture import plan_animation, plan_picture
+from palpate.result import Figure, Result
+
+PLAN, PICTURE, ANIMATION = "plan.json", "plan.png", "rendering.gif"
+
+
+def run(options: PlanNamo) -> Path:
+    """Plan, say what is to be done, and return the path of the plan.
+
+    Raises `PalpateError` for a map that cannot be read, an impossible start or goal, and when no
+    plan was found: the sentence says what keeps closed.
+    """
+    world = read_map(options.map)
+    configuration = folders.told(options, "plan namo")
+    configuration["map"] = folders.fingerprint(options.map)
+    with folders.open_run(options, "plan-namo", configuration, PLAN) as run:
+        if run.finished:
+            plan = read_plan(run.path / PLAN)
+        else:
+            plan = Planner(seed=options.seed).plan(world, options.goal, options.immovable)
+            write_plan(run.path / PLAN, plan)
+            plan_picture(run.path / PICTURE, world, plan)
+            plan_animation(run.path / ANIMATION, world, plan)
+            result = Result(
+                name="plan-namo",
+                figures=[
+                    Figure("planning_s", plan.planning_s, "s"),
+                    Figure("distance", plan.distance, "m"),
+                    Figure("carried", plan.carried, "m"),
+                    Figure("transfers", plan.transfers, ""),
+                    Figure("regions", plan.sizes["regions"], ""),
+                    Figure("evaluations", plan.sizes["evaluations"], ""),
+                ],
+                settings=configuration,
+                seeds=[options.seed],
+                split=None,
+                wall_time_s=run.elapsed,
+            )
+            run.finish(result.to_dict())
+        print("\n".join(told(plan)))
+        folders.hand_over(options, run, f"A plan on {world.name}", PLAN)
+        print(f"picture: {run.path / PICTURE}")
+        return folders.deliver(options, run, PLAN)
+
+
+def told(plan: Plan) -> list[str]:
+    """A sentence for every segment, and one for the whole."""
+    lines = []
+    for number, segment in enumerate(plan.segments, start=1):
+        x, y, theta = segment.poses[-1]
+        where = f"({x:.2f}, {y:.2f}) m, {math.degrees(theta):.0f} degrees"
+        if segment.kind == TRANSFER:
+            ways = " and ".join(segment.primitives)
+            sure = "" if segment.probability == 1 else f", {segment.probability:.0%} sure"
+            lines.append(
+                f"{number}. hold '{segment.name}' and {ways} to {where}: "
+                f"{segment.distance:.2f} m{sure}"
+            )
+        else:
+            lines.append(f"{number}. drive to {where}: {segment.distance:.2f} m")
+    turns = sum(_turned(segment.poses) for segment in plan.segments)
+    lines.append(
+        f"{plan.distance:.2f} m in all, {plan.carried:.2f} m of it carrying, "
+        f"{plan.transfers} transfers, {turns:.0f} degrees of turning; "
+        f"planned in {plan.planning_s:.3f} s"
+    )
+    return lines
+
+
+def _turned(poses: np.ndarray) -> float:
+    """Degrees that the robot turns in all."""
+    change = np.diff(poses[:, 2])
+    return float(np.degrees(np.abs(np.arctan2(np.sin(change), np.cos(change))).sum()))

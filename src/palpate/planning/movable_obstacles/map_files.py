@@ -1,0 +1,75 @@
+"""Maps by their file: namosim SVG, ROS map_server YAML, or our own JSON."""
+
+import dataclasses
+from pathlib import Path
+
+from palpate.errors import PalpateError
+from palpate.planning.movable_obstacles.map import Map
+from palpate.planning.movable_obstacles.map_description import (
+    SIDE_CAR,
+    hints_from,
+    read_described,
+    read_yaml,
+    side_car,
+)
+from palpate.planning.movable_obstacles.map_ros import read_ros
+from palpate.planning.movable_obstacles.map_svg import read_svg
+
+SUFFIXES = (".svg", ".yaml", ".yml", ".json")
+
+
+def read_map(path: str | Path) -> Map:
+    """The map in a file; its suffix says of which kind.
+
+    A side-car `NAME.movables.json` beside a drawing gives objects hints about their dynamics.
+    Raises `PalpateError` for another suffix and for a file that is no such map.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise PalpateError(f"{path} is a folder: expected a map, {_expected()}")
+    if not path.exists():
+        raise PalpateError(f"there is no file {path}")
+    if path.suffix == ".svg":
+        world = read_svg(path)
+        hints = hints_from(side_car(path))
+        movables = {
+            name: dataclasses.replace(movable, hints=hints.get(name, {}))
+            for name, movable in world.movables.items()
+        }
+        return dataclasses.replace(world, movables=movables)
+    if path.suffix in (".yaml", ".yml"):
+        return read_ros(path)
+    if path.suffix == ".json":
+        return read_described(path)
+    raise PalpateError(f"{path} has the suffix '{path.suffix}': expected {_expected()}")
+
+
+def maps_in(folder: str | Path) -> list[Path]:
+    """The files in a folder and below it that are maps of their own, in order of their names.
+
+    Side-cars, and the maps and drawings that a namosim YAML puts together, are none. Raises
+    `PalpateError` for no folder, and for one without maps.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise PalpateError(f"there is no folder {folder}")
+    found = [
+        path
+        for path in sorted(folder.rglob("*"))
+        if path.suffix in SUFFIXES and not path.stem.endswith(SIDE_CAR)
+    ]
+    parts: set[Path] = set()
+    for path in found:
+        if path.suffix in (".yaml", ".yml"):
+            content = read_yaml(path)
+            if isinstance(content, dict):
+                named = [content.get("map_yaml"), content.get("svg_file")]
+                parts |= {path.parent / str(name) for name in named if name is not None}
+    found = [path for path in found if path not in parts]
+    if not found:
+        raise PalpateError(f"{folder} holds no map: expected {_expected()}")
+    return found
+
+
+def _expected() -> str:
+    return "a namosim .svg, a ROS map_server .yaml, or a .json of our own"

@@ -1,0 +1,157 @@
+"""The `d` and `transform` of SVG paths as points, curves flattened to chords."""
+
+import math
+import re
+
+import numpy as np
+
+from palpate.errors import PalpateError
+
+_TOKEN = re.compile(r"([MmLlHhVvZzCcQqSsTtAa])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
+_COUNTS = {"M": 2, "L": 2, "H": 1, "V": 1, "Z": 0, "C": 6, "Q": 4, "S": 4, "T": 2, "A": 7}
+_CHORDS = 12  # of a curve: within 1 % of a quarter circle's radius
+_MOST = 200_000  # characters of a path
+_TRANSFORM = re.compile(r"(matrix|translate|scale|rotate|skewX|skewY)\s*\(([^)]*)\)")
+
+
+def path_points(d: str, what: str) -> np.ndarray:
+    """The points (points, 2) of the first closed or open outline in `d`, in the drawing's units.
+
+    Understands M L H V Z C S Q T A and their relative forms. Raises `PalpateError` for anything
+    else, a path that does not begin with a move, and one that is too long.
+    """
+    if len(d) > _MOST:
+        raise PalpateError(f"{what} has a path of {len(d)} characters: expected at most {_MOST}")
+    rest = _TOKEN.sub("", d)
+    if re.search(r"[^\s,]", rest):
+        raise PalpateError(
+            f"{what} has {rest.strip()[:20]!r} in its path: expected the commands "
+            "M L H V Z C S Q T A and numbers"
+        )
+    tokens = [(letter, number) for letter, number in _TOKEN.findall(d)]
+    if not tokens or tokens[0][0] not in ("M", "m"):
+        raise PalpateError(f"{what} has a path that does not begin with M: {d[:30]!r}")
+    points: list[np.ndarray] = []
+    here = np.zeros(2)
+    handle: np.ndarray | None = None  # the last control point, for S and T
+    command, position = "", 0
+    while position < len(tokens):
+        letter = tokens[position][0]
+        if letter:
+            command, position = letter, position + 1
+        elif command in ("Z", "z"):
+            raise PalpateError(f"{what} has numbers after its outline was closed")
+        kind = command.upper()
+        if kind == "Z":
+            break  # further outlines are not part of the body
+        if kind == "M" and points:
+            break
+        count = _COUNTS[kind]
+        numbers = [
+            float(number) for letter, number in tokens[position : position + count] if number
+        ]
+        if len(numbers) < count:
+            raise PalpateError(f"{what} has a path command {command} with too few numbers")
+        position += count
+        base = here if command.islower() else np.zeros(2)
+        new, handle = _drawn(kind, np.array(numbers), here, base, handle)
+        points.extend(new)
+        here = points[-1]
+        if kind == "M":
+            command = "l" if command == "m" else "L"
+    return np.array(points)
+
+
+def _drawn(
+    kind: str, numbers: np.ndarray, here: np.ndarray, base: np.ndarray, handle: np.ndarray | None
+) -> tuple[list[np.ndarray], np.ndarray | None]:
+    """The points that a command adds, and the control point that the next one may mirror."""
+    along = np.linspace(0, 1, _CHORDS + 1)[1:, None]
+    if kind == "H":
+        return [np.array([numbers[0] + base[0], here[1]])], None
+    if kind == "V":
+        return [np.array([here[0], numbers[0] + base[1]])], None
+    if kind == "A":
+        return _arc(here, numbers[:5], numbers[5:] + base), None
+    places = numbers.reshape(-1, 2) + base
+    if kind in ("M", "L"):
+        return [places[0]], None
+    if kind in ("S", "T"):
+        mirrored = here if handle is None else 2 * here - handle
+        places = np.vstack([mirrored, places])
+    if kind in ("C", "S"):
+        first, second, end = places
+        curve = (
+            (1 - along) ** 3 * here
+            + 3 * (1 - along) ** 2 * along * first
+            + 3 * (1 - along) * along**2 * second
+            + along**3 * end
+        )
+        return list(curve), second
+    first, end = places
+    curve = (1 - along) ** 2 * here + 2 * (1 - along) * along * first + along**2 * end
+    return list(curve), first
+
+
+def _arc(begin: np.ndarray, numbers: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
+    """An elliptic arc from its ends: SVG 1.1, appendix F.6."""
+    rx, ry = np.abs(numbers[:2])
+    if rx == 0 or ry == 0 or np.allclose(begin, end):
+        return [end]
+    tilt, large, sweep = math.radians(numbers[2]), bool(numbers[3]), bool(numbers[4])
+    turn = np.array([[math.cos(tilt), math.sin(tilt)], [-math.sin(tilt), math.cos(tilt)]])
+    x, y = turn @ (begin - end) / 2
+    scale = max(1.0, math.sqrt((x / rx) ** 2 + (y / ry) ** 2))
+    rx, ry = rx * scale, ry * scale
+    square = (rx * ry) ** 2 / ((rx * y) ** 2 + (ry * x) ** 2) - 1
+    factor = math.sqrt(max(0.0, square)) * (-1 if large == sweep else 1)
+    centre = factor * np.array([rx * y / ry, -ry * x / rx])
+    first = math.atan2((y - centre[1]) / ry, (x - centre[0]) / rx)
+    last = math.atan2((-y - centre[1]) / ry, (-x - centre[0]) / rx)
+    if sweep and last < first:
+        last += 2 * math.pi
+    if not sweep and last > first:
+        last -= 2 * math.pi
+    angles = np.linspace(first, last, _CHORDS + 1)[1:]
+    circle = np.stack([rx * np.cos(angles), ry * np.sin(angles)], axis=1) + centre
+    points = list(circle @ turn + (begin + end) / 2)
+    points[-1] = end
+    return points
+
+
+def transform_matrix(text: str, what: str) -> np.ndarray:
+    """A `transform` attribute as a matrix (3, 3); raises `PalpateError` for one it cannot read."""
+    matrix = np.eye(3)
+    if re.search(r"[^\s,]", _TRANSFORM.sub("", text)):
+        raise PalpateError(
+            f"{what} has the transform {text[:40]!r}: expected matrix, translate, "
+            "scale, rotate, skewX or skewY"
+        )
+    for name, inside in _TRANSFORM.findall(text):
+        try:
+            numbers = [float(number) for number in re.split(r"[\s,]+", inside.strip())]
+            matrix = matrix @ _step(name, numbers)
+        except (ValueError, IndexError) as error:
+            raise PalpateError(f"{what} has the transform {name}({inside[:30]})") from error
+    return matrix
+
+
+def _step(name: str, numbers: list[float]) -> np.ndarray:
+    a, b, c, d, e, f = 1.0, 0.0, 0.0, 1.0, 0.0, 0.0
+    if name == "matrix":
+        a, b, c, d, e, f = numbers
+    elif name == "translate":
+        e, f = numbers[0], numbers[1] if len(numbers) > 1 else 0.0
+    elif name == "scale":
+        a, d = numbers[0], numbers[1] if len(numbers) > 1 else numbers[0]
+    elif name == "rotate":
+        angle = math.radians(numbers[0])
+        a, b, c, d = math.cos(angle), math.sin(angle), -math.sin(angle), math.cos(angle)
+        if len(numbers) > 2:
+            x, y = numbers[1:3]
+            e, f = x - a * x - c * y, y - b * x - d * y
+    elif name == "skewX":
+        c = math.tan(math.radians(numbers[0]))
+    else:
+        b = math.tan(math.radians(numbers[0]))
+    return np.array([[a, c, e], [b, d, f], [0.0, 0.0, 1.0]])

@@ -35,6 +35,11 @@ class Model(eqx.Module):
     def observation_shape(self) -> tuple[int, ...]:
         """Shape of one observation."""
 
+    @property
+    def observation_units(self) -> tuple[str, ...]:
+        """Unit of each element of an observation's last axis; empty where the model names none."""
+        return ("",) * self.observation_shape[-1]
+
     @abstractmethod
     def step(self, state: Any, action: Array) -> Any:
         """The state one control period later."""
@@ -42,6 +47,10 @@ class Model(eqx.Module):
     @abstractmethod
     def observe(self, state: Any) -> Array:
         """What a sensor would show in this state."""
+
+    def difference(self, predicted: Array, observed: Array) -> Array:
+        """What separates two observations: predicted minus observed, angles the short way round."""
+        return predicted - observed
 
     @abstractmethod
     def initial_state(self, observations: Array) -> Any:

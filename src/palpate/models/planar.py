@@ -1,0 +1,353 @@
+"""Rigid bodies in the plane on wheels, pivots and links (physics-based RL, Scholz et al. 2014)."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from palpate.models import planar_step
+from palpate.models.model import Model
+from palpate.models.planar_friction import Rolling, Wheel, wheel_axes
+from palpate.models.planar_geometry import Shapes
+from palpate.models.planar_links import COINCIDENT, Links, turn
+from palpate.parameters import LogNormal, Normal, Parameter, Uniform, as_floating, parameter
+
+TIPPING = 0.95  # of the way to the feet on one side: where the centre of mass is at most
+
+
+class PlanarState(eqx.Module):
+    """Pose (x, y in m, theta in rad, not wrapped) of each body's frame in the world, and its rate.
+
+    A frame's origin is the centroid of the body's outline. Velocities are in the world's axes.
+    """
+
+    pose: Float[Array, "*batch bodies 3"]
+    velocity: Float[Array, "*batch bodies 3"]
+
+
+def _data(dtype: type = float) -> Any:
+    """A field that is structure as data: neither a parameter, nor compiled in."""
+    if dtype is int:
+        return eqx.field(converter=lambda value: jnp.asarray(value, jnp.int32))
+    return eqx.field(converter=as_floating)
+
+
+class Planar(Model):
+    """Rigid bodies in the plane, pushed about on a floor (Scholz et al., ICML 2014).
+
+    An action is a wrench on each body, held for one control period: force (N) in the world's axes
+    and torque (N m) about the origin of the body's frame. What resists it:
+
+    - the floor under every body: dry friction at four feet that share its weight, and damping in
+      proportion to its mass about its centre of mass. The whole weight counts, whatever wheels
+      carry: what rolls on casters has a small floor friction, and a wheel takes its own;
+    - wheels, each with a direction in the body. A dry one (`dry` = 1) gives way along and across
+      at the forces `wheel_along` and `wheel_across`, in any other direction on the ellipse between
+      them. A viscous one (`dry` = 0, the law of the thesis) resists with these forces at 1 m/s and
+      in proportion. Both large: a locked caster. Along small and across large: a fixed wheel;
+    - links: a pivot holds a point of the body at a point of the world or of another body, a
+      distance keeps two such points as far apart as they are at `link_pose`.
+
+    Lengths that place something on a body are shares of its half width and half depth, so that one
+    prior serves a stool and a couch.
+
+    A wheel turned by a quarter with along and across swapped is the same wheel. The prior keeps
+    the direction within 45 degrees of the body's x axis, where each wheel has one name, and wheels
+    that are square to the furniture lie in the middle of it. (The other choice, any direction with
+    along <= across, cuts the posterior of a locked wheel in two.)
+
+    Which wheels and links there are, their law, what a link leads to (-1: the world) and which
+    bodies are bolted down is data: hypotheses about it are a batch axis. Batch axes of parameters
+    and structure lead, as those of states and actions do.
+    """
+
+    mass: Float[Array, "*batch bodies"] = parameter(
+        "kg", prior=LogNormal(15.0, 1.0), spread=0.3, about="mass of the body"
+    )
+    centre_of_mass: Float[Array, "*batch bodies 2"] = parameter(
+        "half extent",
+        prior=Normal(0.0, 0.25),
+        about="centre of mass from the outline's centroid, in half extents along x and y",
+    )
+    gyration: Float[Array, "*batch bodies"] = parameter(
+        "1",
+        prior=LogNormal(1.0, 0.3),
+        spread=0.1,
+        about="radius of gyration about the centre of mass, in that of the outline filled evenly",
+    )
+    restitution: Float[Array, "*batch bodies"] = parameter(
+        "1",
+        prior=Uniform(0.0, 1.0),
+        about="speed after an impact per speed before; of two bodies the geometric mean",
+    )
+    contact_friction: Float[Array, "*batch bodies"] = parameter(
+        "1",
+        prior=Uniform(0.0, 1.0),
+        about="friction where bodies touch; of two bodies the geometric mean",
+    )
+    floor_friction: Float[Array, "*batch bodies"] = parameter(
+        "1",
+        prior=LogNormal(0.05, 1.5),
+        spread=0.3,
+        about="dry friction on the floor per weight of the body",
+    )
+    floor_damping: Float[Array, "*batch bodies"] = parameter(
+        "1/s",
+        prior=LogNormal(0.1, 1.5),
+        spread=0.3,
+        about="viscous friction on the floor per mass: the rate at which a glide fades",
+    )
+    floor_spread: Float[Array, "*batch bodies"] = parameter(
+        "1",
+        prior=LogNormal(0.8, 0.2),
+        about="where the feet stand that the floor holds, in half extents along x and y",
+    )
+    wheel_position: Float[Array, "*batch bodies wheels 2"] = parameter(
+        "half extent",
+        prior=Normal(0.0, 0.6),
+        about="where the wheel touches the floor from the centroid, in half extents along x and y",
+    )
+    wheel_direction: Float[Array, "*batch bodies wheels"] = parameter(
+        "rad",
+        prior=Uniform(-jnp.pi / 4, jnp.pi / 4),
+        about="rolling direction from the body's x axis; a quarter turn swaps along and across",
+    )
+    wheel_along: Float[Array, "*batch bodies wheels"] = parameter(
+        "N",
+        prior=LogNormal(5.0, 2.0),
+        spread=0.3,
+        about="force at which a dry wheel rolls; of a viscous one the force at 1 m/s",
+    )
+    wheel_across: Float[Array, "*batch bodies wheels"] = parameter(
+        "N",
+        prior=LogNormal(5.0, 2.0),
+        spread=0.3,
+        about="force at which a dry wheel slips sideways; of a viscous one the force at 1 m/s",
+    )
+    link_anchor: Float[Array, "*batch bodies links 2"] = parameter(
+        "half extent",
+        prior=Normal(0.0, 0.7),
+        about="where a link holds the body, from the centroid in half extents along x and y",
+    )
+    link_other_anchor: Float[Array, "*batch bodies links 2"] = parameter(
+        "half extent",
+        prior=Normal(None, 0.7),
+        about="where a distance holds the other body, or a point of the world in m; a pivot's "
+        "follows from its own anchor",
+    )
+    # structure
+    outline: Float[Array, "*batch bodies parts corners 2"] = _data()
+    walls: Float[Array, "*batch walls corners 2"] = _data()
+    half_extent: Float[Array, "*batch bodies 2"] = _data()
+    even_gyration: Float[Array, "*batch bodies"] = _data()
+    bolted: Float[Array, "*batch bodies"] = _data()
+    wheel: Float[Array, "*batch bodies wheels"] = _data()
+    dry: Float[Array, "*batch bodies wheels"] = _data()
+    pivot: Float[Array, "*batch bodies links"] = _data()
+    distance: Float[Array, "*batch bodies links"] = _data()
+    link_to: Int[Array, "*batch bodies links"] = _data(int)
+    link_pose: Float[Array, "*batch bodies links 3"] = _data()
+    pairs: Int[Array, "*batch pairs 4"] = _data(int)
+    control_period: float = eqx.field(static=True, default=0.02)
+    substeps: int = eqx.field(static=True, default=1)
+    iterations: int = eqx.field(static=True, default=3)
+    overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies."""
+        return self.mass.shape[-1]
+
+    @property
+    def action_shape(self) -> tuple[int, int]:
+        """(bodies, 3): force x and y (N) and torque (N m)."""
+        return self.bodies, 3
+
+    @property
+    def observation_shape(self) -> tuple[int, int]:
+        """(bodies, 3): poses."""
+        return self.bodies, 3
+
+    @property
+    def observation_units(self) -> tuple[str, str, str]:
+        """Of x, y and theta."""
+        return "m", "m", "rad"
+
+    def observe(self, state: PlanarState) -> Float[Array, "*batch bodies 3"]:
+        """Poses of the bodies."""
+        return state.pose
+
+    def difference(
+        self, predicted: Float[Array, "*batch bodies 3"], observed: Float[Array, "*batch bodies 3"]
+    ) -> Float[Array, "*batch bodies 3"]:
+        """Predicted minus observed poses, angles between -pi and pi."""
+        off = predicted - observed
+        return off.at[..., 2].set(wrapped(off[..., 2]))
+
+    def initial_state(self, observations: Float[Array, "*batch frames bodies 3"]) -> PlanarState:
+        """The state at the last of a few frames: on the straight line that fits them best.
+
+        With one frame at rest. Angles may be wrapped or not. Noise s of a pose becomes
+        sqrt(12 / n^3) s / period in the velocity of n frames.
+        """
+        frames = observations.shape[-3]
+        last = observations[..., -1, :, :]
+        if frames < 2:
+            return PlanarState(last, jnp.zeros_like(last))
+        steps = self.difference(observations[..., 1:, :, :], observations[..., :-1, :, :])
+        back = jnp.flip(jnp.cumsum(jnp.flip(steps, axis=-3), axis=-3), axis=-3)
+        change = jnp.concatenate([-back, jnp.zeros_like(back[..., :1, :, :])], axis=-3)
+        time = self.control_period * jnp.arange(1 - frames, 1, dtype=last.dtype)[:, None, None]
+        centred = time - jnp.mean(time)
+        slope = jnp.sum(centred * change, axis=-3) / jnp.sum(jnp.square(centred))
+        offset = jnp.mean(change, axis=-3) - slope * jnp.mean(time)
+        return PlanarState(last + (offset if frames > 2 else 0.0), slope)
+
+    def step(self, state: PlanarState, action: Float[Array, "*batch bodies 3"]) -> PlanarState:
+        """The state one control period later."""
+        leaves, structure = jax.tree.flatten((self, state, action))
+        batched = [leaf.ndim > axes for leaf, axes in zip(leaves, _AXES, strict=True)]
+        if not any(batched):
+            return self._step(state, action)
+
+        def one(*leaves: Array) -> PlanarState:
+            model, state, action = jax.tree.unflatten(structure, leaves)
+            return model._step(state, action)
+
+        return jax.vmap(one, in_axes=[0 if axis else None for axis in batched])(*leaves)
+
+    def linked_at(self, poses: Float[Array, "bodies 3"]) -> "Planar":
+        """The model whose links hold as they stand at these poses."""
+        poses = jnp.asarray(poses, self.link_pose.dtype)
+        other = poses[self.link_to]
+        own = jnp.broadcast_to(poses[:, None], other.shape)
+        cosine, sine = jnp.cos(other[..., 2]), -jnp.sin(other[..., 2])
+        apart = own - other
+        x, y = turn(apart[..., 0], apart[..., 1], cosine, sine)
+        relative = jnp.stack([x, y, apart[..., 2]], axis=-1)
+        to_world = (self.link_to < 0)[..., None]
+        return dataclasses.replace(self, link_pose=jnp.where(to_world, own, relative))
+
+    def wrench_at(
+        self,
+        pose: Float[Array, "*batch bodies 3"],
+        body: int,
+        point: Float[Array, "*batch 2"],
+        force: Float[Array, "*batch 2"],
+    ) -> Float[Array, "*batch bodies 3"]:
+        """The action that pushes one body with a force (N, world axes) at a point of it.
+
+        `point` is in m in the body's frame: where it is touched or grasped.
+        """
+        angle = pose[..., body, 2]
+        x, y = turn(point[..., 0], point[..., 1], jnp.cos(angle), jnp.sin(angle))
+        torque = x * force[..., 1] - y * force[..., 0]
+        wrench = jnp.concatenate([force, torque[..., None]], axis=-1)
+        return jnp.zeros_like(pose).at[..., body, :].set(wrench)
+
+    def kinetic_energy(self, state: PlanarState) -> Float[Array, "*batch bodies"]:
+        """Kinetic energy of each body, J."""
+        centre = self.centre_of_mass * self.half_extent
+        angle, rate = state.pose[..., 2], state.velocity[..., 2]
+        x, y = turn(centre[..., 0], centre[..., 1], jnp.cos(angle), jnp.sin(angle))
+        squared = jnp.square(state.velocity[..., 0] - rate * y)
+        squared = squared + jnp.square(state.velocity[..., 1] + rate * x)
+        gyration = self.gyration * self.even_gyration
+        return 0.5 * self.mass * (squared + jnp.square(gyration * rate))
+
+    def _step(self, state: PlanarState, action: Float[Array, "bodies 3"]) -> PlanarState:
+        system, time_step = self._system(), self.control_period / self.substeps
+
+        def advance(state: PlanarState, _: None) -> tuple[PlanarState, None]:
+            pose, velocity = planar_step.advance(
+                system, state.pose, state.velocity, action, time_step, self.iterations
+            )
+            return PlanarState(pose, velocity), None
+
+        loose = 1.0 - self.bolted
+        state = PlanarState(state.pose, loose[:, None] * state.velocity)
+        if self.substeps == 1:
+            return advance(state, None)[0]
+        return jax.lax.scan(advance, state, length=self.substeps)[0]
+
+    def _feet(self, centre: Float[Array, "bodies 2"]) -> dict[str, Array]:
+        """Four feet of each body as `Rolling` has them, with the loads that balance it."""
+        reach = self.floor_spread[:, None] * self.half_extent
+        balance = jnp.clip(centre / reach, -TIPPING, TIPPING)
+        side_x, side_y = jnp.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, -1.0, 1.0]], reach.dtype)
+        share = 0.25 * (1.0 + side_x * balance[:, :1]) * (1.0 + side_y * balance[:, 1:])
+        friction = planar_step.GRAVITY * self.mass * self.floor_friction
+        return {
+            "foot_x": side_x * reach[:, :1] - centre[:, :1],
+            "foot_y": side_y * reach[:, 1:] - centre[:, 1:],
+            "foot_friction": friction[:, None] * share,
+        }
+
+    def _system(self) -> planar_step.System:
+        """The parameters as a step uses them, without batch axes."""
+        centre = self.centre_of_mass * self.half_extent
+        lever = self.wheel_position * self.half_extent[:, None] - centre[:, None]
+        wheels = []
+        for i in range(self.wheel.shape[-1]):
+            along, across = wheel_axes(lever[:, i, 0], lever[:, i, 1], self.wheel_direction[:, i])
+            exists, dry = self.wheel[:, i], self.dry[:, i]
+            rolling = jnp.where(exists > 0, self.wheel_along[:, i], 1.0)
+            slipping = jnp.where(exists > 0, self.wheel_across[:, i], 1.0)
+            wheels.append(Wheel(along, across, rolling, slipping, dry, exists))
+        anchor = self.link_anchor * self.half_extent[:, None]
+        # a pivot holds on to where its own anchor is at `link_pose`
+        cosine, sine = jnp.cos(self.link_pose[..., 2]), jnp.sin(self.link_pose[..., 2])
+        x, y = turn(anchor[..., 0], anchor[..., 1], cosine, sine)
+        made = jnp.stack([x, y], axis=-1) + self.link_pose[..., :2]
+        to_world = (self.link_to < 0)[..., None]
+        other_extent = jnp.where(to_world, 1.0, self.half_extent[self.link_to])
+        other_anchor = self.link_other_anchor * other_extent
+        gap = jnp.sum(jnp.square(made - other_anchor), axis=-1)
+        mass = self.mass * (1.0 + planar_step.BOLTED * self.bolted)
+        return planar_step.System(
+            bodies=Rolling(
+                mass=mass,
+                inertia=mass * jnp.square(self.gyration * self.even_gyration),
+                **self._feet(centre),
+                floor_viscosity=self.mass * self.floor_damping,
+                floor_radius=self.even_gyration,
+                wheels=tuple(wheels),
+            ),
+            centre=(centre[:, 0], centre[:, 1]),
+            links=Links(
+                anchor=anchor,
+                other_anchor=jnp.where(self.pivot[..., None] > 0, made, other_anchor),
+                length=jnp.sqrt(gap + COINCIDENT),
+                to=self.link_to,
+                pivot=self.pivot,
+                distance=self.distance,
+            ),
+            shapes=Shapes(
+                outline=self.outline,
+                walls=self.walls,
+                pairs=self.pairs,
+            ),
+            restitution=self.restitution,
+            contact_friction=self.contact_friction,
+        )
+
+
+def wrapped(angle: Array) -> Array:
+    """The angle between -pi and pi that points the same way."""
+    return angle - 2.0 * jnp.pi * jnp.round(angle / (2.0 * jnp.pi))
+
+
+def _axes_of(kind: type) -> list[int]:
+    """How many axes the array fields of a module have without a batch's."""
+    annotations: list[Any] = [field.type for field in dataclasses.fields(kind)]
+    return [
+        sum(not axis.startswith("*") for axis in annotation.dim_str.split())
+        for annotation in annotations
+        if hasattr(annotation, "dim_str")
+    ]
+
+
+_AXES = (*_axes_of(Planar), *_axes_of(PlanarState), 2)

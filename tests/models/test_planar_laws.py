@@ -1,0 +1,285 @@
+"""Planar bodies against closed forms: free motion, floor, wheels, pivots and distances."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.models.model import rollout
+from palpate.models.planar import Planar, PlanarState
+from palpate.models.planar_friction import STICTION
+from palpate.models.planar_shapes import furniture, rectangle
+from palpate.models.planar_step import GRAVITY
+
+run = jax.jit(rollout)
+BOX = rectangle(1.2, 0.6)
+SMOOTH = {"floor_friction": 0.0, "floor_damping": 0.0}
+
+
+def body(wheels: int = 0, **fields) -> Planar:
+    """A box of 10 kg on a floor without friction."""
+    return furniture([BOX], **({"mass": 10.0, "wheels": wheels} | SMOOTH | fields))
+
+
+def at(*pose: float, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PlanarState:
+    return PlanarState(jnp.array([pose or (0.0, 0.0, 0.0)]), jnp.array([velocity]))
+
+
+def pushed(model: Planar, state: PlanarState, seconds: float, wrench=(0.0, 0.0, 0.0)):
+    """Poses and velocities after each period under a constant wrench."""
+    periods = round(seconds / model.control_period)
+    action = jnp.tile(jnp.asarray(wrench, state.pose.dtype), (periods, model.bodies, 1))
+    states = run(model, state, action)
+    return np.asarray(states.pose), np.asarray(states.velocity)
+
+
+# Free motion
+
+
+def test_a_free_body_under_a_constant_force_follows_the_parabola_exactly(float64):
+    poses, velocities = pushed(body(), at(velocity=(1.0, 0.0, 0.5)), 2.0, (0.0, 5.0, 0.0))
+    np.testing.assert_allclose(poses[-1, 0], [2.0, 0.5 * 0.5 * 4.0, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(velocities[-1, 0], [1.0, 1.0, 0.5], rtol=1e-12)
+
+
+def test_a_free_body_turns_about_its_centre_of_mass_which_goes_straight(float64):
+    model = body(centre_of_mass=[0.5, 0.2])
+    centre = np.array([0.3, 0.06])
+    poses, velocities = pushed(model, at(velocity=(0.4, -0.3, 2.0)), 3.0)
+    angle = poses[:, 0, 2]
+    turned = np.stack(
+        [
+            np.cos(angle) * centre[0] - np.sin(angle) * centre[1],
+            np.sin(angle) * centre[0] + np.cos(angle) * centre[1],
+        ],
+        axis=-1,
+    )
+    path = poses[:, 0, :2] + turned
+    time = 0.02 * np.arange(1, len(path) + 1)[:, None]
+    straight = np.array([0.4 - 2.0 * 0.06, -0.3 + 2.0 * 0.3])
+    np.testing.assert_allclose(path, centre + time * straight, atol=1e-12)
+    np.testing.assert_allclose(velocities[:, 0, 2], 2.0, rtol=1e-12)
+
+
+def test_a_force_off_the_centre_turns_the_body_by_its_moment_of_inertia(float64):
+    model = body(gyration=1.3)
+    inertia = 10.0 * 1.3**2 * (1.2**2 + 0.6**2) / 12.0
+    action = model.wrench_at(at().pose, 0, jnp.array([0.6, 0.0]), jnp.array([0.0, 3.0]))
+    following = model.step(at(), action)
+    np.testing.assert_allclose(
+        following.velocity[0], [0.0, 0.02 * 0.3, 0.02 * 1.8 / inertia], rtol=1e-12
+    )
+
+
+# The floor
+
+
+def test_a_sliding_body_stops_after_v_squared_over_two_mu_g(float64):
+    for mu in (0.02, 0.1, 0.4):
+        model = body(floor_friction=mu)
+        poses, velocities = pushed(model, at(velocity=(0.8, 0.6, 0.0)), 1.0 / (mu * GRAVITY) + 0.3)
+        distance = np.hypot(*poses[-1, 0, :2])
+        expected = 0.5 / (mu * GRAVITY)
+        assert distance == pytest.approx(expected, abs=1e-3 + 2e-3 * expected)
+        assert np.hypot(*velocities[-1, 0, :2]) < 1e-6
+
+
+def test_the_rate_of_a_gliding_body_fades_exponentially(float64):
+    model = body(floor_damping=0.7)
+    finer = dataclasses.replace(model, substeps=8)
+    exact = 2.0 * np.exp(-0.7)
+    off = [
+        pushed(one, at(velocity=(2.0, 0.0, 0.0)), 1.0)[1][-1, 0, 0] - exact
+        for one in (model, finer)
+    ]
+    assert 0 < off[0] < 0.01 * exact
+    assert off[0] / off[1] == pytest.approx(8.0, rel=0.05)  # first order in the step
+
+
+def test_spinning_on_the_spot_slows_by_the_friction_of_its_feet(float64):
+    """Torque mu m g r against inertia m k^2, with feet at the radius r."""
+    model = body(floor_friction=0.1, floor_spread=0.9)
+    gyration = np.sqrt((1.2**2 + 0.6**2) / 12.0)
+    poses, _ = pushed(model, at(velocity=(0.0, 0.0, 3.0)), 2.0)
+    slowing = 0.1 * GRAVITY * 0.9 * np.hypot(0.6, 0.3) / gyration**2
+    assert poses[-1, 0, 2] == pytest.approx(9.0 / (2.0 * slowing), rel=5e-3)
+
+
+def test_what_slides_slides_more_easily_when_it_spins(float64):
+    """Each foot's friction points against its own motion: little of it along the way."""
+    model = body(floor_friction=0.1)
+    slow = pushed(model, at(velocity=(1.0, 0.0, 0.0)), 0.1)[1][-1, 0, 0]
+    fast = pushed(model, at(velocity=(1.0, 0.0, 20.0)), 0.1)[1][-1, 0, 0]
+    assert 1.0 - fast < 0.3 * (1.0 - slow)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.8, 0.95])
+def test_a_body_pushed_below_its_friction_creeps_no_further_than_the_smoothing(share):
+    """share = v / sqrt(v^2 + STICTION^2): two millimetres in two seconds at 0.9 of the limit."""
+    model = body(floor_friction=0.3)
+    poses, _ = pushed(model, at(), 2.0, (share * 0.3 * 10.0 * GRAVITY, 0.0, 0.0))
+    assert 0 < poses[-1, 0, 0] < 2.0 * STICTION * share / np.sqrt(1.0 - share**2) + 1e-4
+
+
+def test_a_body_pushed_above_its_friction_accelerates_by_the_rest(float64):
+    model = body(floor_friction=0.2)
+    for share in (1.1, 1.5, 4.0):
+        limit = 0.2 * 10.0 * GRAVITY
+        poses, _ = pushed(model, at(), 2.0, (share * limit, 0.0, 0.0))
+        expected = 0.5 * (share - 1.0) * limit / 10.0 * 4.0
+        assert poses[-1, 0, 0] == pytest.approx(expected, rel=0.02)
+
+
+def test_a_bolted_body_does_not_move():
+    model = body(bolted=[0])
+    poses, velocities = pushed(model, at(velocity=(1.0, 0.0, 1.0)), 2.0, (300.0, -50.0, 80.0))
+    np.testing.assert_allclose(poses[-1, 0], 0.0, atol=1e-3)
+    np.testing.assert_allclose(velocities[-1, 0], 0.0, atol=1e-3)
+
+
+# Wheels
+
+
+def test_a_viscous_wheel_under_the_centre_slows_each_axis_on_its_own(float64):
+    model = body(1, law="viscous", wheel_along=2.0, wheel_across=30.0, substeps=20)
+    _, velocities = pushed(model, at(velocity=(1.0, 1.0, 0.0)), 1.0)
+    np.testing.assert_allclose(velocities[-1, 0, 0], np.exp(-0.2), rtol=1e-3)
+    np.testing.assert_allclose(velocities[-1, 0, 1], np.exp(-3.0), rtol=1e-2)
+
+
+def test_a_viscous_wheel_off_the_centre_damps_as_the_matrix_exponential(float64):
+    """v' = -M^-1 c J J' v, constant in the body while it turns little."""
+    model = body(
+        1, law="viscous", wheel_along=0.0, wheel_across=4.0, wheel_position=[0.8, 0.0], substeps=20
+    )
+    lever = 0.8 * 0.6
+    mass = np.diag([10.0, 10.0 * (1.2**2 + 0.6**2) / 12.0])
+    row = np.array([1.0, lever])
+    rates, shapes = np.linalg.eig(np.linalg.solve(mass, 4.0 * np.outer(row, row)))
+    start = np.array([0.0, 0.05])
+    expected = (shapes @ np.diag(np.exp(-rates)) @ np.linalg.solve(shapes, start)).real
+    poses, velocities = pushed(model, at(velocity=(0.0, *start)), 1.0)
+    angle = poses[-1, 0, 2]
+    x, y, rate = velocities[-1, 0]
+    np.testing.assert_allclose(-np.sin(angle) * x + np.cos(angle) * y, expected[0], rtol=5e-3)
+    np.testing.assert_allclose(rate, expected[1], rtol=5e-3)
+
+
+def test_a_dry_wheel_slides_at_its_force_and_holds_below_it(float64):
+    model = body(1, wheel_along=8.0, wheel_across=8.0)
+    poses, _ = pushed(model, at(), 2.0, (20.0, 0.0, 0.0))
+    assert poses[-1, 0, 0] == pytest.approx(0.5 * 1.2 * 4.0, rel=0.01)
+    poses, _ = pushed(model, at(), 2.0, (0.0, -6.0, 0.0))
+    assert np.max(np.abs(poses[-1, 0])) < 2e-3
+
+
+def test_forces_of_a_dry_wheel_lie_on_an_ellipse_and_take_most_power(float64):
+    along, across = 3.0, 12.0
+    model = body(1, wheel_along=along, wheel_across=across, control_period=1e-3)
+    for angle in np.linspace(0.0, np.pi / 2, 7):
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        start = at(velocity=(*direction, 0.0))
+        following = model.step(start, jnp.zeros((1, 3)))
+        force = np.asarray((following.velocity - start.velocity)[0, :2]) * 10.0 / 1e-3
+        expected = np.array([along**2, across**2]) * direction
+        expected /= np.linalg.norm(np.array([along, across]) * direction)
+        np.testing.assert_allclose(-force, expected, rtol=2e-3, atol=1e-3)
+        assert (force[0] / along) ** 2 + (force[1] / across) ** 2 == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_locked_wheel_is_what_the_body_turns_about(float64):
+    model = body(1, wheel_along=300.0, wheel_across=300.0, wheel_position=[0.8, 0.5])
+    wheel = np.array([0.48, 0.15])
+    poses, _ = pushed(model, at(), 2.0, (0.0, -10.0, 1.0))
+    assert abs(poses[-1, 0, 2]) > 1.0
+    angle = poses[:, 0, 2]
+    x = poses[:, 0, 0] + np.cos(angle) * wheel[0] - np.sin(angle) * wheel[1]
+    y = poses[:, 0, 1] + np.sin(angle) * wheel[0] + np.cos(angle) * wheel[1]
+    np.testing.assert_allclose(np.stack([x, y], -1), np.tile(wheel, (len(x), 1)), atol=2e-3)
+
+
+def test_a_fixed_wheel_goes_along_itself_only(float64):
+    """A skate: the wheel's point keeps to its line, and the body rolls on."""
+    model = body(2, wheel_along=0.0, wheel_across=400.0, wheel_position=[[-0.8, 0.0], [0.8, 0.0]])
+    poses, _ = pushed(model, at(0.0, 0.0, 0.3), 2.0, (10.0, -10.0, 0.0))
+    path = poses[-1, 0, :2]
+    force = 10.0 * (np.cos(0.3) - np.sin(0.3))
+    expected = 0.5 * force / 10.0 * 4.0
+    assert path[0] * np.cos(0.3) + path[1] * np.sin(0.3) == pytest.approx(expected, rel=0.01)
+    assert abs(path[1] * np.cos(0.3) - path[0] * np.sin(0.3)) < 2e-3
+    assert poses[-1, 0, 2] == pytest.approx(0.3, abs=2e-3)
+
+
+def test_a_wheel_has_the_symmetries_of_its_labels(float64):
+    """A quarter turn swaps along and across, a half turn changes nothing."""
+    settings = {"wheel_position": [0.5, -0.3], "floor_friction": 0.05}
+    one = body(1, wheel_direction=0.3, wheel_along=2.0, wheel_across=9.0, **settings)
+    swapped = body(
+        1, wheel_direction=0.3 + np.pi / 2, wheel_along=9.0, wheel_across=2.0, **settings
+    )
+    turned = dataclasses.replace(one, wheel_direction=one.wheel_direction - np.pi)
+    wrench = (8.0, 5.0, -2.0)
+    expected, _ = pushed(one, at(), 1.0, wheel_wrench := wrench)
+    for other in (swapped, turned):
+        poses, _ = pushed(other, at(), 1.0, wheel_wrench)
+        np.testing.assert_allclose(poses, expected, atol=1e-12)
+
+
+# Links
+
+
+def test_a_pivot_swings_about_its_point_with_the_parallel_axis_inertia(float64):
+    pose = np.array([[0.4, -0.2, 0.5]])
+    model = body(pivots={0: None}, poses=pose, link_anchor=[1.0, 0.0])
+    start = PlanarState(jnp.asarray(pose), jnp.zeros((1, 3)))
+    poses, _ = pushed(model, start, 1.0, (0.0, 0.0, 2.0))
+    inertia = 10.0 * ((1.2**2 + 0.6**2) / 12.0 + 0.6**2)
+    assert poses[-1, 0, 2] - 0.5 == pytest.approx(0.5 * 2.0 / inertia, rel=2e-3)
+    angle = poses[:, 0, 2]
+    hinge = poses[:, 0, :2] + 0.6 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    expected = pose[0, :2] + 0.6 * np.array([np.cos(0.5), np.sin(0.5)])
+    np.testing.assert_allclose(hinge, np.tile(expected, (len(hinge), 1)), atol=1e-3)
+
+
+def test_a_distance_makes_a_pendulum_of_the_period_of_its_closed_form(float64):
+    """A box on a rod of length l to a point of the world, pulled by a constant force, held upright
+    in its centre: a point mass, omega^2 = force / (mass l)."""
+    length, force = 0.8, 10.0
+    pose = np.array([[length * np.sin(0.1), -length * np.cos(0.1), 0.0]])
+    model = body(distances={0: None}, poses=pose, link_anchor=0.0, link_other_anchor=[0.0, 0.0])
+    start = PlanarState(jnp.asarray(pose), jnp.zeros((1, 3)))
+    poses, _ = pushed(model, start, 12.0, (0.0, -force, 0.0))
+    swing = poses[:, 0, 0]
+    crossings = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))
+    fraction = swing[crossings] / (swing[crossings] - swing[crossings + 1])
+    period = np.mean(np.diff(crossings + fraction)) * model.control_period
+    exact = 2 * np.pi * np.sqrt(10.0 * length / force) * (1 + 0.1**2 / 16)
+    assert period == pytest.approx(exact, rel=1e-3)
+    np.testing.assert_allclose(np.hypot(*poses[:, 0, :2].T), length, atol=1e-3)
+    assert np.max(np.abs(swing[-200:])) == pytest.approx(length * np.sin(0.1), rel=0.03)
+
+
+def test_two_bodies_on_one_pivot_keep_their_momentum_and_their_joint(float64):
+    poses = np.array([[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
+    model = furniture(
+        [BOX, BOX],
+        wheels=0,
+        pivots={0: 1},
+        poses=poses,
+        link_anchor=[1.0, 0.0],
+        mass=[10.0, 4.0],
+        **SMOOTH,
+    )
+    velocity = jnp.array([[0.0, 0.0, 1.0], [0.5, 0.6, -0.5]])
+    start = PlanarState(jnp.asarray(poses), velocity)
+    end, speed = pushed(model, start, 2.0)
+    mass = np.array([10.0, 4.0])[:, None]
+    np.testing.assert_allclose(
+        np.sum(mass * speed[..., :2], 1), np.tile([2.0, 2.4], (len(speed), 1)), atol=1e-9
+    )
+    x, y, angle = np.moveaxis(end, -1, 0)
+    side = np.array([1.0, -1.0]) * 0.6
+    joint = np.stack([x + side * np.cos(angle), y + side * np.sin(angle)], -1)
+    assert np.max(np.abs(joint[:, 0] - joint[:, 1])) < 3e-3

@@ -1,0 +1,275 @@
+"""Bayesian identification of any model with declared priors.
+
+    posterior = identify(model, recording.align(model.control_period), at_rest=True)
+    posterior.table()                  # medians, intervals, R-hat, what the data left undecided
+    posterior.predict(cut(held_out, model, 2.0, at_rest=True))
+
+The likelihood is `palpate.identification.likelihood`'s, of pieces of a second or so; chains of the
+no-U-turn sampler begin at the posterior's modes. Other samplers of the same target: Metropolis
+(`metropolis`), tempered particles with evidence (`tempered`), and particles that follow data as
+they arrive (`online`).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from palpate.identification import predictive
+from palpate.identification.diagnostics import bulk_size, rhat, tail_size
+from palpate.identification.draws import Draws
+from palpate.identification.hamiltonian import no_u_turn
+from palpate.identification.laplace import Modes, settle
+from palpate.identification.likelihood import (
+    MotionPosterior,
+    inferred_scales,
+    motion_posterior,
+)
+from palpate.identification.predictive import Predicted, Score
+from palpate.identification.segments import Segments, cut, noise_scale
+from palpate.models.model import Model
+from palpate.parameters import value_of
+from palpate.recording import Aligned
+
+MIXED, ENOUGH = 1.01, 400.0  # R-hat and effective sizes that chains should reach (Vehtari et al.)
+UNDECIDED = 0.7  # posterior over prior standard deviation above which the data say nothing
+PREDICTING = 400  # draws that a prediction is made of
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One coordinate of a posterior, in the parameter's own unit.
+
+    `lower` to `upper` holds 90 % of the draws; `share` is the posterior's standard deviation over
+    the prior's, both in whitened coordinates: 1 says that the data told nothing.
+    """
+
+    name: str
+    unit: str
+    about: str
+    median: float
+    lower: float
+    upper: float
+    share: float
+    rhat: float
+    bulk: float
+    tail: float
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the data left this where the prior had it."""
+        return self.share > UNDECIDED
+
+
+@dataclasses.dataclass(frozen=True)
+class Posterior:
+    """Draws of a model's parameters given recordings, and how far to trust them.
+
+    `probes` are the pieces at whose ends the chains' predictions are compared: labels of wheels
+    may swap between draws that predict the same.
+    """
+
+    target: MotionPosterior
+    draws: Draws
+    modes: Modes
+    probes: Segments
+
+    @property
+    def flat(self) -> Float[np.ndarray, "draws free"]:
+        """Draws of all chains in whitened coordinates, chain after chain."""
+        return self.draws.position.reshape(-1, self.draws.position.shape[-1])
+
+    def thinned(self, count: int) -> Float[np.ndarray, "count free"]:
+        """About evenly spaced draws over all chains."""
+        rows = np.linspace(0, len(self.flat) - 1, min(count, len(self.flat))).round()
+        return self.flat[rows.astype(int)]
+
+    def models(self, count: int | None = None) -> Model:
+        """Legal models as one, all draws or about `count` evenly spaced; free parameters lead.
+
+        What is fixed has no batch axis.
+        """
+        return self.target.models(jnp.asarray(self.flat if count is None else self.thinned(count)))
+
+    @cached_property
+    def values(self) -> dict[str, Float[np.ndarray, "chains draws ..."]]:
+        """Legal values of the free parameters by path, in their units."""
+        models = self.models()
+        lead = self.draws.position.shape[:2]
+        found = {}
+        for path in self.target.coordinates.declarations:
+            value = np.asarray(value_of(models, path))
+            found[path] = value.reshape(*lead, *value.shape[1:])
+        return found
+
+    @cached_property
+    def predictions(self) -> Float[np.ndarray, "chains draws segments ..."]:
+        """What each draw says is observed at the end of each probe, without noise."""
+        return predictive.final_poses(self.target, self.draws.position, self.probes)
+
+    @cached_property
+    def rhat_of_predictions(self) -> float:
+        """Greatest R-hat over everything observed at the ends of the probes."""
+        return float(np.max(rhat(self.predictions)))
+
+    @cached_property
+    def size_of_predictions(self) -> float:
+        """Least effective sample size, bulk and tail, over the ends of the probes."""
+        return float(min(np.min(bulk_size(self.predictions)), np.min(tail_size(self.predictions))))
+
+    @cached_property
+    def table(self) -> tuple[Row, ...]:
+        """A row for each coordinate: the parameters by element, then the noise scales."""
+        position = self.draws.position
+        legal = _legal(self.target, jnp.asarray(self.flat))
+        prior = jax.random.normal(jax.random.key(0), (1000, self.target.dimension))
+        share = np.std(legal, axis=0) / np.std(_legal(self.target, prior), axis=0)
+        judged = rhat(position), bulk_size(position), tail_size(position)
+        values = self._by_name()
+        rows = []
+        for index, name in enumerate(self.target.names):
+            unit, about, draws = values[name]
+            lower, median, upper = np.quantile(draws, (0.05, 0.5, 0.95))
+            rows.append(
+                Row(
+                    name, unit, about, float(median), float(lower), float(upper),
+                    float(share[index]), *(float(column[index]) for column in judged),
+                )
+            )  # fmt: skip
+        return tuple(rows)
+
+    @property
+    def undecided(self) -> tuple[str, ...]:
+        """Names of the coordinates that the data left where the prior had them."""
+        return tuple(row.name for row in self.table if row.undecided)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """How far not to trust this posterior, a sentence each; none when there is no reason."""
+        said = []
+        if self.rhat_of_predictions >= MIXED:
+            said.append(
+                f"the chains do not agree on what will happen: R-hat of predictions is "
+                f"{self.rhat_of_predictions:.3f}, expected below {MIXED}; draw more, or compare "
+                "hypotheses if there are several modes"
+            )
+        if self.size_of_predictions < ENOUGH:
+            said.append(
+                f"predictions rest on {self.size_of_predictions:.0f} effective draws, expected at "
+                f"least {ENOUGH:.0f}: draw more"
+            )
+        unmixed = [row.name for row in self.table if row.rhat >= MIXED]
+        if unmixed:
+            said.append(
+                f"the chains differ on {', '.join(unmixed)}: if predictions agree, labels that "
+                "mean the same motion were swapped, and only the predictions should be read"
+            )
+        if self.draws.divergences:
+            said.append(
+                f"{self.draws.divergences} of {self.draws.density.size} trajectories diverged: "
+                "the posterior has corners that were not explored, and intervals may be too narrow"
+            )
+        if self.undecided:
+            said.append(
+                f"the data say next to nothing of {', '.join(self.undecided)}: what is printed "
+                "for them is the prior"
+            )
+        return tuple(said)
+
+    def predict(self, segments: Segments, count: int = PREDICTING, seed: int = 0) -> Predicted:
+        """Predict pieces with about `count` draws; see `predictive.predict`."""
+        return predictive.predict(self.target, self.thinned(count), segments, seed)
+
+    def score(self, segments: Segments, count: int = PREDICTING, seed: int = 0) -> Score:
+        """Coverage, log score and errors on pieces it was not fitted to."""
+        return predictive.score(self.target, self.predict(segments, count, seed), segments)
+
+    def _by_name(self) -> dict[str, tuple[str, str, np.ndarray]]:
+        """Unit, meaning and values (chains x draws) of each coordinate."""
+        found = {}
+        for path, declaration in sorted(self.target.coordinates.declarations.items()):
+            values = self.values[path]
+            first = values.reshape(*values.shape[:2], -1)
+            if declaration.shared or values.ndim == 2:
+                found[path] = declaration.unit, declaration.about, first[..., 0]
+                continue
+            for index in np.ndindex(values.shape[2:]):
+                name = f"{path}[{', '.join(map(str, index))}]"
+                element = values[(..., *index)]
+                found[name] = declaration.unit, declaration.about, element
+        noise, growth = (np.asarray(x) for x in _scales(self.target, jnp.asarray(self.flat)))
+        scales = self.target.scales
+        for kind, of, values in (
+            ("noise", scales.of_channel, noise),
+            ("discrepancy", scales.growth_of_channel, growth),
+        ):
+            labels = [label for label in scales.labels if label.startswith(kind)]
+            for group, label in enumerate(labels):
+                unit = label.partition("(")[2].removesuffix(")")
+                about = "sensor noise" if kind == "noise" else "what the model does not explain"
+                found[label] = unit, about, values[:, of.index(group)]
+        return found
+
+
+def identify(
+    model: Model,
+    aligned: Aligned,
+    *,
+    seconds: float = 1.0,
+    at_rest: bool = False,
+    chains: int = 4,
+    draws: int = 300,
+    seed: int = 0,
+    probes: Segments | None = None,
+    tell: Callable[[int, int], None] = lambda done, blocks: None,
+) -> Posterior:
+    """Infer a model's free parameters and the noise scales from aligned trials.
+
+    Trials are cut into pieces of `seconds`; `at_rest` says that each begins at rest. Chains are
+    compared by what they predict at the ends of `probes`, by default the pieces themselves.
+    `tell(done, blocks)` is called as the sampling goes on. The same seed gives the same draws.
+
+    Raises `PalpateError` when no piece can be cut, or the likelihood is not finite anywhere.
+    """
+    segments = cut(aligned, model, seconds, at_rest)
+    target = motion_posterior(model, segments, inferred_scales(model, noise_scale(aligned, model)))
+    return sample(target, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+
+
+def sample(
+    target: MotionPosterior,
+    *,
+    chains: int = 4,
+    draws: int = 300,
+    seed: int = 0,
+    probes: Segments | None = None,
+    tell: Callable[[int, int], None] = lambda done, blocks: None,
+) -> Posterior:
+    """As `identify`, for a target that was made apart."""
+    climbing, sampling = jax.random.split(jax.random.key(seed))
+    target, modes = settle(target, climbing)
+    found = no_u_turn(target, modes, sampling, chains, draws, tell)
+    return Posterior(target, found, modes, target.segments if probes is None else probes)
+
+
+@eqx.filter_jit
+def _legal(target: MotionPosterior, position: Array) -> Array:
+    """Whitened coordinates of the legal models, noise scales as they are."""
+    flat, unravel = ravel_pytree(target.coordinates.initial)
+
+    def one(position: Array) -> Array:
+        projected = target.coordinates.project(unravel(position[: flat.size]))
+        return jnp.concatenate([ravel_pytree(projected)[0], position[flat.size :]])
+
+    return jax.vmap(one)(position)
+
+
+@eqx.filter_jit
+def _scales(target: MotionPosterior, position: Array) -> tuple[Array, Array]:
+    return jax.vmap(target.noise)(position), jax.vmap(target.growth)(position)

@@ -1,0 +1,192 @@
+"""The no-U-turn sampler, several chains at once, in coordinates that its metric whitens.
+
+Hoffman and Gelman, J. Mach. Learn. Res. 15, 2014, with multinomial trajectories (Betancourt, arXiv
+1701.02434), by BlackJAX. The metric begins as the covariance at the modes (`laplace`), and is
+learnt anew from the draws of all chains together in the warm-up, in which the step size is steered
+to its acceptance; then both are kept.
+"""
+
+import time
+from collections.abc import Callable
+
+import blackjax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from blackjax.mcmc.hmc import HMCState
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+
+from palpate.identification.draws import Draws, check_start
+from palpate.identification.laplace import Modes, look
+from palpate.identification.target import Target
+
+BLOCK = 50  # draws between two looks at the chains: one compiled piece of work
+WARM_UP = 4  # blocks
+LEARNED = 2  # from this block of the warm-up on the metric is learnt from the draws of the last
+ACCEPTANCE = 0.8
+DOUBLINGS = 5
+GAIN = 0.15  # of the step size's logarithm per draw, at first; falls as the root of the draws
+
+State = tuple[ArrayLike, ArrayLike, ArrayLike]  # position, density and slope of each chain
+
+
+class _Block(eqx.Module):
+    """What became of one block, batch axes chains and draws."""
+
+    position: Float[Array, "*batch free"]
+    density: Float[Array, "*batch"]
+    step: Float[Array, "*batch"]  # logarithm of the step size
+    acceptance: Float[Array, "*batch"]
+    divergent: Float[Array, "*batch"]
+    leaps: Float[Array, "*batch"]
+
+
+def no_u_turn(
+    target: Target,
+    modes: Modes,
+    key: PRNGKeyArray,
+    chains: int = 4,
+    draws: int = 300,
+    tell: Callable[[int, int], None] = lambda done, blocks: None,
+) -> Draws:
+    """Sample `draws` of each of `chains`, rounded up to whole blocks, after the warm-up.
+
+    Chains begin at draws of the modes' mixture. `tell(done, blocks)` is called after every block.
+    Raises `PalpateError` when the density is not finite where a chain begins.
+    """
+    began = time.monotonic()
+    begin, *keys = jax.random.split(key, 1 + WARM_UP + -(-draws // BLOCK))
+    position = np.array(modes.draw(begin, chains))
+    lost = ~np.isfinite(look(target, position)[0])
+    position[lost] = modes.position[0]
+    value, slope, _ = look(target, position)
+    check_start(target, position, value)
+    state = position, value.astype(position.dtype), slope.astype(position.dtype)
+    covariance = np.asarray(modes.covariance[0], np.float64)
+    step = np.full(chains, np.log(1.2 * target.dimension**-0.25))
+    blocks, compiling, leaps = [], 0.0, 0.0
+    for index, block_key in enumerate(keys):
+        gain = GAIN if index < WARM_UP else 0.0
+        root = jnp.asarray(np.linalg.cholesky(covariance), position.dtype)
+        # From the host each time: placed otherwise than before, it would be compiled anew.
+        state, block = jax.device_get(
+            _block(
+                target, state, root, jnp.asarray(step, position.dtype),
+                jax.random.split(block_key, chains), jnp.asarray(gain, position.dtype),
+            )
+        )  # fmt: skip
+        compiling = compiling or time.monotonic() - began
+        leaps += float(block.leaps.sum())
+        if index < WARM_UP:
+            # One for all, from the half in which it has settled; a chain that is stuck is outvoted.
+            step[:] = np.median(block.step[:, BLOCK // 2 :])
+            if LEARNED <= index + 1 < WARM_UP:
+                covariance = pooled(block.position, covariance)
+        else:
+            blocks.append(block)
+        tell(index + 1, len(keys))
+    return Draws(
+        position=np.concatenate([b.position for b in blocks], axis=1)[:, :draws],
+        density=np.concatenate([b.density for b in blocks], axis=1)[:, :draws],
+        acceptance=np.mean([b.acceptance.mean(axis=1) for b in blocks], axis=0),
+        divergences=int(sum(b.divergent.sum() for b in blocks)),
+        evaluations=int(leaps),
+        seconds=time.monotonic() - began,
+        compiling=compiling,
+    )
+
+
+def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Covariance of the draws of all chains, with the earlier one worth a few draws.
+
+    As few draws as two for each coordinate: it keeps the estimate positive definite.
+    """
+    flat = position.reshape(-1, position.shape[-1]).astype(np.float64)
+    weight = 2.0 * flat.shape[1]
+    scatter = np.cov(flat, rowvar=False).reshape(prior.shape) * len(flat)
+    return (scatter + weight * prior) / (len(flat) + weight)
+
+
+@eqx.filter_jit
+def _block(
+    target: Target,
+    state: State,
+    root: Float[Array, "free free"],
+    step: Float[Array, " chains"],
+    keys: Array,
+    gain: Float[Array, ""],
+) -> tuple[State, _Block]:
+    """One block of every chain, chains divided over the devices; none waits for another device."""
+    arrays, static = eqx.partition(target, eqx.is_array)
+
+    def part(arrays, state, root, step, keys, gain) -> tuple[State, _Block]:
+        whole = eqx.combine(arrays, static)
+        return jax.vmap(lambda s, e, k: chain(whole, s, root, e, k, gain))(state, step, keys)
+
+    devices = jax.devices()
+    if len(step) % len(devices):
+        return part(arrays, state, root, step, keys, gain)
+    each, shared = PartitionSpec("chains"), PartitionSpec()
+    divided = jax.shard_map(
+        part,
+        mesh=Mesh(devices, ("chains",)),
+        in_specs=(shared, each, shared, each, each, shared),
+        out_specs=each,
+        check_vma=False,
+    )
+    return divided(arrays, state, root, step, keys, gain)
+
+
+def chain(
+    target: Target,
+    state: State,
+    root: Array,
+    step: Array,
+    key: PRNGKeyArray,
+    gain: Array,
+    leaps: int | None = None,
+) -> tuple[State, _Block]:
+    """One block of one chain. In the coordinates y of x = root y the metric is the identity.
+
+    With `leaps` trajectories have that length (Duane et al. 1987), their steps varied by a fifth
+    so that none returns to where it began: among many chains side by side none waits for the
+    longest trajectory.
+
+    It begins with the density and slope that the block before it ended with: to compute them here
+    would compile the model's derivatives twice.
+    """
+    turning, fixed = blackjax.nuts.build_kernel(), blackjax.hmc.build_kernel()
+    position, value, slope = state
+    unit = jnp.ones_like(position)
+
+    def density(y: Array) -> Array:
+        return target.density(root @ y)
+
+    def advance(carry, inputs):
+        state, step = carry
+        key, index = inputs
+        if leaps is None:
+            state, info = turning(key, state, density, jnp.exp(step), unit, DOUBLINGS)
+        else:
+            moving, varying = jax.random.split(key)
+            varied = jnp.exp(step) * jax.random.uniform(varying, (), step.dtype, 0.8, 1.2)
+            state, info = fixed(moving, state, density, varied, unit, leaps)
+        step += gain / jnp.sqrt(1.0 + index / 5.0) * (info.acceptance_rate - ACCEPTANCE)
+        out = _Block(
+            position=root @ state.position,
+            density=state.logdensity,
+            step=step,
+            acceptance=info.acceptance_rate,
+            divergent=info.is_divergent.astype(step.dtype),
+            leaps=jnp.asarray(info.num_integration_steps, step.dtype),
+        )
+        return (state, step), out
+
+    within = jax.scipy.linalg.solve_triangular(root, position, lower=True)
+    start = HMCState(within, value, slope @ root)
+    inputs = jax.random.split(key, BLOCK), jnp.arange(BLOCK)
+    (end, _), trace = jax.lax.scan(advance, (start, step), inputs)
+    slope = jax.scipy.linalg.solve_triangular(root, end.logdensity_grad, trans=1, lower=True)
+    return (root @ end.position, end.logdensity, slope), trace

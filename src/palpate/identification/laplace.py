@@ -1,0 +1,154 @@
+"""Where a posterior has its modes, and the normal distributions that touch it there.
+
+Fisher scoring with Levenberg's damping from many starts at once: chains then begin where the
+posterior is, with its shape known (Tierney and Kadane, J. Am. Stat. Assoc. 81, 1986).
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from palpate.errors import PalpateError
+from palpate.identification.likelihood import MotionPosterior, initial_position
+from palpate.identification.target import Target
+
+LONGEST = 1.5  # prior standard deviations that a step may have
+DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
+SETTLED = 0.1  # gain of the density's logarithm in a few steps below which a climb has arrived
+ROUNDS = 3  # in which the start's errors are propagated anew
+
+
+class Modes(eqx.Module):
+    """Normal approximations at stationary points, best density first.
+
+    `slope` is the density's, near zero; `covariance` the inverse of the target's curvature;
+    `evidence` Laplace's logarithm of the data's density by each mode alone.
+    """
+
+    position: Float[Array, "*batch modes free"]
+    density: Float[Array, "*batch modes"]
+    slope: Float[Array, "*batch modes free"]
+    covariance: Float[Array, "*batch modes free free"]
+    evidence: Float[Array, "*batch modes"]
+
+    def draw(self, key: PRNGKeyArray, count: int) -> Array:
+        """Draws (count, free) from the mixture, modes weighted by their evidence."""
+        which, where = jax.random.split(key)
+        chosen = jax.random.categorical(which, self.evidence, shape=(count,))
+        noise = jax.random.normal(where, (count, self.position.shape[1]), self.position.dtype)
+        root = jnp.linalg.cholesky(self.covariance)[chosen]
+        return self.position[chosen] + jnp.einsum("nij,nj->ni", root, noise)
+
+
+def find_modes(target: Target, key: PRNGKeyArray, starts: int = 8, steps: int = 40) -> Modes:
+    """Climb from the prior's centre and `starts` - 1 draws of the prior.
+
+    Raises `PalpateError` when the density is finite at none of them.
+    """
+    noise = jax.random.normal(key, (starts, target.dimension))
+    return climb(target, noise.at[0].set(0.0), steps)
+
+
+def climb(target: Target, position: Float[Array, "starts free"], steps: int = 40) -> Modes:
+    """Climb from given positions; raises `PalpateError` when all of them fail."""
+    modes = climb_each(functools.partial(_look, target), np.asarray(position), steps)
+    if not np.any(np.isfinite(modes.density)):
+        raise PalpateError(
+            "the likelihood is not finite anywhere a search began: expected data that the model "
+            f"can predict; the coordinates are {', '.join(target.names)}"
+        )
+    return modes
+
+
+def climb_each(
+    curvature: Callable[[Array], tuple[Array, Array, Array]],
+    position: Float[np.ndarray, "*batch starts free"],
+    steps: int = 40,
+) -> Modes:
+    """Climb side by side, with density, slope and `curvature` at positions shaped like these."""
+    here = np.array(position, np.float64)
+    value, slope, information = _finite(curvature, here)
+    damping = np.full(value.shape, DAMPING[0])
+    gained = np.full(value.shape, np.inf)
+    for _ in range(steps):
+        if np.all(gained < SETTLED):
+            break
+        diagonal = np.einsum("...ii->...i", information)
+        matrix = information + np.eye(here.shape[-1]) * (damping[..., None] * diagonal)[..., None]
+        change = np.linalg.solve(matrix, slope[..., None])[..., 0]
+        length = np.linalg.norm(change, axis=-1, keepdims=True)
+        proposed = here + change * np.minimum(1.0, LONGEST / (length + 1e-12))
+        after = _finite(curvature, proposed)
+        better = after[0] > value
+        # Over a few steps: one that is refused gains nothing and may be followed by one that does.
+        gain = np.where(better, after[0], value) - np.where(np.isfinite(value), value, -1e300)
+        gained = np.where(np.isfinite(value), np.maximum(0.3 * gained, gain), 0.0)
+        damping = np.clip(np.where(better, damping / 5.0, damping * 8.0), *DAMPING[1:])
+        here[better] = proposed[better]
+        for kept, new in zip((value, slope, information), after, strict=True):
+            kept[better] = new[better]
+    _, volume = np.linalg.slogdet(information / (2.0 * np.pi))
+    inverse = np.linalg.inv(information)
+    covariance = 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
+    found = here, value, slope, covariance, value - 0.5 * volume
+    order = np.argsort(-value, axis=-1)
+    dtype = jnp.zeros(()).dtype
+
+    def sorted_by_density(part: np.ndarray) -> Array:
+        index = order.reshape(*order.shape, *(1,) * (part.ndim - order.ndim))
+        return jnp.asarray(np.take_along_axis(part, index, axis=order.ndim - 1), dtype)
+
+    return Modes(*map(sorted_by_density, found))
+
+
+def look(
+    target: Target, position: Float[np.ndarray, "starts free"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Density, slope and curvature at several positions, in float64.
+
+    A position where any of them is not finite has no density, no slope, and the prior's curvature.
+    """
+    return _finite(functools.partial(_look, target), position)
+
+
+def _finite(
+    curvature: Callable[[Array], tuple[Array, Array, Array]], position: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    here = jnp.asarray(position, jnp.zeros(()).dtype)
+    value, slope, information = (np.array(x, np.float64) for x in curvature(here))
+    finite = np.isfinite(value) & np.isfinite(slope).all(-1)
+    finite &= np.isfinite(information).all((-2, -1))
+    value[~finite], slope[~finite] = -np.inf, 0.0
+    information[~finite] = np.eye(position.shape[-1])
+    # At least the prior's, which rounding may take away where the data say a million times more.
+    values, vectors = np.linalg.eigh(information)
+    scaled = vectors * np.maximum(values, 1.0)[..., None, :]
+    return value, slope, scaled @ np.swapaxes(vectors, -1, -2)
+
+
+@eqx.filter_jit
+def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
+    return jax.vmap(target.curvature)(position)
+
+
+def settle(
+    target: MotionPosterior, key: PRNGKeyArray, starts: int = 8, steps: int = 40
+) -> tuple[MotionPosterior, Modes]:
+    """Modes, and the target linearised about the best of them, by turns.
+
+    The reference model is among the starts.
+    """
+    noise = jax.random.normal(key, (starts, target.dimension))
+    position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
+    modes = climb(target, position, steps)
+    if target.sensitivity is None:
+        return target, modes
+    for _ in range(ROUNDS - 1):
+        target = target.linearised(modes.position[0])
+        modes = climb(target, modes.position, steps)
+    return target, modes

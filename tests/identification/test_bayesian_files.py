@@ -1,0 +1,69 @@
+"""A posterior is read back as it was written, and ArviZ gets what it needs."""
+
+import builtins
+
+import numpy as np
+import pytest
+
+from bayesian_toys import Sled, pushes
+from palpate.errors import PalpateError
+from palpate.identification.bayesian import identify
+from palpate.identification.posterior_files import (
+    read_posterior,
+    to_arviz,
+    write_netcdf,
+    write_posterior,
+)
+from palpate.storage import DamagedFileError
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    model = Sled(mass=10.0, friction=[15.0, 15.0])
+    recording = pushes(Sled(mass=14.0, friction=[6.0, 40.0]), 1, trials=2, frames=51)
+    return identify(model, recording, at_rest=True, chains=2, draws=50)
+
+
+def test_what_was_written_is_read_back(posterior, tmp_path):
+    path = write_posterior(tmp_path / "posterior.npz", posterior)
+    arrays, about = read_posterior(path)
+    np.testing.assert_array_equal(arrays["position"], posterior.draws.position)
+    np.testing.assert_array_equal(arrays["value.friction"], posterior.values["friction"])
+    assert about["names"] == list(posterior.target.names)
+    assert [row["name"] for row in about["table"]] == about["names"]
+    assert about["warnings"] == list(posterior.warnings)
+
+
+def test_other_files_are_refused(posterior, tmp_path):
+    with pytest.raises(PalpateError, match="there is no file"):
+        read_posterior(tmp_path / "none.npz")
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    with pytest.raises(PalpateError, match="is no posterior"):
+        read_posterior(tmp_path / "other.npz")
+    path = write_posterior(tmp_path / "cut.npz", posterior)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(DamagedFileError):
+        read_posterior(path)
+
+
+def test_arviz_gets_chains_and_predictions(posterior, tmp_path):
+    arviz = pytest.importorskip("arviz")
+    data = to_arviz(posterior)
+    assert data.posterior["friction"].shape == (2, 50, 2)
+    assert data.posterior["probe_end"].shape == (2, 50, 2, 3)
+    path = write_netcdf(tmp_path / "posterior.nc", posterior)
+    again = arviz.from_netcdf(path)
+    np.testing.assert_allclose(again.posterior["mass"], posterior.values["mass"])
+
+
+def test_without_arviz_the_extra_is_named(posterior, monkeypatch):
+    present = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name == "arviz":
+            raise ImportError(name)
+        return present(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(PalpateError, match="extra 'bayes'"):
+        to_arviz(posterior)

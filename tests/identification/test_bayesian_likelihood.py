@@ -1,0 +1,210 @@
+"""The likelihood of pieces of motion against dense normal distributions, and how they are cut."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from bayesian_toys import NOISE, Sled, pushes
+from palpate.errors import PalpateError
+from palpate.identification.likelihood import (
+    VAGUE,
+    discrepancy_covariance,
+    from_start,
+    inferred_scales,
+    initial_position,
+    known_scales,
+    motion_posterior,
+    residuals,
+)
+from palpate.identification.predictive import predict, score
+from palpate.identification.segments import Segments, cut, known_start, noise_scale
+from palpate.models.model import rollout
+from palpate.parameters import sample_prior
+from toys import Cart, CartState
+
+SLED = Sled(mass=14.0, friction=[6.0, 40.0])
+
+
+def aligned_with(recording, observation):
+    return type(recording)(recording.period, observation, recording.action, recording.length)
+
+
+@pytest.mark.usefixtures("float64")
+def test_the_likelihood_is_that_of_the_dense_normal_distribution():
+    """Noise, a discrepancy that grows, unseen frames, and a start that is not known."""
+    recording = pushes(SLED, 1, trials=1, frames=31)
+    observation = recording.observation.astype(float).copy()
+    observation[0, 20, 1] = np.nan
+    sled = Sled(mass=14.0, friction=[6.0, 40.0])
+    segments = cut(aligned_with(recording, observation), sled, 0.4)
+    target = motion_posterior(sled, segments, inferred_scales(sled, NOISE))
+    position = initial_position(target) + 0.1
+    target = target.linearised(position)
+    found = np.asarray(target.by_segment(position))
+    kernel = discrepancy_covariance(0.02 * np.arange(1, 21))
+    model = target.model(position)
+    noise, growth = np.asarray(target.noise(position)), np.asarray(target.growth(position))
+
+    def moved(error, piece):
+        pose, rate = (VAGUE * part for part in jnp.split(error, 2))
+        start = Segments(
+            piece.pose + pose * piece.pose_deviation,
+            piece.rate + rate * piece.rate_deviation,
+            *(piece.pose_deviation, piece.rate_deviation),
+            *(piece.action, piece.target, piece.seen),
+        )
+        return residuals(model, from_start(model, start), piece)[0].T.ravel()
+
+    for index in range(segments.count):
+        piece = segments.take([index])
+        mean = np.asarray(moved(jnp.zeros(6), piece))
+        starts = np.asarray(jax.jacfwd(moved)(jnp.zeros(6), piece))
+        covariance = starts @ starts.T
+        for channel in range(3):
+            rows = slice(20 * channel, 20 * channel + 20)
+            covariance[rows, rows] += (
+                noise[channel] ** 2 * np.eye(20) + growth[channel] ** 2 * kernel
+            )
+        seen = np.asarray(piece.seen)[0].T.ravel()
+        expected = multivariate_normal.logpdf(
+            mean[seen], np.zeros(seen.sum()), covariance[np.ix_(seen, seen)]
+        )
+        assert found[index] == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.usefixtures("float64")
+def test_curvature_is_that_of_the_expected_information():
+    """At data without residuals, Fisher's information of the mean is minus the Hessian."""
+    sled = Sled(mass=14.0, friction=[6.0, 40.0])
+    actions = jnp.asarray(np.random.default_rng(0).normal(size=(2, 10, 3))) * 10.0
+    pose = jnp.zeros((2, 3))
+    blank = known_start(pose, pose, actions, jnp.zeros((2, 10, 3)))
+    exact = known_start(pose, pose, actions, from_start(sled, blank))
+    target = motion_posterior(sled, exact, known_scales(sled, NOISE))
+    position = initial_position(target)
+    value, slope, curvature = target.curvature(position)
+    assert value == pytest.approx(float(target.density(position)))
+    np.testing.assert_allclose(slope, jax.grad(target.density)(position), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(curvature, -jax.hessian(target.density)(position), rtol=1e-6)
+
+
+@pytest.mark.usefixtures("float64")
+def test_the_discrepancy_is_twice_integrated_white_noise():
+    rng = np.random.default_rng(0)
+    step, count = 1e-3, 4000
+    rate = np.cumsum(rng.normal(size=(count, 1000)) * np.sqrt(step), axis=1)
+    path = np.cumsum(rate, axis=1) * step
+    at = [249, 499, 999]
+    expected = discrepancy_covariance(step * (np.array(at) + 1.0))
+    np.testing.assert_allclose(np.cov(path[:, at], rowvar=False), expected, rtol=0.1)
+
+
+def test_angles_are_wrapped():
+    recording = pushes(SLED, 1)
+    turned = recording.observation.copy()
+    turned[..., 2] += np.float32(4.0 * np.pi)
+    densities = [
+        motion_posterior(
+            SLED, cut(aligned, SLED, 1.0, at_rest=True), known_scales(SLED, NOISE)
+        ).by_segment(jnp.zeros(3))
+        for aligned in (recording, aligned_with(recording, turned))
+    ]
+    np.testing.assert_allclose(*densities, rtol=1e-3)
+
+
+def test_noise_is_found_under_any_smooth_motion():
+    found = noise_scale(pushes(SLED, 1, trials=8), SLED)
+    np.testing.assert_allclose(found, NOISE, rtol=0.1)
+
+
+def test_smoothed_starts_are_as_good_as_they_say():
+    errors, seen = [], []
+    for seed in range(12):
+        recording = pushes(SLED, seed)
+        clean = rollout(
+            SLED,
+            SLED.initial_state(jnp.zeros((4, 1, 3))),
+            jnp.asarray(recording.action),
+        )
+        pieces = cut(recording, SLED, 1.0)
+        rows = np.arange(1, pieces.count, 2)  # the second piece of each trial begins in mid motion
+        errors.append(np.asarray(pieces.rate[rows] - clean.rate[:, 49]))
+        seen.append(np.asarray(pieces.rate_deviation[rows]))
+    ratio = np.concatenate(errors) / np.concatenate(seen)
+    assert 0.7 < np.sqrt(np.mean(np.square(ratio))) < 2.0  # wrenches jump within the polynomial
+
+
+def test_pieces_at_rest_begin_at_rest_and_short_ones_are_padded():
+    recording = pushes(SLED, 1, trials=2, frames=81)
+    pieces = cut(recording, SLED, 1.0, at_rest=True, count=6)
+    assert (pieces.count, pieces.horizon) == (6, 50)
+    assert np.all(np.asarray(pieces.rate_deviation)[[0, 2]] == 0.0)
+    assert np.all(np.asarray(pieces.rate_deviation)[[1, 3]] > 0.0)
+    seen = np.asarray(pieces.seen).all(axis=2).sum(axis=1)
+    np.testing.assert_array_equal(seen, [50, 30, 50, 30, 0, 0])
+    with pytest.raises(PalpateError, match="do not fit into 3"):
+        cut(recording, SLED, 1.0, count=3)
+
+
+def test_a_recording_in_which_nothing_is_seen_is_refused():
+    recording = pushes(SLED, 1)
+    with pytest.raises(PalpateError, match="no piece of 1 s can begin"):
+        cut(aligned_with(recording, recording.observation * np.nan), SLED, 1.0)
+
+
+def test_pieces_of_another_model_and_noise_without_size_are_refused():
+    pieces = cut(pushes(SLED, 1), SLED, 1.0)
+    with pytest.raises(PalpateError, match=r"Cart observes \(1,\)"):
+        motion_posterior(Cart(mass=1.0, friction=1.0), pieces, known_scales(SLED, NOISE))
+    with pytest.raises(PalpateError, match="positive noise"):
+        known_scales(SLED, np.array([1e-3, 0.0, 1e-3]))
+
+
+class LinearCart(Cart):
+    """Of unit names, so that its scales have labels."""
+
+    observation_units = ("m",)
+
+
+def test_predictions_cover_as_they_claim():
+    """Draws of the prior predict motions of other draws of the prior: 90 % lie within 90 %."""
+    model = LinearCart(mass=1.0, friction=0.5)
+    models = jax.vmap(lambda key: sample_prior(model, key))(jax.random.split(jax.random.key(0), 60))
+    rng = np.random.default_rng(0)
+    action = jnp.asarray(np.repeat(rng.normal(size=(60, 4, 1)), 10, axis=1), jnp.float32)
+    states = jax.vmap(rollout)(models, CartState(jnp.zeros((60, 1)), jnp.zeros((60, 1))), action)
+    noisy = np.asarray(states.position) + 0.01 * rng.normal(size=(60, 40, 1)).astype(np.float32)
+    pieces = known_start(jnp.zeros((60, 1)), jnp.zeros((60, 1)), action, jnp.asarray(noisy))
+    target = motion_posterior(model, pieces, known_scales(model, np.array([0.01])))
+    draws = np.random.default_rng(1).normal(size=(400, 2)).astype(np.float32)
+    predicted = predict(target, draws, pieces, seed=0)
+    found = score(target, predicted, pieces)
+    assert found.coverage[0.9] == pytest.approx(0.9, abs=0.06)
+    assert found.coverage[0.5] == pytest.approx(0.5, abs=0.1)
+    assert found.error == pytest.approx(found.spread, rel=0.4)
+    lower, upper = predicted.interval(0.9)
+    assert np.all(lower < upper)
+    sharper = score(target, predict(target, draws * 0.0, pieces, seed=0), pieces)
+    assert sharper.log_score < found.log_score
+
+
+def test_unseen_pieces_cannot_be_scored():
+    model = LinearCart(mass=1.0, friction=0.5)
+    nothing = jnp.zeros((1, 1))
+    pieces = known_start(nothing, nothing, jnp.zeros((1, 10, 1)), jnp.full((1, 10, 1), jnp.nan))
+    target = motion_posterior(model, pieces, known_scales(model, np.array([0.01])))
+    with pytest.raises(PalpateError, match="nothing to score"):
+        score(target, predict(target, np.zeros((10, 2), np.float32), pieces, 0), pieces)
+
+
+def test_a_draw_without_a_finite_motion_is_named():
+    model = LinearCart(mass=1.0, friction=0.5)
+    nothing = jnp.zeros((1, 1))
+    pieces = known_start(nothing, nothing, jnp.ones((1, 10, 1)), jnp.zeros((1, 10, 1)))
+    target = motion_posterior(model, pieces, known_scales(model, np.array([0.01])))
+    draws = np.zeros((10, 2), np.float32)
+    draws[3] = np.nan
+    with pytest.raises(PalpateError, match="draw 3 of the posterior predicts no finite motion"):
+        predict(target, draws, pieces, 0)

@@ -1,0 +1,118 @@
+"""Every sampler against posteriors and evidences known in closed form."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayesian_toys import Linear, linear
+from palpate.errors import PalpateError
+from palpate.identification.diagnostics import bulk_size, rhat
+from palpate.identification.hamiltonian import no_u_turn
+from palpate.identification.laplace import find_modes
+from palpate.identification.metropolis import covariance_adapted, prior_scaled
+from palpate.identification.target import Target
+from palpate.identification.tempered import batch_of, compare, temper
+
+KEY = jax.random.key(7)
+
+
+def sampled(name, target):
+    modes = find_modes(target, KEY)
+    if name == "no u-turn":
+        return no_u_turn(target, modes, KEY, chains=4, draws=2000)
+    method = {"prior scaled": prior_scaled, "covariance adapted": covariance_adapted}[name]
+    return method(target, modes.draw(KEY, 4), KEY, draws=4000, warm_up=2000, thin=5)
+
+
+@pytest.mark.parametrize("name", ["prior scaled", "covariance adapted", "no u-turn"])
+def test_draws_have_the_moments_of_the_normal_posterior(name):
+    target = linear()
+    mean, covariance = target.moments()
+    draws = sampled(name, target)
+    assert np.max(rhat(draws.position)) < 1.02
+    size = bulk_size(draws.position)
+    assert np.all(size > 200)
+    flat = draws.position.reshape(-1, target.dimension)
+    error = (flat.mean(axis=0) - mean) / np.sqrt(np.diag(covariance) / size)
+    assert np.max(np.abs(error)) < 4.0
+    relative = np.cov(flat, rowvar=False) / np.sqrt(np.outer(*2 * [np.diag(covariance)]))
+    expected = covariance / np.sqrt(np.outer(*2 * [np.diag(covariance)]))
+    # Trajectories that turn back make means better than independent draws would, not variances.
+    assert np.max(np.abs(relative - expected)) < 6.0 / np.sqrt(min(size.min(), 2000.0))
+    assert np.all((draws.acceptance > 0.1) & (draws.acceptance < 0.98))
+    assert draws.divergences == 0
+
+
+def test_the_same_key_gives_the_same_draws():
+    first, second = (sampled("covariance adapted", linear()).position for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_one_mode_of_a_normal_posterior_is_the_posterior():
+    target = linear()
+    mean, covariance = target.moments()
+    modes = find_modes(target, KEY)
+    np.testing.assert_allclose(modes.position, np.tile(mean, (8, 1)), atol=2e-3)
+    np.testing.assert_allclose(modes.covariance[0], covariance, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(modes.evidence, target.log_evidence(), atol=0.01)
+
+
+def test_tempered_particles_have_moments_and_evidence():
+    target = linear()
+    mean, covariance = target.moments()
+    found = temper(target, KEY, particles=1000, moves=20)
+    deviation = np.sqrt(np.diag(covariance))
+    np.testing.assert_array_less(np.abs(found.position.mean(axis=0) - mean), 0.2 * deviation)
+    np.testing.assert_allclose(np.std(found.position, axis=0), deviation, rtol=0.15)
+    evidences = [float(temper(target, key, 500).evidence) for key in jax.random.split(KEY, 8)]
+    assert np.mean(evidences) == pytest.approx(target.log_evidence(), abs=0.3)
+
+
+class TwoWells(Target):
+    """A likelihood with two narrow modes, the right one three times as heavy."""
+
+    @property
+    def names(self):
+        return ("x", "y")
+
+    def log_likelihood(self, position):
+        left, right = (-0.5 * jnp.sum(jnp.square((position - a) / 0.1)) for a in (-1.5, 1.5))
+        return jnp.logaddexp(left, right + jnp.log(3.0))
+
+
+def test_tempered_particles_weigh_two_modes():
+    right = [
+        np.mean(np.asarray(temper(TwoWells(), key, 1000).position)[:, 0] > 0.0)
+        for key in jax.random.split(KEY, 4)
+    ]
+    assert np.mean(right) == pytest.approx(0.75, abs=0.08)
+
+
+def test_hypotheses_are_compared_by_their_evidence():
+    right = linear(3, data=6)
+    wrong = Linear(right.design, right.observed + 0.6)
+    probability, found = compare(batch_of([right, wrong]), KEY, particles=1000, moves=20)
+    ratio = right.log_evidence() - wrong.log_evidence()
+    assert np.log(probability[0] / probability[1]) == pytest.approx(ratio, abs=0.5)
+    assert found.position.shape == (2, 1000, 4)
+
+
+def test_hypotheses_of_other_shapes_are_refused():
+    with pytest.raises(PalpateError, match="pad their structure"):
+        batch_of([linear(data=6), linear(data=7)])
+
+
+class Nowhere(Linear):
+    def log_likelihood(self, position):
+        return jnp.nan * jnp.sum(position)
+
+
+def test_a_likelihood_that_is_nowhere_finite_is_refused():
+    broken = Nowhere(linear().design, linear().observed)
+    with pytest.raises(PalpateError, match="not finite anywhere"):
+        find_modes(broken, KEY)
+    with pytest.raises(PalpateError, match="declare a narrower prior"):
+        prior_scaled(broken, jnp.zeros((4, 4)), KEY, 10, 20)
+    with pytest.raises(PalpateError, match="hardly any draw of the prior"):
+        temper(broken, KEY, 100)

@@ -1,0 +1,49 @@
+"""Simulation-based calibration passes where a posterior is right, and fails where it is not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayesian_toys import NOISE, Sled
+from palpate.errors import PalpateError
+from palpate.identification.calibration import histogram, p_values, problem, ranks_of
+
+SIMULATIONS, DRAWS, BINS = 160, 31, 8
+
+
+def ranks(sigma_factor):
+    rng = np.random.default_rng(0)
+    action = jnp.asarray(np.repeat(rng.normal(size=(2, 2, 3)) * 10.0, 10, axis=1), jnp.float32)
+    model = Sled(mass=10.0, friction=[15.0, 15.0])
+    given = problem(model, jnp.zeros((2, 3)), action, 0.2 * NOISE, sigma_factor)
+    return ranks_of(given, jax.random.key(3), SIMULATIONS, DRAWS)
+
+
+def test_the_right_likelihood_passes_and_a_wrong_sigma_fails():
+    right, wrong = ranks(1.0), ranks(1.5)
+    assert right.rank.shape == (SIMULATIONS, 3)
+    assert np.median(right.size) > 0.6 * DRAWS
+    assert p_values(right.rank, DRAWS, BINS).min() > 0.01 / 3
+    assert p_values(wrong.rank, DRAWS, BINS).min() < 1e-3
+
+
+def test_p_values_of_uniform_ranks_are_uniform():
+    rng = np.random.default_rng(0)
+    values = p_values(rng.integers(0, 64, size=(320, 2000)), 63)
+    np.testing.assert_allclose(np.quantile(values, [0.05, 0.5, 0.95]), [0.05, 0.5, 0.95], atol=0.03)
+    narrow = np.clip(rng.normal(32, 12, size=(320, 5)), 0, 63).astype(int)
+    assert np.all(p_values(narrow, 63) < 1e-6)
+
+
+def test_each_rank_has_its_bin():
+    counts = histogram(np.array([[0], [3], [4], [63]]), 63)
+    np.testing.assert_array_equal(np.flatnonzero(counts[0]), [0, 1, 15])
+    assert counts[0, 0] == 2
+
+
+def test_too_few_simulations_are_refused():
+    with pytest.raises(PalpateError, match="at least 80 simulations"):
+        p_values(np.zeros((79, 1), int), 63)
+    with pytest.raises(PalpateError, match="multiple of the bins"):
+        p_values(np.zeros((320, 1), int), 60)

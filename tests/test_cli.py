@@ -111,11 +111,14 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         (
             "idenitfy rope R.npz",
             "unknown command 'idenitfy'; did you mean 'identify'? there are: demo, record, "
-            "convert, track, identify, train, evaluate, export, serve, report, reproduce",
+            "convert, track, identify, plan, train, evaluate, export, serve, report, reproduce",
         ),
-        ("identify rpoe R.npz", "unknown family 'rpoe'; did you mean 'rope'? there are: rope"),
-        ("identify", "palpate identify needs a family first; there are: rope"),
-        ("identify --seed 1 rope", "palpate identify needs a family first; there are: rope"),
+        (
+            "identify rpoe R.npz",
+            "unknown family 'rpoe'; did you mean 'rope'? there are: rope, furniture",
+        ),
+        ("identify", "palpate identify needs a family first; there are: rope, furniture"),
+        ("identify --seed 1 rope", "palpate identify needs a family first; there are: rope, furniture"),
         (
             "train rope-stabilisation",
             "unknown task 'rope-stabilisation'; did you mean 'rope-stabilization'? there are: "
@@ -125,7 +128,8 @@ def test_what_is_recorded_by_default_is_the_default_rope():
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: rope-model, "
             "rope-stabilization, rope-ablation, rope-rivals, rope-bound, rope-generalization, "
-            "rope-tracking, rope-dagger, rope-residual, rope-markerless",
+            "rope-tracking, rope-dagger, rope-residual, rope-markerless, namo-scenarios, "
+            "namo-scaling, calibration, cart-online",
         ),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),
         (

@@ -22,7 +22,7 @@ class Command:
     """One command: where its options and its work are found, as "module:name".
 
     Where a command works on one of several things, `options` gives those of each by its name and
-    `what` says what they are.
+    `what` says what they are. Options that name a `worker` have their work done there.
     """
 
     about: str
@@ -40,7 +40,10 @@ COMMANDS = {
     "record": Command(
         "record a simulated object",
         "palpate.experiments.record:run",
-        {"rope": "palpate.experiments.rope_options:RecordRope"},
+        {
+            "rope": "palpate.experiments.rope_options:RecordRope",
+            "furniture": "palpate.experiments.furniture_options:RecordFurniture",
+        },
         "family",
     ),
     "convert": Command(
@@ -57,8 +60,17 @@ COMMANDS = {
     "identify": Command(
         "find an object's physical parameters from recordings of it",
         "palpate.experiments.identify:run",
-        {"rope": "palpate.experiments.rope_options:IdentifyRope"},
+        {
+            "rope": "palpate.experiments.rope_options:IdentifyRope",
+            "furniture": "palpate.experiments.furniture_options:IdentifyFurniture",
+        },
         "family",
+    ),
+    "plan": Command(
+        "plan a robot's way, moving what stands in it",
+        "palpate.experiments.plan_namo:run",
+        {"namo": "palpate.experiments.namo_options:PlanNamo"},
+        "problem",
     ),
     "train": Command(
         "train a controller through an identified model",
@@ -108,6 +120,10 @@ COMMANDS = {
                 "rope-dagger",
                 "rope-residual",
                 "rope-markerless",
+                "namo-scenarios",
+                "namo-scaling",
+                "calibration",
+                "cart-online",
             ),
             "palpate.experiments.options:Reproduce",
         ),
@@ -161,10 +177,12 @@ def _run(words: list[str]) -> int:
         kind, *rest = rest
         check_name(command.what, kind, command.options)
         program = f"{program} {kind}"
-    options = parse(_found(command.options[kind]), program, rest)
+    kind_of_options = _found(command.options[kind])
+    options = parse(kind_of_options, program, rest)
     if options is None:
         return 0
-    _found(command.run)(options, *([kind] if name == "reproduce" else []))
+    work = getattr(kind_of_options, "worker", command.run)
+    _found(work)(options, *([kind] if name == "reproduce" else []))
     return 0
 
 

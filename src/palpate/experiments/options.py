@@ -15,6 +15,8 @@ from tyro.conf import Positional, arg
 from palpate.errors import PalpateError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from palpate.models.model import Model
     from palpate.networks import CommandPolicy
     from palpate.recording import Aligned, Recording
@@ -127,6 +129,37 @@ class Identify(Reading, ABC):
     @abstractmethod
     def start(self, aligned: Aligned) -> Model:
         """The model an identification starts from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyBayesian(Reading, ABC):
+    """Identification with a posterior; each family says which models are compared."""
+
+    family: ClassVar[str]
+    observation: ClassVar[str]  # the channel that is predicted
+    action: ClassVar[str]  # the channel that drives the model
+    worker: ClassVar[str] = "palpate.experiments.identify_bayesian:run"
+
+    recordings: Positional[
+        Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
+    ]
+    """What to fit: .npz of palpate, or a robot's log: .mcap, .db3, .bag, a folder of a rosbag2."""
+    validate: Annotated[
+        tuple[Path, ...], arg(metavar="FILE ...", help_behavior_hint="(default: none)")
+    ] = ()
+    """Recordings to score on and not to fit."""
+    draws: int = 300
+    """Of each chain, after its warm-up."""
+    chains: int = 4
+    """Independent of one another, so that it shows when they do not agree."""
+
+    @abstractmethod
+    def prepare(self, recording: Recording) -> Recording:
+        """The recording with the channels that the models need."""
+
+    @abstractmethod
+    def hypotheses(self, recording: Recording, period: float) -> Mapping[str, Model]:
+        """The models to compare by name, of one shape; one is fitted without comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,6 +287,7 @@ class Reproduce(Options):
     3. With motion capture of a real rope:      palpate reproduce rope-model --mocap FOLDER
     4. Without training:                        palpate reproduce rope-stabilization
                                                     --weights shipped
+    5. On a folder of maps:                     palpate reproduce namo-scenarios --maps FOLDER
     """
 
     quick: bool = False
@@ -267,6 +301,8 @@ class Reproduce(Options):
         Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: figures left out)")
     ] = None
     """With dlo1_train.npz and dlo1_eval.npz."""
+    maps: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
+    """Of maps with a robot, a goal and what can be moved."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,10 @@ def run(options: Record) -> Path:
 
     Raises `PalpateError` rather than overwrite a file that holds another recording.
     """
-    configuration = folders.told(options, f"record {options.family}")
+    configuration = {
+        name: " ".join(value) if isinstance(value, tuple) else value  # provenance is text
+        for name, value in folders.told(options, f"record {options.family}").items()
+    }
     if options.out is not None and _is_there(options.out, options, configuration):
         print(f"recording: {options.out} (it was there already)")
         return options.out

@@ -59,7 +59,7 @@ def beside(result: Result, kept: Result) -> list[str]:
 
 def _given(name: str, function: Callable[..., Result], options: Reproduce) -> dict[str, Any]:
     given = {"quick": options.quick, "seed": options.seed}
-    for option in ("weights", "mocap"):
+    for option in ("weights", "mocap", "maps"):
         value = getattr(options, option)
         if value is not None:
             if option not in inspect.signature(function).parameters:

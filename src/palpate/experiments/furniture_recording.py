@@ -1,0 +1,195 @@
+"""What a recording of furniture says of itself, and the model that is fitted to it."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.models.planar import Planar
+from palpate.models.planar_shapes import furniture
+from palpate.recording import Recording
+from palpate.worlds.furniture import FurnitureWorld
+from palpate.worlds.furniture_handling import record_handling, record_pushes
+from palpate.worlds.furniture_pieces import Piece
+
+POSE, WRENCH = "pose", "wrench"
+APART = 2.5  # m between pieces that are handled, so that they do not meet
+UNITS = {POSE: "m, m, rad", WRENCH: "N, N, N m"}
+
+
+def checked(recording: Recording) -> Recording:
+    """The recording, with both channels of the shape that `Planar` needs; one body gets an axis.
+
+    Raises `PalpateError` where the channel "pose" (frames, bodies, 3) or "wrench" of that shape is
+    missing, or their numbers of bodies differ.
+    """
+    bodies, trials = set(), []
+    for trial in recording.trials:
+        channels = dict(trial.channels)
+        for name, unit in UNITS.items():
+            channel = trial[name]
+            shape = channel.values.shape[1:]
+            if shape[-1:] != (3,) or len(shape) > 2:
+                raise PalpateError(
+                    f"trial '{trial.name}' has a channel '{name}' of shape (frames, "
+                    f"{', '.join(map(str, shape))}): expected (frames, bodies, 3) in {unit}"
+                )
+            bodies.add(shape[0] if len(shape) == 2 else 1)
+            values = channel.values.reshape(len(channel.values), -1, 3)
+            channels[name] = dataclasses.replace(channel, values=values, notes=())
+        trials.append(dataclasses.replace(trial, channels=channels))
+    if len(bodies) > 1:
+        raise PalpateError(
+            f"poses and wrenches are of {' and '.join(map(str, sorted(bodies)))} bodies: expected "
+            "the same bodies in every channel of every trial"
+        )
+    return dataclasses.replace(recording, trials=tuple(trials))
+
+
+def names_of(recording: Recording) -> tuple[str, ...]:
+    """What the bodies are called: as the recording says, else "body 1" and so on."""
+    count = recording.trials[0][POSE].values.shape[1]
+    told = _told(recording, "bodies")
+    if told is None:
+        return tuple(f"body {number + 1}" for number in range(count))
+    if not (isinstance(told, list) and len(told) == count and all(map(_is_name, told))):
+        raise PalpateError(
+            f'the recording\'s "bodies" are {told!r}: expected names of its {count} bodies'
+        )
+    return tuple(told)
+
+
+def starting_furniture(
+    recording: Recording, period: float, size: tuple[float, float] | None = None, **structure: Any
+) -> Planar:
+    """The planar model of the bodies in a recording, every parameter at its prior's centre.
+
+    Outlines and walls are those that the recording brings; where it brings none, every body is a
+    rectangle of `size` (m along x and y of its frame). `structure` as in `furniture`.
+
+    Raises `PalpateError` when there are neither, or they are malformed.
+    """
+    names = names_of(recording)
+    told = _told(recording, "outlines")
+    if size is not None:
+        if not all(math.isfinite(s) and s > 0 for s in size):
+            raise PalpateError(f"a size is two positive lengths in m, not {size}")
+        x, y = size[0] / 2, size[1] / 2
+        outlines = [[(-x, -y), (x, -y), (x, y), (-x, y)]] * len(names)
+    elif isinstance(told, dict) and set(names) <= set(told):
+        outlines = [_polygon(told[name], f"outline of '{name}'") for name in names]
+    else:
+        raise PalpateError(
+            'the recording does not say how large the bodies are: expected "outlines" in its '
+            "provenance, or --size LENGTH WIDTH"
+        )
+    walls = _told(recording, "walls") or []
+    if not isinstance(walls, list):
+        raise PalpateError(f'the recording\'s "walls" are {walls!r}: expected a list of polygons')
+    return furniture(
+        outlines,
+        [_polygon(wall, f"wall {number}") for number, wall in enumerate(walls)],
+        control_period=period,
+        poses=_first_seen(recording),
+        **structure,
+    )
+
+
+def structures(
+    recording: Recording,
+    period: float,
+    size: tuple[float, float] | None = None,
+    wheels: int = 1,
+    law: Literal["coulomb", "viscous"] = "coulomb",
+) -> dict[str, Planar]:
+    """What each body may be, as models of one shape: on wheels, on feet, hinged, or bolted down.
+
+    What is on feet or on a hinge has no wheels that resist; free casters are small friction of the
+    floor. Arguments as of `starting_furniture` and `furniture`.
+    """
+    bodies = range(recording.trials[0][POSE].values.shape[1])
+    model = starting_furniture(
+        recording, period, size, wheels=wheels, law=law, pivots=dict.fromkeys(bodies)
+    )
+    rolling, held = jnp.ones_like(model.wheel), jnp.ones_like(model.pivot)
+    none = 0.0
+    return {
+        name: dataclasses.replace(
+            model,
+            wheel=wheel * rolling,
+            pivot=pivot * held,
+            bolted=bolted * jnp.ones_like(model.bolted),
+        )
+        for name, wheel, pivot, bolted in (
+            ("wheels", 1.0, none, none),
+            ("feet", none, none, none),
+            ("hinge", none, 1.0, none),
+            ("bolted", none, none, 1.0),
+        )
+    }
+
+
+def record_pieces(
+    kinds: Sequence[str], seed: int, trials: int, duration: float, pushes: bool
+) -> Recording:
+    """Furniture of the MuJoCo world, handled or pushed: `trials` for each piece in turn.
+
+    The pieces stand in a row, far enough apart not to touch. Raises `PalpateError` for a kind that
+    does not exist.
+    """
+    reach = [Piece(kind).made_as.radius for kind in kinds]
+    across = np.concatenate([[0.0], np.cumsum(np.add(reach[1:], reach[:-1]) + APART)])
+    world = FurnitureWorld(
+        [Piece(kind, (0.0, float(y), 0.0)) for kind, y in zip(kinds, across, strict=True)]
+    )
+    if pushes:
+        return record_pushes(world, seed, trials * len(kinds), duration)
+    parts = [
+        record_handling(world, seed, duration, number * len(kinds)) for number in range(trials)
+    ]
+    named = [
+        dataclasses.replace(trial, name=f"{trial.name} {number + 1}" if trials > 1 else trial.name)
+        for number, part in enumerate(parts)
+        for trial in part.trials
+    ]
+    return dataclasses.replace(parts[0], trials=tuple(named))
+
+
+def _first_seen(recording: Recording) -> np.ndarray:
+    """Where each body is seen first, (bodies, 3)."""
+    poses = recording.trials[0][POSE].values.astype(float)
+    complete = np.isfinite(poses).all(axis=2)
+    if not complete.any(axis=0).all():
+        raise PalpateError("a body is never seen in the first trial: expected some of its poses")
+    return poses[complete.argmax(axis=0), np.arange(poses.shape[1])]
+
+
+def _told(recording: Recording, key: str) -> Any:
+    text = recording.provenance.get(key)
+    if text is None:
+        return None
+    try:
+        return json.loads(str(text))
+    except ValueError as error:
+        raise PalpateError(f'the recording\'s "{key}" is not JSON: {error}') from error
+
+
+def _polygon(points: Any, what: str) -> np.ndarray:
+    try:
+        polygon = np.asarray(points, float)
+    except (TypeError, ValueError) as error:
+        raise PalpateError(f"the {what} is not a list of points (x, y)") from error
+    if polygon.ndim != 2 or polygon.shape[1:] != (2,) or not np.isfinite(polygon).all():
+        raise PalpateError(
+            f"the {what} has shape {polygon.shape}: expected finite points (corners, 2) in m"
+        )
+    return polygon
+
+
+def _is_name(text: Any) -> bool:
+    return isinstance(text, str) and bool(text)

@@ -1,0 +1,289 @@
+"""`palpate identify` with a posterior: recordings in, draws of models and what they predict out.
+
+Nothing here knows what was recorded: `options.prepare` and `options.hypotheses` do.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.experiments import folders
+from palpate.experiments.options import IdentifyBayesian
+from palpate.identification.bayesian import Posterior, sample
+from palpate.identification.laplace import settle
+from palpate.identification.likelihood import (
+    MotionPosterior,
+    inferred_scales,
+    motion_posterior,
+)
+from palpate.identification.posterior_files import write_posterior
+from palpate.identification.predictive import Predicted, Score
+from palpate.identification.segments import Segments, cut, difference, noise_scale
+from palpate.models.model import Model
+from palpate.parameters import format_value
+from palpate.recording import Aligned, Recording, join
+from palpate.recording_files import read_recording
+from palpate.report import write_evidence
+from palpate.result import Figure, Result, read_result
+from palpate.runs import RESULT, Run
+
+DRAWS = "posterior.npz"
+PIECE, SCORED = 1.0, 2.0  # s: pieces that are fitted, and those that are predicted open loop
+LEVEL = 0.9
+STILL = 0.1  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """The posterior of the most probable hypothesis, and how probable each is."""
+
+    posterior: Posterior
+    structure: str
+    probability: dict[str, float]
+
+
+def run(options: IdentifyBayesian) -> Path:
+    """Identify, print what a person wants to know, and return the folder everything is in.
+
+    Raises `PalpateError` for recordings and folders that cannot be used.
+    """
+    fitted, period = _read(options, options.recordings)
+    scored = _read(options, options.validate)[0] if options.validate else None
+    name = f"identify-{options.family}"
+    configuration = {
+        **folders.told(options, f"identify {options.family}"),
+        "recordings": [folders.fingerprint(path) for path in options.recordings],
+        "validate": [folders.fingerprint(path) for path in options.validate],
+    }
+    with folders.open_run(options, name, configuration, DRAWS) as run:
+        if not run.finished:
+            hypotheses = options.hypotheses(fitted, period)
+            aligned = fitted.align(period, options.observation, options.action)
+            found = identify(hypotheses, aligned, options.draws, options.chains, options.seed)
+            _write(run, name, options, fitted, scored, found)
+        result = read_result(run.path / RESULT)
+        _print(result)
+        title = f"What was found out about the {options.family}"
+        folders.hand_over(options, run, title, DRAWS, list(result.warnings))
+        return run.path
+
+
+def identify(
+    hypotheses: Mapping[str, Model],
+    aligned: Aligned,
+    draws: int = 300,
+    chains: int = 4,
+    seed: int = 0,
+) -> Found:
+    """Compare the hypotheses by their evidence and sample the posterior of the most probable."""
+    probability = probabilities(hypotheses, aligned, seed)
+    structure = max(probability, key=probability.__getitem__)
+    posterior = sample(
+        posterior_of(hypotheses[structure], aligned), chains=chains, draws=draws, seed=seed
+    )
+    return Found(posterior, structure, probability)
+
+
+def probabilities(
+    hypotheses: Mapping[str, Model], aligned: Aligned, seed: int = 0
+) -> dict[str, float]:
+    """How probable each hypothesis is given the trials, all of them alike before.
+
+    By Laplace's evidence at the best mode of each: tempered particles (`tempered.compare`) give it
+    without the assumption of a normal posterior, and take a hundred times as long.
+    """
+    if len(hypotheses) == 1:
+        return dict.fromkeys(hypotheses, 1.0)
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    found = [settle(posterior_of(model, aligned), key)[1] for model in hypotheses.values()]
+    evidence = np.array([float(np.max(np.asarray(modes.evidence))) for modes in found])
+    shares = np.exp(evidence - evidence.max())
+    return dict(zip(hypotheses, map(float, shares / shares.sum()), strict=True))
+
+
+def posterior_of(model: Model, aligned: Aligned) -> MotionPosterior:
+    """What is to be sampled: of pieces of the trials, the first of each from rest if it is so."""
+    segments = cut(aligned, model, PIECE, begins_at_rest(aligned, model))
+    return motion_posterior(model, segments, inferred_scales(model, noise_scale(aligned, model)))
+
+
+def _read(options: IdentifyBayesian, paths: tuple[Path, ...]) -> tuple[Recording, float]:
+    """The recordings as the family needs them, and their period without the clock's jitter."""
+    if not paths:
+        raise PalpateError("no recording is named: expected at least one file or log")
+    recording = options.prepare(
+        join([
+            read_recording(
+                path, rate=options.rate, unit=options.unit, up=options.up,
+                topics=options.topics or (),
+            )
+            for path in paths
+        ])
+    )  # fmt: skip
+    for note in dict.fromkeys(recording.notes):
+        print(f"note: {note}")
+    periods = [trial[options.observation].nominal_period for trial in recording.trials]
+    period = 1.0 / options.rate if options.rate else float(f"{np.median(periods):.5g}")
+    return recording, period
+
+
+def begins_at_rest(aligned: Aligned, model: Model) -> bool:
+    """Whether nothing moves beyond the noise in the first tenth of a second of any trial."""
+    frames = max(2, round(STILL / aligned.period))
+    noise = noise_scale(aligned, model)
+    for observed in aligned.observation:
+        early, late = observed[:frames], observed[frames : 2 * frames]
+        if not (np.isfinite(early).all() and np.isfinite(late).all()):
+            return False
+        moved = difference(model, late.mean(axis=0), early.mean(axis=0))
+        if np.any(np.abs(moved) > 4.0 * noise * np.sqrt(2.0 / frames)):
+            return False
+    return True
+
+
+def rows(posterior: Posterior) -> list[dict[str, Any]]:
+    """The parameters for `result.json`: medians, 90 % intervals and what the data left open."""
+    declared = posterior.target.coordinates.declarations
+    found = []
+    for path, declaration in declared.items():
+        of = [row for row in posterior.table if row.name.partition("[")[0] == path]
+        told = sum(not row.undecided for row in of)
+        found.append({
+            "name": path,
+            "value": [row.median for row in of],
+            "unit": declaration.unit,
+            "about": declaration.about,
+            "fixed": False,
+            "shared": declaration.shared,
+            "lower": [row.lower for row in of],
+            "upper": [row.upper for row in of],
+            "verdict": _verdict(told, len(of)),
+        })  # fmt: skip
+    return found
+
+
+def _verdict(told: int, elements: int) -> str | None:
+    if told == elements:
+        return None
+    if told == 0:
+        return "not told by the data: the interval is the prior's"
+    return f"not told by the data for {elements - told} of {elements} elements"
+
+
+def _write(
+    run: Run,
+    name: str,
+    options: IdentifyBayesian,
+    fitted: Recording,
+    scored: Recording | None,
+    found: Found,
+) -> None:
+    """Draws, evidence and result into the run's folder; the result last."""
+    posterior = found.posterior
+    write_posterior(run.path / DRAWS, posterior)
+    model = posterior.target.coordinates.reference
+    which = scored or fitted
+    aligned = which.align(model.control_period, options.observation, options.action)
+    pieces = cut(aligned, model, SCORED, begins_at_rest(aligned, model))
+    predicted = posterior.predict(pieces)
+    score = posterior.score(pieces)
+    write_evidence(run.path, _horizon(predicted, pieces, model))
+    settings = run.configuration | {
+        "structure": found.structure,
+        "probability": found.probability,
+        "pieces": pieces.count,
+        "scored_on": "recordings that were not fitted" if scored else "what was fitted",
+        "observation_unit": model.observation_units[0],
+    }
+    run.finish(
+        Result(
+            name=name,
+            figures=_figures(posterior, score, model, run.elapsed),
+            settings=settings,
+            seeds=[options.seed],
+            split={
+                "fitted": [trial.name for trial in fitted.trials],
+                "validation": [trial.name for trial in scored.trials]
+                if scored
+                else "none: errors and coverage are those on the fitted trials",
+            },
+            wall_time_s=run.elapsed,
+            parameters=rows(posterior),
+            warnings=list(posterior.warnings),
+        ).to_dict()
+    )
+
+
+def _figures(posterior: Posterior, score: Score, model: Model, wall_time: float) -> list[Figure]:
+    error = score.error.reshape(-1, score.error.shape[-1])
+    units = model.observation_units
+    figures = [
+        Figure(
+            f"rmse_{unit}", float(np.sqrt(np.mean(error[:, np.array(units) == unit] ** 2))), unit
+        )
+        for unit in dict.fromkeys(units)
+    ]
+    return [
+        *figures,
+        Figure("coverage_90", score.coverage[LEVEL], ""),
+        Figure("log_score", score.log_score, "", better="higher"),
+        Figure("rhat_max_predictions", posterior.rhat_of_predictions, ""),
+        Figure("ess_min", posterior.size_of_predictions, "", better="higher"),
+        Figure("divergences", posterior.draws.divergences, ""),
+        Figure("wall_time_s", wall_time, "s"),
+    ]
+
+
+def _horizon(predicted: Predicted, pieces: Segments, model: Model) -> dict[str, np.ndarray]:
+    """How the error of position grows, and how far predictions reach that hold 90 %."""
+    unit = model.observation_units[0]
+    of = np.array([u == unit for u in model.observation_units])
+    seen = np.asarray(pieces.seen)[..., of]
+    off = difference(model, np.asarray(predicted.motion), np.asarray(pieces.target))[..., of]
+    mean = np.where(seen, off.mean(axis=0), 0.0)
+    axes = (0, *range(2, mean.ndim))
+    count = np.maximum(seen.sum(axis=axes), 1)
+    spread = np.where(seen, np.var(np.asarray(predicted.observed)[..., of], axis=0), 0.0)
+    return {
+        "horizon.time": model.control_period * np.arange(1, pieces.horizon + 1),
+        "horizon.error": np.sqrt(np.square(mean).sum(axis=axes) / count),
+        "horizon.expected": np.sqrt(spread.sum(axis=axes) / count),
+    }
+
+
+def _print(result: Result) -> None:
+    """Structure, parameters, what the data cannot tell, and how predictions fared."""
+    settings = result.settings
+    if len(settings["probability"]) > 1:
+        told = ", ".join(f"{name} {share:.2g}" for name, share in settings["probability"].items())
+        print(f"structure: {settings['structure']} (probability of each: {told})")
+    width = max(len(row["name"]) for row in result.parameters)
+    for row in result.parameters:
+        several = len(row["value"]) > 1
+        for number, (value, low, high) in enumerate(
+            zip(row["value"], row["lower"], row["upper"], strict=True)
+        ):
+            told = "" if row["verdict"] is None else f"  ({row['verdict']})"
+            name = f"{row['name']}[{number}]" if several else row["name"]
+            print(
+                f"{name:{width + 3}}  {format_value(value, row['unit'])}"
+                f"  [{low:.3g}, {high:.3g}]{told}"
+            )
+    for warning in result.warnings:
+        print(f"warning: {warning}")
+    values = {figure.name: figure for figure in result.figures}
+    coverage = values["coverage_90"].value or 0.0
+    errors = ", ".join(
+        f"{figure.value:.3g} {figure.unit}"
+        for name, figure in values.items()
+        if name.startswith("rmse_")
+    )
+    print(
+        f"predicted over {SCORED:g} s: root mean square error {errors}; 90 % intervals hold "
+        f"{coverage:.0%} of what was seen ({settings['scored_on']})"
+    )

@@ -1,0 +1,273 @@
+"""The Shopping-Cart and Apartment tasks and who learns them, at sizes that take seconds."""
+
+import dataclasses
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import shapely
+from shapely import affinity
+
+from palpate.experiments import cart_agents, cart_online
+from palpate.experiments.cart_agents import (
+    FRAMES,
+    Decision,
+    Episode,
+    Handled,
+    Knowing,
+    PhysicsAgent,
+    RegressionAgent,
+    around,
+    due,
+    piece_model,
+    scene_model,
+)
+from palpate.experiments.cart_tasks import DONE, TURN, Turns, apartment, shopping_cart
+from palpate.experiments.cart_trials import Planning, Trial
+from palpate.identification.segments import Segments
+from palpate.models.planar import Planar, PlanarState
+from palpate.planning.sampling import SamplingPlanner
+from palpate.worlds.furniture import KINDS
+
+TASKS = [shopping_cart(), apartment()]
+SMALL = Planning(samples=4, knots=3, spacing=1)
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
+def test_starts_and_goals_are_apart_and_in_the_room(task):
+    random = np.random.default_rng(1)
+    walls = shapely.MultiPolygon([shapely.Polygon(wall) for wall in task.walls])
+    for poses in (task.goals, *(task.start(random) for _ in range(200))):
+        placed = [
+            affinity.translate(affinity.rotate(shapely.Polygon(o), a, (0, 0), True), x, y)
+            for o, (x, y, a) in zip(task.outlines, poses, strict=True)
+        ]
+        assert all(one.distance(walls) > 0.02 for one in placed)
+        assert all(a.distance(b) > 0 for a, b in itertools.combinations(placed, 2))
+
+
+def test_the_reward_is_distance_and_heading_the_short_way_round():
+    task = shopping_cart()
+    assert task.reward(task.goals) == 0
+    assert task.reward(np.array([[3.0, 4.0, 2 * np.pi]])) == pytest.approx(-5.0)
+    assert task.reward(np.array([[0.0, 0.0, 1.5 * np.pi]])) == pytest.approx(-np.pi / 4)
+    assert task.reward(np.zeros((7, 1, 3))).shape == (7,)
+
+
+def test_pieces_are_held_one_after_another():
+    task = apartment()
+    turns, away = Turns(task), np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    turns.begin()
+    held = [turns.held(task.goals + away) for _ in range(3 * TURN)]
+    assert held == [0] * TURN + [1] * TURN + [2] * TURN
+    turns.begin()
+    assert turns.held(task.goals + away * [[0], [1], [1]]) == 1  # the first is where it should be
+    assert turns.held(task.goals + away * 0.9 * DONE) == 1  # all are: nothing changes
+    assert turns.held(task.goals + away * [[1], [0], [0]]) == 0
+
+
+def test_a_wrench_acts_on_the_piece_that_is_held_at_its_handle():
+    task = apartment()
+    strength, handle = jnp.asarray(task.strength), jnp.array([[0.0, 0], [-0.5, 0.2], [0.0, 0]])
+    inner = scene_model(task, [piece_model(task, body) for body in range(3)])
+    handled = Handled(inner=inner, held=jnp.asarray(1), strength=strength, handle=handle)
+    pose = jnp.asarray(task.goals, jnp.float32).at[1, 2].set(0.6)
+    action = jnp.array([0.3, -0.5, 0.0])
+    wrench = handled.wrench(pose, action)
+    cosine, sine = np.cos(0.6), np.sin(0.6)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    force = jnp.asarray(turn @ (np.array([0.3, -0.5]) * 140), jnp.float32)
+    np.testing.assert_allclose(wrench, inner.wrench_at(pose, 1, handle[1], force), atol=1e-3)
+    twist = handled.wrench(pose, jnp.array([0.0, 0, 1.0]))
+    np.testing.assert_allclose(twist[1], [0, 0, task.strength[1, 2]], atol=1e-4)
+    many = handled.wrench(jnp.stack([pose, pose]), jnp.stack([action, action]))
+    np.testing.assert_allclose(many[1], wrench, atol=1e-4)
+
+
+def test_the_scene_has_the_parameters_of_its_pieces_and_the_contacts_of_the_one_held():
+    task = apartment()
+    pieces = [
+        dataclasses.replace(piece_model(task, body), mass=jnp.array([10.0 + body]))
+        for body in range(3)
+    ]
+    scene = scene_model(task, pieces)
+    np.testing.assert_allclose(scene.mass, [10, 11, 12])
+    for held in range(3):
+        pairs = np.asarray(around(scene, held).pairs)
+        assert len(pairs) == 2 + 4  # the other two, and four walls
+        assert (pairs[:, [0, 2]] == held).any(axis=1).all()
+
+
+def decision(moved: bool, touched: bool, number: int) -> Decision:
+    state = PlanarState(jnp.zeros((1, 3)), jnp.zeros((1, 3)))
+    poses = np.full((FRAMES, 1, 3), float(number))
+    flags = np.array([moved]), np.array([touched])
+    return Decision(poses, poses, state, state, np.zeros((1, 3)), 0, *flags)
+
+
+def test_handling_is_cut_where_the_piece_touches_or_rests():
+    kinds = [(True, False), (True, False), (True, True), (False, False), (True, False)]
+    episode = Episode(np.full((1, 3), -1.0))
+    for number, (moved, touched) in enumerate(kinds):
+        episode.decisions.append(decision(moved, touched, number))
+    (first, at_rest), (second, later) = episode.handling(0)
+    assert (at_rest, later) == (True, False)
+    assert first.observation.shape == (1, 2 * FRAMES + 1, 1, 3)
+    assert first.observation[0, :2, 0, 0].tolist() == [-1, 0]
+    assert second.observation.shape == (1, FRAMES + 1, 1, 3)
+    assert second.observation[0, :2, 0, 0].tolist() == [3, 4]
+    assert first.action.shape == (1, 2 * FRAMES, 1, 3)
+
+
+def test_learning_becomes_seldom():
+    assert sum(map(due, range(1, 1001))) < 60
+    assert all(map(due, range(1, 11)))
+
+
+def test_the_pieces_in_which_most_happened_are_compared(monkeypatch):
+    """Fewer than there is room for are padded by pieces in which nothing is seen."""
+    way = jnp.array([0.0, 0.3, 0.1, 0.2])
+    target = way[:, None, None, None] * jnp.ones((4, 5, 1, 3))
+    zero = jnp.zeros((4, 1, 3))
+    pieces = Segments(zero, zero, zero, zero, target, target, jnp.ones(target.shape, bool))
+    monkeypatch.setattr(cart_agents, "MOST", 3)
+    picked = cart_agents._telling([pieces.take([0, 1]), pieces.take([2, 3])])
+    np.testing.assert_allclose(picked.target[:, 0, 0, 0], [0.3, 0.2, 0.1])
+    monkeypatch.setattr(cart_agents, "MOST", 6)
+    picked = cart_agents._telling([pieces])
+    assert picked.count == 6
+    assert np.asarray(picked.seen).all(axis=(1, 2, 3)).tolist() == [True] * 4 + [False] * 2
+
+
+def run(task, agent, seed, count, idle=False):
+    trial = Trial(task, agent, SMALL, seed, idle)
+    return np.array([trial.decide() for _ in range(count)]), trial
+
+
+def test_a_trial_is_its_seed_and_begins_anew_after_an_episode():
+    task = dataclasses.replace(shopping_cart(), episode=4)
+    first, trial = run(task, Knowing(None), 3, 6)
+    again, _ = run(task, Knowing(None), 3, 6)
+    other, _ = run(task, Knowing(None), 4, 6)
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).all()
+    assert [len(episode.decisions) for episode in trial.episodes] == [4, 2]
+    still, trial = run(task, Knowing(None), 3, 6, idle=True)
+    np.testing.assert_allclose(still[:4], task.reward(trial.episodes[0].first), atol=0.02)
+    np.testing.assert_allclose(np.diff(still[:4]), 0, atol=1e-4)
+
+
+def test_a_regression_is_asked_once_its_piece_was_held():
+    task = apartment()
+    agent = RegressionAgent(task, "oo-lwr", 16)
+    assert agent.believed(0) is None
+    trial = Trial(task, agent, SMALL, 3)
+    for _ in range(4):
+        trial.decide()
+    assert agent.believed(1) is None
+    model = agent.believed(0)
+    assert model is not None
+    last = trial.episodes[-1].decisions[-1]
+    predicted = model.step(last.before, jnp.asarray(last.wrench))
+    assert np.abs(predicted.pose - last.after.pose).max() < 0.2
+
+
+def test_a_planner_is_asked_for_what_is_believed(monkeypatch):
+    """With a model the action comes from the planner, kept from one decision to the next."""
+    asked = []
+
+    def call(self, plan, state, goals):
+        asked.append((self.model.inner, int(self.model.held), goals.shape))
+        return plan, jnp.array([0.5, 0.0, 0.0])
+
+    monkeypatch.setattr(SamplingPlanner, "__call__", call)
+    task = shopping_cart()
+    scene = scene_model(task, [piece_model(task, 0)])
+    _, trial = run(task, Knowing(scene), 3, 2)
+    assert [held for _, held, _ in asked] == [0, 0]
+    assert asked[0][2] == (2, 1, 3)
+    assert isinstance(asked[0][0], Planar)
+    wrench = trial.episodes[0].decisions[0].wrench[0]
+    assert np.hypot(*wrench[:2]) == pytest.approx(0.5 * KINDS["cart"].hand_force, rel=1e-4)
+
+
+def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
+    updates, kept = [], []
+
+    class Posterior:
+        def __init__(self, model, seed):
+            self.model, self.mass = model, 10.0
+
+        def keep(self, stretches):
+            kept.append(len(stretches))
+
+        def update(self, stretches):
+            updates.append(sum(a.action.shape[1] for a, _ in stretches))
+            self.mass += 1
+            return dataclasses.replace(self.model, mass=jnp.array([self.mass]))
+
+    monkeypatch.setattr(cart_agents, "PiecePosterior", Posterior)
+    monkeypatch.setattr(
+        SamplingPlanner, "__call__", lambda self, plan, *_: (plan, jnp.array([0.2, 0.0, 0.0]))
+    )
+    task = dataclasses.replace(shopping_cart(), episode=3)
+    agent = PhysicsAgent(task, 0)
+    run(task, agent, 3, 4)
+    assert updates == [FRAMES, 2 * FRAMES, 3 * FRAMES, FRAMES]
+    assert kept == [1]
+    assert float(agent.believed(0).mass[0]) == 14.0
+
+
+def earned(worlds: int, decisions: int) -> cart_online.Rewards:
+    means = dict.fromkeys(cart_online.AGENTS, -2.0) | {"TRUE": -1.0, "PBRL": -1.02, "random": -3.0}
+    random = np.random.default_rng(0)
+    return {
+        agent: mean + 0.01 * random.normal(size=(worlds, decisions))
+        for agent, mean in means.items()
+    }
+
+
+def test_regret_is_a_share_of_what_there_is_to_learn():
+    rewards = earned(5, 200)
+    figures = {figure.name: figure for figure in cart_online.figures("cart", rewards)}
+    assert figures["cart.regret"].value == pytest.approx(0.01, abs=2e-3)
+    assert figures["cart.regret"].met is True
+    assert figures["cart.regret"].rival == pytest.approx(0.5, abs=0.01)
+    assert figures["cart.regret.doing_nothing"].value == pytest.approx(0.5, abs=0.01)
+    assert cart_online.regret(rewards, "random", slice(None)).mean() == pytest.approx(1.0)
+    assert cart_online.regret(rewards, "TRUE", slice(None)).tolist() == [0.0] * 5
+
+
+def test_what_was_earned_is_kept_and_only_what_was_cut_off_begins_anew(tmp_path, monkeypatch):
+    worked = []
+
+    class Stub:
+        def __init__(self, task, agent, planning, seed, idle):
+            worked.append((task.name, seed, idle))
+            self.count = 0
+
+        def decide(self):
+            self.count += 1
+            if len(worked) == 3 and self.count == 5:
+                raise KeyboardInterrupt
+            return -1.0 / self.count - 0.1 * len(worked)
+
+    monkeypatch.setattr(cart_online, "Trial", Stub)
+    monkeypatch.setattr(cart_online, "_agent", lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        cart_online.reproduce(tmp_path, quick=True)
+    assert len(worked) == 3
+    result = cart_online.reproduce(tmp_path, quick=True)
+    assert len(worked) == 3 + 2 * len(cart_online.AGENTS) - 2
+    assert sum(idle for *_, idle in worked) == 2
+    assert {seed for _, seed, _ in worked} == {cart_online.EVALUATION_SEEDS}
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    names = [figure.name for figure in result.figures]
+    assert {"cart.regret", "apartment.regret"} <= set(names)
+    count = len(worked)
+    assert (
+        cart_online.reproduce(tmp_path, quick=True).to_dict()["figures"]
+        == (result.to_dict()["figures"])
+    )
+    assert len(worked) == count

@@ -1,0 +1,139 @@
+"""`palpate identify furniture`: what a recording has to bring, and the whole way on a short one."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.errors import PalpateError
+from palpate.experiments.furniture_recording import (
+    POSE,
+    WRENCH,
+    checked,
+    names_of,
+    record_pieces,
+    starting_furniture,
+    structures,
+)
+from palpate.experiments.identify_bayesian import begins_at_rest
+from palpate.recording import Channel, Recording, Role, Trial
+
+RATE = 50.0
+
+
+def recording(pose: np.ndarray, wrench: np.ndarray, **provenance: str) -> Recording:
+    time = np.arange(len(pose)) / RATE
+    channels = {
+        POSE: Channel(POSE, Role.OBSERVATION, time, pose, "m, m, rad"),
+        WRENCH: Channel(WRENCH, Role.COMMAND, time[:-1], wrench, "N, N, N m"),
+    }
+    return Recording((Trial("one", channels),), provenance)
+
+
+def still(bodies: int = 1, frames: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    noise = 1e-3 * random.standard_normal((frames, bodies, 3))
+    return noise, np.zeros((frames - 1, bodies, 3))
+
+
+def test_one_body_may_come_without_an_axis_of_its_own():
+    pose, wrench = still()
+    found = checked(recording(pose[:, 0], wrench[:, 0]))
+    assert found.trials[0][POSE].values.shape == (20, 1, 3)
+    assert names_of(found) == ("body 1",)
+
+
+def test_channels_of_another_shape_are_refused():
+    pose, wrench = still(2)
+    with pytest.raises(PalpateError, match="expected \\(frames, bodies, 3\\)"):
+        checked(recording(pose[..., :2], wrench))
+    with pytest.raises(PalpateError, match="the same bodies"):
+        checked(recording(pose, wrench[:, :1]))
+
+
+def test_outlines_come_from_the_recording_or_from_a_size():
+    pose, wrench = still()
+    corners = [[-0.6, -0.3], [0.6, -0.3], [0.6, 0.3], [-0.6, 0.3]]
+    told = checked(
+        recording(pose, wrench, bodies='["table"]', outlines=json.dumps({"table": corners}))
+    )
+    half_extent = np.asarray(starting_furniture(told, 0.02).half_extent)
+    np.testing.assert_allclose(half_extent, [[0.6, 0.3]], rtol=1e-6)
+    bare = checked(recording(pose, wrench))
+    with pytest.raises(PalpateError, match="--size LENGTH WIDTH"):
+        starting_furniture(bare, 0.02)
+    sized = starting_furniture(bare, 0.02, (1.2, 0.6))
+    np.testing.assert_allclose(np.asarray(sized.half_extent), half_extent, rtol=1e-6)
+    with pytest.raises(PalpateError, match="two positive lengths"):
+        starting_furniture(bare, 0.02, (1.2, -1.0))
+
+
+@pytest.mark.parametrize(
+    ("provenance", "sentence"),
+    [
+        ({"bodies": "[1"}, "is not JSON"),
+        ({"bodies": '["a", "b"]'}, "expected names of its 1 bodies"),
+        ({"outlines": '{"body 1": [[0, 1], [2]]}'}, "not a list of points"),
+        ({"outlines": '{"body 1": [[0, 1, 2]]}'}, "expected finite points"),
+    ],
+)
+def test_damaged_provenance_is_refused_with_a_sentence(provenance, sentence):
+    pose, wrench = still()
+    with pytest.raises(PalpateError, match=sentence):
+        starting_furniture(checked(recording(pose, wrench, **provenance)), 0.02)
+
+
+def test_a_body_that_is_never_seen_is_refused():
+    pose, wrench = still()
+    with pytest.raises(PalpateError, match="never seen"):
+        starting_furniture(checked(recording(np.full_like(pose, np.nan), wrench)), 0.02, (1.0, 1.0))
+
+
+def test_hypotheses_differ_in_nothing_but_their_data():
+    import jax
+
+    pose, wrench = still()
+    models = structures(checked(recording(pose, wrench)), 0.02, (1.0, 0.5))
+    assert set(models) == {"wheels", "feet", "hinge", "bolted"}
+    shapes = {jax.tree.structure(model) for model in models.values()}
+    assert len(shapes) == 1
+    assert float(models["hinge"].pivot.sum()) == 1.0
+    assert float(models["feet"].wheel.sum()) == 0.0
+
+
+def test_rest_is_told_from_motion():
+    pose, wrench = still()
+    model = starting_furniture(checked(recording(pose, wrench)), 0.02, (1.0, 0.5))
+    aligned = recording(pose, wrench).align(0.02)
+    assert begins_at_rest(aligned, model)
+    moving = pose + 0.5 * np.arange(len(pose))[:, None, None] / RATE
+    assert not begins_at_rest(dataclasses.replace(aligned, observation=moving[None]), model)
+
+
+def test_recorded_pieces_bring_what_identification_needs():
+    found = record_pieces(("table", "chair"), 3, 2, 0.2, pushes=False)
+    assert [trial.name for trial in found.trials] == [
+        "handling table 1",
+        "handling chair 1",
+        "handling table 2",
+        "handling chair 2",
+    ]
+    model = starting_furniture(checked(found), 0.02)
+    assert model.bodies == 2
+    pushed = record_pieces(("box",), 3, 2, 0.2, pushes=True)
+    assert len(pushed.trials) == 2
+
+
+@pytest.mark.slow
+def test_a_table_is_identified_from_a_short_recording(tmp_path, capsys):
+    file = tmp_path / "R.npz"
+    assert main(["record", "furniture", "--duration", "3", "--out", str(file)]) == 0
+    out = tmp_path / "identified"
+    assert main(["identify", "furniture", str(file), "--draws", "50", "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "mass" in told
+    assert "90 % intervals hold" in told
+    assert (out / "posterior.npz").exists()
+    assert (out / "report.html").exists()

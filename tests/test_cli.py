@@ -118,7 +118,10 @@ def test_what_is_recorded_by_default_is_the_default_rope():
             "unknown family 'rpoe'; did you mean 'rope'? there are: rope, furniture",
         ),
         ("identify", "palpate identify needs a family first; there are: rope, furniture"),
-        ("identify --seed 1 rope", "palpate identify needs a family first; there are: rope, furniture"),
+        (
+            "identify --seed 1 rope",
+            "palpate identify needs a family first; there are: rope, furniture",
+        ),
         (
             "train rope-stabilisation",
             "unknown task 'rope-stabilisation'; did you mean 'rope-stabilization'? there are: "

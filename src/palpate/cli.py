@@ -122,6 +122,7 @@ COMMANDS = {
                 "rope-markerless",
                 "namo-scenarios",
                 "namo-scaling",
+                "namo-online",
                 "calibration",
                 "cart-online",
             ),

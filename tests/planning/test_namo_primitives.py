@@ -1,0 +1,143 @@
+"""The deck's table of primitives, and what becomes of a motion under each constraint."""
+
+import math
+
+import numpy as np
+import pytest
+
+from palpate.planning.movable_obstacles.geometry import placed
+from palpate.planning.movable_obstacles.manipulation import (
+    FORWARD,
+    LEFT,
+    Grasp,
+    ManipulationModel,
+    RigidCarry,
+    outline_grasps,
+)
+from palpate.planning.movable_obstacles.map import Movable
+from palpate.planning.movable_obstacles.physics_manipulation import (
+    ConstrainedManipulation,
+    Drawn,
+    swept,
+)
+from palpate.planning.movable_obstacles.primitives import (
+    APART,
+    AXIS,
+    FREE,
+    PIVOT,
+    STATIC,
+    Constraint,
+    Turn,
+    anchors,
+    grasp_share,
+    twist,
+)
+
+OUTLINE = np.array([[-0.5, -0.3], [0.5, -0.3], [0.5, 0.3], [-0.5, 0.3]])
+PIECE = Movable("piece", OUTLINE, (1.0, 2.0, 0.4))
+POSE = np.array(PIECE.pose)
+GRASP = Grasp((0.5, 0.1), 0.0)
+ROBOT = GRASP.robot_pose(POSE, 0.4)
+LENGTHS = np.linspace(0.05, 0.6, 12)
+
+
+def moved(constraint: Constraint, primitive, force: float = 100.0):
+    model = ConstrainedManipulation({"piece": Drawn((constraint,))}, force)
+    return model.motion(PIECE, POSE, ROBOT, primitive, LENGTHS, 0)
+
+
+def test_is_a_model_of_manipulation():
+    assert isinstance(
+        ConstrainedManipulation({"piece": Drawn((Constraint(FREE),))}, 1.0), ManipulationModel
+    )
+
+
+@pytest.mark.parametrize("primitive", [FORWARD, LEFT])
+def test_a_free_piece_is_carried_rigidly(primitive):
+    ours = moved(Constraint(FREE), primitive)
+    rigid = RigidCarry().motion(PIECE, POSE, ROBOT, primitive, LENGTHS, 0)
+    np.testing.assert_allclose(ours.object_poses, rigid.object_poses, atol=1e-9)
+    np.testing.assert_allclose(ours.robot_poses, rigid.robot_poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("anchor", [(-0.4, -0.2), (-0.5, 0.3)])
+def test_a_pivot_keeps_its_point_whatever_point_was_meant(anchor):
+    constraint = Constraint(PIVOT, anchor)
+    motion = moved(constraint, Turn("turn", turn=1.0, anchor=(anchor[0] + 0.1, anchor[1])))
+    points = placed(np.array([anchor]), motion.object_poses)[:, 0]
+    np.testing.assert_allclose(points - placed(np.array([anchor]), POSE)[0], 0, atol=1e-9)
+    assert np.ptp(motion.object_poses[:, 2]) == pytest.approx(np.ptp(LENGTHS))
+    # The base keeps its place by the object.
+    held = [np.linalg.norm(robot[:2] - pose[:2]) for robot, pose in zip(
+        motion.robot_poses, motion.object_poses, strict=True)]  # fmt: skip
+    assert np.ptp(held) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("constraint", "primitive"),
+    [
+        (Constraint(PIVOT, (-0.4, -0.2)), FORWARD),
+        (Constraint(PIVOT, (-0.4, -0.2)), Turn("turn", turn=1.0, anchor=(0.4, 0.2))),
+        (Constraint(AXIS, (-0.4, 0.0), 0.0), LEFT),
+        (Constraint(STATIC), FORWARD),
+        (Constraint(STATIC), Turn("turn", turn=1.0)),
+    ],
+)
+def test_what_a_constraint_holds_stays_where_it_is(constraint, primitive):
+    motion = moved(constraint, primitive)
+    np.testing.assert_allclose(motion.object_poses, np.tile(POSE, (len(LENGTHS), 1)), atol=1e-12)
+    np.testing.assert_allclose(motion.robot_poses[:, :2], np.tile(ROBOT[:2], (12, 1)), atol=1e-12)
+
+
+def test_an_axis_lets_a_piece_roll_along_it_only():
+    slanted = Constraint(AXIS, (-0.4, 0.0), 0.2)
+    motion = moved(slanted, FORWARD)
+    step = motion.object_poses[-1, :2] - POSE[:2]
+    assert math.atan2(-step[1], -step[0]) == pytest.approx(POSE[2] + 0.2)
+    assert np.linalg.norm(step) == pytest.approx(LENGTHS[-1] * math.cos(0.2))
+
+
+def test_what_is_too_heavy_for_the_hand_stays_and_energy_is_force_times_way():
+    assert np.ptp(moved(Constraint(FREE, force=101.0), FORWARD).object_poses[:, 0]) == 0
+    motion = moved(Constraint(FREE, force=30.0), FORWARD)
+    np.testing.assert_allclose(motion.energy, 30.0 * LENGTHS, atol=1e-9)
+
+
+def test_grasps_stand_as_the_table_says():
+    grasps = outline_grasps(OUTLINE, 0.3)
+    normals = np.array([grasp.normal for grasp in grasps])
+    uniform = grasp_share(Constraint(FREE), grasps)
+    assert uniform == pytest.approx(np.full(len(grasps), 1 / len(grasps)))
+    across = grasp_share(Constraint(AXIS, (0.0, 0.0), 0.0), grasps)
+    assert ((across > 0) == (np.abs(np.cos(normals)) > 0.9)).all()
+    far = grasp_share(Constraint(PIVOT, (-0.5, -0.3)), grasps)
+    levers = np.array([math.dist(grasp.point, (-0.5, -0.3)) for grasp in grasps])
+    assert levers[far > 0].min() > levers[far == 0].max()
+    assert not grasp_share(Constraint(STATIC), grasps).any()
+
+
+def test_points_to_turn_about_are_where_most_draws_have_one():
+    near = [Constraint(PIVOT, (0.4, 0.2 + 0.01 * k)) for k in range(3)]
+    found = anchors([Constraint(STATIC), Constraint(FREE), *near])
+    assert found[0] == pytest.approx((0.4, 0.21))
+    assert (0.0, 0.0) in found
+    assert all(math.dist(a, b) >= APART for a in found for b in found if a != b)
+
+
+def test_a_twist_is_swept_as_small_steps_of_it_are():
+    rate, pose = np.array([0.3, -0.2, 0.7]), POSE.copy()
+    steps = 20_000
+    for _ in range(steps):
+        cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+        world = [cosine * rate[0] - sine * rate[1], sine * rate[0] + cosine * rate[1], rate[2]]
+        pose = pose + np.array(world) * 1.5 / steps
+    np.testing.assert_allclose(swept(POSE, rate, np.array([1.5]))[0], pose, atol=1e-4)
+    straight = swept(POSE, np.array([0.3, 0.0, 0.0]), np.array([2.0]))[0]
+    np.testing.assert_allclose(straight[:2] - POSE[:2], [0.6 * math.cos(0.4), 0.6 * math.sin(0.4)])
+
+
+def test_a_hand_gives_way_by_a_share_only():
+    constraint = Constraint(PIVOT, (0.0, 0.0))
+    wanted = np.array([0.0, -0.1, 1.0])  # a turn about (0.1, 0)
+    assert twist(constraint, wanted, 0.5, 0.35)[2] == 1.0
+    assert not twist(constraint, wanted, 0.25, 0.35).any()

@@ -1,7 +1,27 @@
 """What every test may ask for: float64, and no implicit promotion of dtypes."""
 
+import gc
+from pathlib import Path
+
 import jax
 import pytest
+
+MAPS, MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_compiled_functions():
+    """Forget what was compiled, before there is so much of it that the process is killed.
+
+    Each function that XLA compiles takes a few mappings of memory; Linux grants a process 65,530.
+    """
+    yield
+    if MAPS.exists() and MOST.exists():
+        with MAPS.open() as maps:
+            count = sum(1 for _ in maps)
+        if count > int(MOST.read_text()) // 3:
+            jax.clear_caches()
+            gc.collect()
 
 
 @pytest.fixture

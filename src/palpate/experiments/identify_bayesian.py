@@ -95,7 +95,7 @@ def probabilities(
     """How probable each hypothesis is given the trials, all of them alike before.
 
     By Laplace's evidence at the best mode of each: tempered particles (`tempered.compare`) give it
-    without the assumption of a normal posterior, and take a hundred times as long.
+    without the assumption of a normal posterior, and take many times as long.
     """
     if len(hypotheses) == 1:
         return dict.fromkeys(hypotheses, 1.0)

@@ -1,7 +1,7 @@
 """Bayesian identification of any model with declared priors.
 
     posterior = identify(model, recording.align(model.control_period), at_rest=True)
-    posterior.table()                  # medians, intervals, R-hat, what the data left undecided
+    posterior.table                    # medians, intervals, R-hat, what the data left undecided
     posterior.predict(cut(held_out, model, 2.0, at_rest=True))
 
 The likelihood is `palpate.identification.likelihood`'s, of pieces of a second or so; chains of the

@@ -18,7 +18,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 FOUNDATION = (
-    *("networks", "recording", "parameters"),
+    *("networks", "recording", "parameters", "small_systems"),
     *("runs", "result", "storage", "errors", "devices", "__init__"),
 )
 # From the top of the house to its foundation: a row imports rows below it and its own, never one

@@ -21,6 +21,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from palpate.identification.draws import Draws, check_start
 from palpate.identification.laplace import Modes, look
 from palpate.identification.target import Target
+from palpate.small_systems import solve_lower, solve_upper
 
 BLOCK = 50  # draws between two looks at the chains: one compiled piece of work
 WARM_UP = 4  # blocks
@@ -184,9 +185,9 @@ def chain(
         )
         return (state, step), out
 
-    within = jax.scipy.linalg.solve_triangular(root, position, lower=True)
+    within = solve_lower(root, position[:, None])[:, 0]
     start = HMCState(within, value, slope @ root)
     inputs = jax.random.split(key, BLOCK), jnp.arange(BLOCK)
     (end, _), trace = jax.lax.scan(advance, (start, step), inputs)
-    slope = jax.scipy.linalg.solve_triangular(root, end.logdensity_grad, trans=1, lower=True)
+    slope = solve_upper(root, end.logdensity_grad[:, None])[:, 0]
     return (root @ end.position, end.logdensity, slope), trace

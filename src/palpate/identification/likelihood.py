@@ -32,6 +32,7 @@ from palpate.identification.segments import Segments
 from palpate.identification.target import Target
 from palpate.models.model import Model, rollout
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
+from palpate.small_systems import cholesky, solve_lower
 
 VAGUE = 3.0  # by which the start's deviation is widened in the likelihood
 NOISE_SPREAD = 0.7  # standard deviation of the logarithm of s about what the sensor seems to have
@@ -209,12 +210,10 @@ class MotionPosterior(Target):
         assert self.sensitivity is not None
         weighted = self.sensitivity * (self.counted / variance)[:, None]
         matrix = jnp.einsum("wqct,wpct->wqp", weighted, self.sensitivity)
-        return jnp.linalg.cholesky(matrix + jnp.eye(matrix.shape[-1]))
+        return cholesky(matrix + jnp.eye(matrix.shape[-1]))
 
     def _through_root(self, explained: Array, variance: Array) -> Array:
-        return jax.lax.linalg.triangular_solve(
-            self._root(variance), explained, left_side=True, lower=True
-        )
+        return solve_lower(self._root(variance), explained)
 
 
 def motion_posterior(model: Model, segments: Segments, scales: Scales) -> MotionPosterior:

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from palpate.errors import PalpateError
+from palpate.small_systems import cholesky, solve_lower, solve_upper
 
 BANDWIDTHS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 100.0)  # standard deviations; the last is linear
 RIDGES = (1e-3, 1e-1, 3.0)  # data
@@ -184,8 +185,8 @@ def _solved(moments: Array, asked: Array, ridge: Array, outputs: int) -> Array:
     # What rounding leaves of sums over all data must not make the matrix indefinite.
     least = _ROUNDING * moments[:, :1, :1]
     matrix = moments[:, :, :size] + (ridge + least) * jnp.diag(held)
-    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
-    slopes = jax.scipy.linalg.cho_solve(factor, moments[:, :, size:])
+    root = cholesky(matrix)
+    slopes = solve_upper(root, solve_lower(root, moments[:, :, size:]))
     return slopes[:, 0] + jnp.einsum("qi,qio->qo", asked, slopes[:, 1:])
 
 

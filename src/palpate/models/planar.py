@@ -153,7 +153,7 @@ class Planar(Model):
     pairs: Int[Array, "*batch pairs 4"] = _data(int)
     control_period: float = eqx.field(static=True, default=0.02)
     substeps: int = eqx.field(static=True, default=1)
-    iterations: int = eqx.field(static=True, default=3)
+    iterations: int = eqx.field(static=True, default=4)
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     @property

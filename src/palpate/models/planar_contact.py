@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from palpate.models.planar_friction import remaining, size
+from palpate.models.planar_friction import STICTION
 from palpate.models.planar_geometry import Shapes, nearest, pick
 
 STIFFNESS = 3e3  # of a contact, in the mass it feels
@@ -21,6 +21,7 @@ SLOTS = 3  # pairs of parts that a step looks at for each body
 SOFT_APPROACH = 0.02  # m/s: slower impacts do not bounce, twice as fast ones in full
 RECOVERY = 0.2  # share of an overlap that is made up for in one step
 SLOP = 2e-4  # m: overlap that is left alone
+AT_REST = 1e-7  # m/s: a sliding speed has a slope down to here
 SLOWEST = 1e-4  # m/s: keeps the slope of the time of impact finite
 FASTEST_RECOVERY = 0.3  # m/s
 
@@ -195,3 +196,15 @@ def delayed(
     rubbed = -weight[count:] * jnp.sum(found.tangent * velocity, axis=(1, 2))
     moved = jnp.sum((pushed * found.delay)[:, None, None] * found.normal, axis=0)
     return moved + jnp.sum((rubbed * found.sliding_delay)[:, None, None] * found.tangent, axis=0)
+
+
+def size(speed: Array) -> Array:
+    """How large a speed is, m/s; its slope at rest is zero."""
+    return jnp.sqrt(jnp.square(speed) + AT_REST**2)
+
+
+def remaining(speed: Array, taken: Array) -> Array:
+    """What is left of a speed (m/s) from which some is taken, smoothly, and at least a little."""
+    left = speed - taken
+    left = 0.5 * (left + jnp.sqrt(jnp.square(left) + 4.0 * STICTION**2))
+    return jnp.sqrt(jnp.square(left) + STICTION**2)

@@ -6,23 +6,24 @@ Papadopoulos, Wear 143, 1991). A dry wheel takes the power
 
     sqrt((along v_along)^2 + (across v_across)^2):
 
-an ellipse of forces, and of these the one that takes most. In a system of equations either has a
-weight, force over speed. The speed is what its own force leaves of that which the body would have
-without it: each iteration removes the force of the last one and takes a new one off in closed
-form. What acts alone is solved at once, and what acts together is solved when nothing changes.
+an ellipse of forces, and of these the one that takes most. Both are elements that take an impulse
+in proportion to the slope of a convex function of the size of two rates, which is that size, and
+quadratic below `STICTION` (Huber's). The velocity at the end of a step minimises the sum of all of
+them and of what is quadratic, which Newton's method finds.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-AT_REST = 1e-7  # m/s: a speed has a slope down to here
 STICTION = 5e-4  # m/s: what sticks creeps no faster
 
 # A body's velocity along its own axes and its turning, or what belongs to it; one array for each:
 # components side by side would be cut out and put together again in every derivative.
 Triple = tuple[Array, Array, Array]
+Entries = tuple[Array, Array, Array, Array, Array, Array]  # x, y, t, xy, xt, yt of symmetric 3 x 3
 
 
 class Wheel(NamedTuple):
@@ -58,22 +59,24 @@ class Rolling(NamedTuple):
     wheels: tuple[Wheel, ...]
 
 
-class Slip(NamedTuple):
-    """What dry friction leaves: speed of feet (bodies, feet) in m/s, power of wheels in W."""
+class Dry(NamedTuple):
+    """Elements of dry friction, (bodies, elements): rows of two rates, and what they take.
 
-    feet: Array
-    wheels: tuple[Array, ...]
-
-
-class Weights(NamedTuple):
-    """What resists in the system of equations: h times force per velocity (kg).
-
-    Of the feet (bodies, feet), of viscous friction, and along and across each wheel (bodies,).
+    The rates, m/s of a foot and W of a wheel, are in units of those below which they stick, and the
+    impulse of a step is by such a unit.
     """
 
-    feet: Array
-    floor: Array
-    wheels: tuple[tuple[Array, Array], ...]
+    first: Triple
+    second: Triple
+    impulse: Array
+
+
+class Resistance(NamedTuple):
+    """What a body's velocity v costs in a step: v' A v / 2 - momentum' v + sum of what is dry."""
+
+    entries: Entries
+    momentum: Triple
+    dry: Dry
 
 
 def wheel_axes(x: Array, y: Array, direction: Array) -> tuple[Triple, Triple]:
@@ -87,103 +90,156 @@ def wheel_axes(x: Array, y: Array, direction: Array) -> tuple[Triple, Triple]:
     return along, across
 
 
-def first_slip(bodies: Rolling, free: Triple, time_step: float) -> Slip:
-    """Where each element leaves the body when it acts on it alone; `free` is without any."""
+def resistance(bodies: Rolling, free: Triple, time_step: float) -> Resistance:
+    """What resists in a step (s), of bodies that would leave it with the velocity `free`."""
+    momentum = bodies.mass * free[0], bodies.mass * free[1], bodies.inertia * free[2]
+    zero = jnp.zeros_like(bodies.mass)
+    viscous = time_step * bodies.floor_viscosity
+    shift = bodies.mass + viscous
+    entries: Entries = (
+        shift,
+        shift,
+        bodies.inertia + viscous * jnp.square(bodies.floor_radius),
+        zero,
+        zero,
+        zero,
+    )
+    nowhere = jnp.zeros_like(bodies.foot_x)
+    here = nowhere + 1.0 / STICTION
+    first = [(here, nowhere, -here * bodies.foot_y)]
+    second = [(nowhere, here, here * bodies.foot_x)]
+    impulse = [time_step * STICTION * bodies.foot_friction]
+    for wheel in bodies.wheels:
+        weight = time_step * wheel.exists * (1.0 - wheel.dry)
+        entries = add_row(entries, wheel.along, weight * wheel.along_friction)
+        entries = add_row(entries, wheel.across, weight * wheel.across_friction)
+        creep = least_power(wheel)
+        first.append(scaled(wheel.along, wheel.along_friction / creep))
+        second.append(scaled(wheel.across, wheel.across_friction / creep))
+        impulse.append((time_step * creep * wheel.exists * wheel.dry)[:, None])
 
-    def left(row: Triple, friction: Array) -> Array:
-        yielding = 1.0 / bodies.mass + jnp.square(row[2]) / bodies.inertia
-        return remaining(size(along(row, free)), time_step * yielding * friction)
+    def joined(rows: list[Triple]) -> Triple:
+        x, y, turning = (jnp.concatenate(parts, axis=1) for parts in zip(*rows, strict=True))
+        return x, y, turning
 
-    speed, taken = foot_speeds(bodies, free, time_step)
-    return Slip(
-        remaining(speed, taken),
-        tuple(
-            jnp.sqrt(
-                jnp.square(w.along_friction * left(w.along, w.along_friction))
-                + jnp.square(w.across_friction * left(w.across, w.across_friction))
-                + least_power(w)
-            )
-            for w in bodies.wheels
-        ),
+    dry = Dry(joined(first), joined(second), jnp.concatenate(impulse, axis=1))
+    return Resistance(entries, momentum, dry)
+
+
+def slope(resisting: Resistance, velocity: Triple) -> Triple:
+    """Derivative of the cost by the velocity: momentum that is left over, zero at the end."""
+    dry = resisting.dry
+    first, second = rates(dry.first, velocity), rates(dry.second, velocity)
+    taken = dry.impulse * softened(first, second)
+    first, second = taken * first, taken * second
+    linear = product(resisting.entries, velocity)
+    x, y, turning = (
+        a - p + jnp.sum(first * f + second * s, axis=1)
+        for a, p, f, s in zip(linear, resisting.momentum, dry.first, dry.second, strict=True)
+    )
+    return x, y, turning
+
+
+def curvature(resisting: Resistance, velocity: Triple) -> Entries:
+    """Second derivative of the cost by the velocity, positive definite."""
+    dry = resisting.dry
+    first, second = rates(dry.first, velocity), rates(dry.second, velocity)
+    soft = softened(first, second)
+    weight = dry.impulse * soft
+    fading = jnp.where(soft < 1.0, weight * jnp.square(soft), 0.0)
+    x, y, turning = (first * p + second * q for p, q in zip(dry.first, dry.second, strict=True))
+    faded = (
+        fading * x * x,
+        fading * y * y,
+        fading * turning * turning,
+        fading * x * y,
+        fading * x * turning,
+        fading * y * turning,
+    )
+    return _plus(resisting.entries, _weighted(dry, weight), faded)
+
+
+def as_viscous(resisting: Resistance, velocity: Triple) -> Entries:
+    """The matrix of what resists when each dry element counts as a viscous one of the same force.
+
+    With it a step takes energy whatever the velocity is that the forces are of.
+    """
+    dry = resisting.dry
+    soft = softened(rates(dry.first, velocity), rates(dry.second, velocity))
+    every = _weighted(dry, dry.impulse * soft)
+    return _plus(resisting.entries, every, (jnp.zeros_like(soft),) * 6)
+
+
+def _weighted(dry: Dry, weight: Array) -> tuple[Array, ...]:
+    """Entries of w J'J of each element."""
+    a, b, c = dry.first
+    d, e, f = dry.second
+    return (
+        weight * (a * a + d * d),
+        weight * (b * b + e * e),
+        weight * (c * c + f * f),
+        weight * (a * b + d * e),
+        weight * (a * c + d * f),
+        weight * (b * c + e * f),
     )
 
 
-def next_slip(bodies: Rolling, velocity: Triple, slip: Slip, time_step: float) -> Slip:
-    """Slip for the next iteration, from the velocity that the last one's gave."""
-    speed, taken = foot_speeds(bodies, velocity, time_step)
-    feet = remaining(speed * (1.0 + taken / slip.feet), taken)
-    wheels = []
-    for wheel, before in zip(bodies.wheels, slip.wheels, strict=True):
-        along_power = jnp.square(wheel.along_friction * along(wheel.along, velocity))
-        across_power = jnp.square(wheel.across_friction * along(wheel.across, velocity))
-        smallest = least_power(wheel)
-        squared = along_power + across_power + 1e-6 * smallest
-        # what turns gives way more, unless something else holds it: then this would overshoot
-        taken = jnp.square(wheel.along_friction) * along_power
-        taken = taken + jnp.square(wheel.across_friction) * across_power
-        taken = time_step * taken / (squared * bodies.mass)
-        power = jnp.sqrt(squared)
-        wheels.append(remaining(power * (1.0 + taken / before), taken, smallest))
-    return Slip(feet, tuple(wheels))
-
-
-def weights(bodies: Rolling, slip: Slip, time_step: float) -> Weights:
-    """Weights of the floor and the wheels."""
-    wheels = []
-    for wheel, power in zip(bodies.wheels, slip.wheels, strict=True):
-        step = time_step * wheel.exists
-        dry, viscous = step * wheel.dry / power, step * (1.0 - wheel.dry)
-        wheels.append(
-            (
-                dry * jnp.square(wheel.along_friction) + viscous * wheel.along_friction,
-                dry * jnp.square(wheel.across_friction) + viscous * wheel.across_friction,
-            )
-        )
-    feet = time_step * bodies.foot_friction / slip.feet
-    return Weights(feet, time_step * bodies.floor_viscosity, tuple(wheels))
-
-
-def foot_speeds(bodies: Rolling, velocity: Triple, time_step: float) -> tuple[Array, Array]:
-    """Speed of each foot, and how much of it all feet together can take in a step, m/s."""
-    x, y, turning = (part[:, None] for part in velocity)
-    squared = jnp.square(x - turning * bodies.foot_y) + jnp.square(y + turning * bodies.foot_x)
-    radius = jnp.square(bodies.foot_x) + jnp.square(bodies.foot_y)
-    by_turning = jnp.square(turning) * radius
-    by_sliding = jnp.square(x) + jnp.square(y) + AT_REST**2
-    # turning is slowed by radius^2 / gyration^2 as much as sliding is
-    ratio = radius * (bodies.mass / bodies.inertia)[:, None]
-    share = 1.0 + by_turning / (by_turning + by_sliding) * (ratio - 1.0)
-    every = jnp.sum(bodies.foot_friction, axis=-1) / bodies.mass
-    return jnp.sqrt(squared + AT_REST**2), time_step * share * every[:, None]
+def _plus(entries: Entries, more: tuple[Array, ...], less: tuple[Array, ...]) -> Entries:
+    x, y, t, xy, xt, yt = (
+        own + jnp.sum(added - taken, axis=1)
+        for own, added, taken in zip(entries, more, less, strict=True)
+    )
+    return x, y, t, xy, xt, yt
 
 
 def least_power(wheel: Wheel) -> Array:
-    """Square of the power (W^2) below which a wheel sticks.
+    """Power (W) below which a wheel sticks.
 
     In proportion to its lesser friction, so that neither direction starts to slide later than the
-    other: twice the harmonic mean of squares. Never zero, for wheels without friction.
+    other: the root of twice the harmonic mean of squares. Never zero, for wheels without friction.
     """
     along_squared, across_squared = (
         jnp.square(wheel.along_friction),
         jnp.square(wheel.across_friction),
     )
-    return STICTION**2 * (
-        1e-8 + 2.0 * along_squared * across_squared / (along_squared + across_squared + 1e-12)
+    mean = 2.0 * along_squared * across_squared / (along_squared + across_squared + 1e-12)
+    return STICTION * jnp.sqrt(1e-8 + mean)
+
+
+def softened(first: Array, second: Array) -> Array:
+    """One over the size of two rates, or one where they are smaller."""
+    return jax.lax.rsqrt(jnp.maximum(jnp.square(first) + jnp.square(second), 1.0))
+
+
+def scaled(row: Triple, factor: Array) -> Triple:
+    """The row (bodies,) times a factor of each body, as that of one element (bodies, 1)."""
+    x, y, turning = row
+    return (factor * x)[:, None], (factor * y)[:, None], (factor * turning)[:, None]
+
+
+def rates(row: Triple, velocity: Triple) -> Array:
+    """Rates J v (bodies, elements) of the velocities (bodies,)."""
+    x, y, turning = (part[:, None] for part in velocity)
+    return row[0] * x + row[1] * y + row[2] * turning
+
+
+def product(entries: Entries, vector: Triple) -> Triple:
+    """A symmetric 3 x 3 matrix of each body times a vector of it."""
+    x, y, t, xy, xt, yt = entries
+    a, b, c = vector
+    return x * a + xy * b + xt * c, xy * a + y * b + yt * c, xt * a + yt * b + t * c
+
+
+def add_row(entries: Entries, row: Triple, weight: Array) -> Entries:
+    """Entries of A + w J'J; `row` and `weight` are (bodies,)."""
+    x, y, t, xy, xt, yt = entries
+    first, second, third = row
+    by_first, by_second = weight * first, weight * second
+    return (
+        x + by_first * first,
+        y + by_second * second,
+        t + weight * third * third,
+        xy + by_first * second,
+        xt + by_first * third,
+        yt + by_second * third,
     )
-
-
-def size(speed: Array) -> Array:
-    """How large a speed is, m/s; its slope at rest is zero."""
-    return jnp.sqrt(jnp.square(speed) + AT_REST**2)
-
-
-def along(row: Triple, velocity: Triple) -> Array:
-    """Velocity J v along a row, m/s."""
-    return row[0] * velocity[0] + row[1] * velocity[1] + row[2] * velocity[2]
-
-
-def remaining(speed: Array, taken: Array, least_squared: Array | float = STICTION**2) -> Array:
-    """What is left of a speed (m/s) from which some is taken, smoothly, and at least a little."""
-    left = speed - taken
-    left = 0.5 * (left + jnp.sqrt(jnp.square(left) + 4.0 * least_squared))
-    return jnp.sqrt(jnp.square(left) + least_squared)

@@ -6,10 +6,12 @@ The velocity at the end of a step minimises a convex potential,
 
 where psi_i is half the power that a viscous element takes, or all that dry friction takes
 (maximum dissipation; Moreau, "Unilateral contact and dry friction in finite freedom dynamics",
-1988). It is found by reweighting: dry friction counts as a viscous element of its last force over
-its last speed, so that every iteration is one symmetric positive definite system which takes
-energy and never adds any, however stiff a wheel is. Three iterations leave the error of the
-smoothing alone (`planar_friction`); where bodies touch there are more.
+1988). Newton's method finds it, with a search along each of its directions: a few iterations from
+the velocity without resistance. At last every dry element counts as a viscous one of the same
+force, which changes nothing at the minimum, and short of it takes energy and never adds any. How
+the minimum moves with what it depends on is the implicit function theorem's, so that nothing
+differentiates the iterations. What contacts take changes with the iterations (`planar_contact`);
+where bodies touch there are more of them.
 
 Positions take half a step before and half a step after (drift, kick, drift), which makes free
 motion under a constant wrench exact. All of it happens in each body's axes about its centre of
@@ -24,12 +26,26 @@ from jaxtyping import Array, Float
 
 from palpate.models import planar_contact
 from palpate.models.planar_contact import Contacts
-from palpate.models.planar_friction import Rolling, Slip, Triple, first_slip, next_slip, weights
+from palpate.models.planar_friction import (
+    Entries,
+    Resistance,
+    Rolling,
+    Triple,
+    as_viscous,
+    curvature,
+    product,
+    rates,
+    resistance,
+    slope,
+    softened,
+)
 from palpate.models.planar_geometry import Shapes
 from palpate.models.planar_links import Links, Rows, link_rows, no_rows, turn
+from palpate.small_systems import cholesky, solve
 
 GRAVITY = 9.81  # m/s^2
 MORE_ITERATIONS = 2  # where bodies touch
+SEARCHES = 4  # points at which the slope along a direction is looked at
 BOLTED = 1e6  # how many times as heavy a bolted body is
 
 
@@ -84,7 +100,8 @@ def advance(
         middle = jnp.stack([x, y, angle], axis=-1)
         centre = jnp.stack(system.centre, axis=-1)
         links = link_rows(system.links, bodies.mass, centre, middle, ahead, time_step)
-    velocity, slip = solve_velocity(bodies, free, links, time_step, iterations)
+    resisting = resistance(bodies, free, time_step)
+    velocity = solve_velocity(resisting, free, links, iterations)
     if system.shapes.pairs.shape[0]:
         contacts = planar_contact.contacts(
             system.shapes,
@@ -98,9 +115,7 @@ def advance(
             1.0 / jnp.stack([bodies.mass, bodies.mass, bodies.inertia], axis=-1),
             time_step,
         )
-        velocity, late = solve_contacts(
-            bodies, free, velocity, slip, links, contacts, time_step, iterations
-        )
+        velocity, late = solve_contacts(resisting, velocity, links, contacts, iterations)
         late_x, late_y = turn(late[0], late[1], cosine, sine)
         x, y, angle = x + late_x, y + late_y, angle + late[2]
 
@@ -112,98 +127,148 @@ def advance(
     return pose, jnp.stack([end_x + rate * lever_y, end_y - rate * lever_x, rate], axis=-1)
 
 
-def solve_velocity(
-    bodies: Rolling, free: Triple, links: Rows, time_step: float, iterations: int
-) -> tuple[Triple, Slip]:
-    """Velocity at the end of a step without contacts, and the slip of the last iteration.
-
-    `free` is the velocity without resistance.
-    """
-    momentum = bodies.mass * free[0], bodies.mass * free[1], bodies.inertia * free[2]
-    slip = first_slip(bodies, free, time_step)
-    velocity = solve_bodies(*resisting(bodies, slip, time_step), momentum, links)
-    for _ in range(iterations - 1):
-        slip = next_slip(bodies, velocity, slip, time_step)
-        velocity = solve_bodies(*resisting(bodies, slip, time_step), momentum, links)
-    return velocity, slip
+def solve_velocity(resisting: Resistance, free: Triple, links: Rows, iterations: int) -> Triple:
+    """Velocity at the end of a step without contacts; `free` is the velocity without resistance."""
+    fixed = jax.lax.stop_gradient((resisting, links))
+    velocity = jax.lax.stop_gradient(free)
+    for _ in range(iterations):
+        velocity = newton(*fixed, velocity)
+    velocity = held_back(*fixed, velocity)
+    # the slope is zero and stays so: its derivative says how the velocity follows what it is of
+    left = leftover(resisting, links, velocity)
+    change = tuple(part - jax.lax.stop_gradient(part) for part in left)
+    followed = solve_bodies(curvature(fixed[0], velocity), change, fixed[1])
+    return minus(velocity, followed)
 
 
 def solve_contacts(
-    bodies: Rolling,
-    free: Triple,
-    velocity: Triple,
-    slip: Slip,
-    links: Rows,
-    contacts: Contacts,
-    time_step: float,
-    iterations: int,
+    resisting: Resistance, velocity: Triple, links: Rows, contacts: Contacts, iterations: int
 ) -> tuple[Triple, Triple]:
     """Velocity at the end of a step, and how far the times of impacts within it move the bodies.
 
-    `velocity` and `slip` are those without contacts.
+    `velocity` is that without contacts.
     """
-    momentum = bodies.mass * free[0], bodies.mass * free[1], bodies.inertia * free[2]
     joined = Rows(
         jnp.concatenate([links.jacobian, contacts.normal, contacts.tangent]),
         jnp.concatenate([links.target, contacts.target, jnp.zeros_like(contacts.friction)]),
         links.weight,
     )
 
-    def iterate(velocity: Triple, slip: Slip, touching: Array | None) -> tuple[Triple, Slip, Array]:
+    def iterate(velocity: Triple, touching: Array | None) -> tuple[Triple, Array]:
         touching = planar_contact.weights(contacts, jnp.stack(velocity, axis=-1), touching)
         rows = joined._replace(weight=jnp.concatenate([links.weight, touching]))
-        slip = next_slip(bodies, velocity, slip, time_step)
-        velocity = solve_bodies(*resisting(bodies, slip, time_step), momentum, rows)
-        return velocity, slip, touching
+        return newton(resisting, rows, velocity), touching
 
     # a loop, and not written out: derivatives of what is written out take minutes to compile
     carry, _ = jax.lax.scan(
         lambda carry, _: (iterate(*carry), None),
-        iterate(velocity, slip, None),
+        iterate(velocity, None),
         length=iterations + MORE_ITERATIONS - 1,
     )
-    velocity, slip, touching = carry
+    velocity, touching = carry
+    rows = joined._replace(weight=jnp.concatenate([links.weight, touching]))
+    velocity = held_back(resisting, rows, velocity)
     delayed = planar_contact.delayed(contacts, touching, jnp.stack(velocity, axis=-1))
-    held = Rows(links.jacobian, jnp.zeros_like(links.target), links.weight)
     impulse = (delayed[:, 0], delayed[:, 1], delayed[:, 2])
-    return velocity, solve_bodies(*resisting(bodies, slip, time_step), impulse, held)
+    return velocity, solve_bodies(curvature(resisting, velocity), impulse, links)
 
 
-def resisting(
-    bodies: Rolling, slip: Slip, time_step: float
-) -> tuple[tuple[Array, ...], list[tuple[Triple, Array]]]:
-    """Entries of inertia and floor (see `add_rows`), and the rows of the wheels with weights."""
-    resist = weights(bodies, slip, time_step)
-    feet, x, y = resist.feet, bodies.foot_x, bodies.foot_y
-    shift = bodies.mass + resist.floor + jnp.sum(feet, axis=-1)
-    turning = bodies.inertia + resist.floor * jnp.square(bodies.floor_radius)
-    turning = turning + jnp.sum(feet * (jnp.square(x) + jnp.square(y)), axis=-1)
-    coupling = -jnp.sum(feet * y, axis=-1), jnp.sum(feet * x, axis=-1)
-    rows = [
-        row
-        for wheel, (along, across) in zip(bodies.wheels, resist.wheels, strict=True)
-        for row in ((wheel.along, along), (wheel.across, across))
-    ]
-    return (shift, shift, turning, jnp.zeros_like(shift), *coupling), rows
+def newton(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
+    """A step towards the least cost, as long as the cost falls along it."""
+    left = leftover(resisting, rows, velocity)
+    step = solve_bodies(curvature(resisting, velocity), left, rows)
+    length = jax.lax.stop_gradient(step_length(resisting, rows, velocity, left, step))
+    return minus(velocity, tuple(length * part for part in step))
 
 
-def solve_bodies(
-    entries: tuple[Array, ...], wheels: list[tuple[Triple, Array]], momentum: Triple, rows: Rows
-) -> Triple:
-    """Velocities v of (A + sum w J'J) v = momentum + sum w J' target.
+def held_back(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
+    """The velocity that the forces at a velocity leave: the same where that is the least cost.
+
+    It has less energy than a step without resistance however far from there it is.
+    """
+    x, y, turning = resisting.momentum
+    if rows.weight.size:
+        pull = jnp.einsum("r,rbi->bi", rows.weight * rows.target, rows.jacobian)
+        x, y, turning = x + pull[:, 0], y + pull[:, 1], turning + pull[:, 2]
+    return solve_bodies(as_viscous(resisting, velocity), (x, y, turning), rows)
+
+
+def step_length(
+    resisting: Resistance, rows: Rows, velocity: Triple, left: Triple, step: Triple
+) -> Array:
+    """Share (bodies,) of a Newton step at which the cost stops falling, one if it does not before.
+
+    The zero of the slope along the step, which only rises, by false position (Illinois). Bodies
+    that something joins go the same share of their way.
+    """
+    dry = resisting.dry
+    first, second = rates(dry.first, velocity), rates(dry.second, velocity)
+    by_first, by_second = rates(dry.first, step), rates(dry.second, step)
+    straight = dot(product(resisting.entries, step), step)
+    if rows.weight.size:
+        pulled = jnp.einsum("rbi,bi->r", rows.jacobian, jnp.stack(step, axis=-1))
+        straight = jnp.sum(straight) + jnp.sum(rows.weight * jnp.square(pulled))
+
+    def total(of_bodies: Array) -> Array:
+        return jnp.sum(of_bodies) if rows.weight.size else of_bodies
+
+    def taken(share: Array) -> Array:
+        """Slope of what is dry along the step back from the velocity."""
+        share = jnp.broadcast_to(share, velocity[0].shape)[:, None]
+        a, b = first - share * by_first, second - share * by_second
+        weight = dry.impulse * softened(a, b)
+        return -total(jnp.sum(weight * (a * by_first + b * by_second), axis=1))
+
+    zero = jnp.zeros_like(straight)
+    low, high = zero, zero + 1.0
+    fall = -total(dot(left, step))
+    steady = fall - taken(zero)  # of what is quadratic, at the velocity
+    below, above = fall, steady + straight + taken(high)
+    whole = above <= 0.0
+    for _ in range(SEARCHES):
+        secant = -below / jnp.where(above > below, above - below, 1.0)
+        share = low + (high - low) * jnp.clip(secant, 0.05, 0.95)
+        found = steady + share * straight + taken(share)
+        rising = found > 0.0
+        # the slope jumps where something comes to rest: an end that stays counts for half
+        low, below = jnp.where(rising, low, share), jnp.where(rising, 0.5 * below, found)
+        high, above = jnp.where(rising, share, high), jnp.where(rising, found, 0.5 * above)
+    return jnp.where(whole, 1.0, share)
+
+
+def leftover(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
+    """Momentum that neither what resists nor the rows take, zero at the end of a step."""
+    x, y, turning = slope(resisting, velocity)
+    if rows.weight.size:
+        off = jnp.einsum("rbi,bi->r", rows.jacobian, jnp.stack(velocity, axis=-1)) - rows.target
+        pull = jnp.einsum("r,rbi->bi", rows.weight * off, rows.jacobian)
+        x, y, turning = x + pull[:, 0], y + pull[:, 1], turning + pull[:, 2]
+    return x, y, turning
+
+
+def dot(one: Triple, other: Triple) -> Array:
+    """Scalar product of each body's."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def minus(one: Triple, other: tuple[Array, ...]) -> Triple:
+    """Difference of each body's."""
+    return one[0] - other[0], one[1] - other[1], one[2] - other[2]
+
+
+def solve_bodies(entries: Entries, right: tuple[Array, ...], rows: Rows) -> Triple:
+    """Solve (A + sum w J'J) v = `right`.
 
     Bodies that nothing joins are solved side by side; else all in one.
     """
-    bodies = momentum[0].shape[0]
-    entries = add_rows(entries, wheels)
+    first, second, third = right
+    bodies = first.shape[0]
     if not rows.weight.size:
-        return solve_three(entries, momentum)
+        return solve_three(entries, (first, second, third))
     x, y, t, xy, xt, yt = entries
     size = 3 * bodies
     jacobian = rows.jacobian.reshape(-1, size)
-    pulled = rows.weight[:, None] * jacobian
-    joined, pull = jacobian.T @ pulled, rows.target @ pulled
-    right = jnp.stack(momentum, axis=-1) + pull.reshape(bodies, 3)
+    joined = jacobian.T @ (rows.weight[:, None] * jacobian)
     if bodies == 1:
         entries = (
             x + joined[0, 0],
@@ -213,11 +278,11 @@ def solve_bodies(
             xt + joined[0, 2],
             yt + joined[1, 2],
         )
-        return solve_three(entries, (right[:, 0], right[:, 1], right[:, 2]))
+        return solve_three(entries, (first, second, third))
     blocks = jnp.stack([x, xy, xt, xy, y, yt, xt, yt, t], axis=-1).reshape(bodies, 3, 3)
     matrix = jnp.eye(bodies, dtype=x.dtype)[:, None, :, None] * blocks[:, :, None, :]
-    solved = solve_symmetric(matrix.reshape(size, size) + joined, right.reshape(size))
-    solved = solved.reshape(bodies, 3)
+    stacked = jnp.stack([first, second, third], axis=-1).reshape(size)
+    solved = solve_symmetric(matrix.reshape(size, size) + joined, stacked).reshape(bodies, 3)
     return solved[:, 0], solved[:, 1], solved[:, 2]
 
 
@@ -225,41 +290,19 @@ def solve_symmetric(
     matrix: Float[Array, "size size"], right: Float[Array, " size"]
 ) -> Float[Array, " size"]:
     """Solve a symmetric positive definite system; derivatives solve once more with its factor."""
-    factor = jax.scipy.linalg.cho_factor(jax.lax.stop_gradient(matrix), lower=True)
+    root = cholesky(jax.lax.stop_gradient(matrix))
     return jax.lax.custom_linear_solve(
-        lambda v: matrix @ v,
-        right,
-        lambda _, b: jax.scipy.linalg.cho_solve(factor, b),
-        symmetric=True,
+        lambda v: matrix @ v, right, lambda _, b: solve(root, b), symmetric=True
     )
 
 
-def add_rows(entries: tuple[Array, ...], rows: list[tuple[Triple, Array]]) -> tuple[Array, ...]:
-    """The entries x, y, t, xy, xt, yt of symmetric 3 x 3 matrices (bodies,) plus sum w J'J.
-
-    Each J is a triple of (bodies,), each w is (bodies,); three entries are a diagonal.
-    """
-    zero = jnp.zeros_like(entries[0])
-    x, y, t, xy, xt, yt = (*entries, zero, zero, zero)[:6]
-    for (first, second, third), weight in rows:
-        by_first, by_second = weight * first, weight * second
-        x, xy, xt = x + by_first * first, xy + by_first * second, xt + by_first * third
-        y, yt = y + by_second * second, yt + by_second * third
-        t = t + weight * third * third
-    return x, y, t, xy, xt, yt
-
-
-def solve_three(entries: tuple[Array, ...], right: Triple) -> Triple:
+def solve_three(entries: Entries, right: Triple) -> Triple:
     """Solve symmetric 3 x 3 systems by LDL', one for each body.
 
     Written out: a library call for each of thousands of 3 x 3 systems costs more than its sums.
     Derivatives solve once more and do not differentiate the elimination.
     """
     x, y, t, xy, xt, yt = entries
-
-    def product(v: Triple) -> Triple:
-        a, b, c = v
-        return x * a + xy * b + xt * c, xy * a + y * b + yt * c, xt * a + yt * b + t * c
 
     def solve(_: Any, right: Triple) -> Triple:
         lower_y, lower_t = xy / x, xt / x
@@ -273,4 +316,4 @@ def solve_three(entries: tuple[Array, ...], right: Triple) -> Triple:
         b = b / pivot_y - last * c
         return a / x - lower_y * b - lower_t * c, b, c
 
-    return jax.lax.custom_linear_solve(product, right, solve, symmetric=True)
+    return jax.lax.custom_linear_solve(lambda v: product(entries, v), right, solve, symmetric=True)

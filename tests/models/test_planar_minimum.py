@@ -1,0 +1,127 @@
+"""The velocity at the end of a step is the least of the potential, whatever acts at once."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from palpate.models.planar import Planar, PlanarState
+from palpate.models.planar_friction import STICTION
+from palpate.models.planar_shapes import furniture, rectangle
+from palpate.models.planar_step import GRAVITY
+
+HALF = np.array([0.9, 0.425])
+
+
+def _body(random: np.random.Generator) -> tuple[Planar, dict[str, np.ndarray | float]]:
+    mass, friction = random.lognormal(3.5, 0.7), random.lognormal(-2.0, 0.7)
+    place, direction = random.normal(size=2) * 0.5, random.uniform(-0.7, 0.7)
+    along, across = random.lognormal(np.log(5.0), 2.0, 2)
+    centre = random.uniform(-0.3, 0.3, 2)
+    model = furniture(
+        [rectangle(*(2.0 * HALF))],
+        mass=mass,
+        centre_of_mass=centre,
+        floor_friction=friction,
+        floor_damping=1e-6,
+        floor_spread=0.8,
+        wheel_position=place,
+        wheel_direction=direction,
+        wheel_along=along,
+        wheel_across=across,
+    )
+    gyration = float(np.sqrt(np.sum(HALF**2) / 3.0))
+    signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+    loads = 0.25 * np.prod(1.0 + signs * centre / 0.8, axis=1)
+    return model, {
+        "mass": mass,
+        "inertia": mass * gyration**2,
+        "feet": (0.8 * signs - centre) * HALF,
+        "held": friction * mass * GRAVITY * loads,
+        "wheel": (place - centre) * HALF,
+        "direction": direction,
+        "along": along,
+        "across": across,
+        "centre": centre * HALF,
+    }
+
+
+def _least(of: dict, before: np.ndarray, wrench: np.ndarray, period: float) -> np.ndarray:
+    """Velocity of the centre of mass and turning at the end of a step, by a search of simplices."""
+    inertia = np.array([of["mass"], of["mass"], of["inertia"]])
+    free = before + period * wrench / inertia
+    cosine, sine = np.cos(of["direction"]), np.sin(of["direction"])
+    x, y = of["wheel"]
+
+    def cost(velocity: np.ndarray) -> float:
+        vx, vy, turning = velocity
+        speeds = np.hypot(vx - turning * of["feet"][:, 1], vy + turning * of["feet"][:, 0])
+        wx, wy = vx - turning * y, vy + turning * x
+        along = of["along"] * (cosine * wx + sine * wy)
+        across = of["across"] * (cosine * wy - sine * wx)
+        taken = of["held"] @ speeds + np.hypot(along, across)
+        return 0.5 * inertia @ np.square(velocity - free) + period * taken
+
+    best = min(
+        (
+            scipy.optimize.minimize(
+                cost, start, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}
+            )
+            for start in (free, before, 0.5 * free, 1e-3 + 0.0 * free)
+        ),
+        key=lambda found: found.fun,
+    )
+    return best.x
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_feet_and_a_wheel_together_leave_the_least_of_the_potential(float64, seed):
+    random = np.random.default_rng(seed)
+    model, of = _body(random)
+    period = model.control_period
+    limit = of["mass"] * GRAVITY * float(model.floor_friction[0])
+    # forces from well below what holds to well above, with a torque, in motion and at rest
+    before = random.normal(size=3) * [0.1, 0.1, 0.2] * (seed % 2)
+    wrench = random.normal(size=3) * np.array([1.0, 1.0, 0.5]) * limit * random.uniform(0.3, 2.0)
+    x, y = of["centre"]
+    origin = before - before[2] * np.array([-y, x, 0.0])  # of the frame, from the centre's
+    about = wrench + np.array([0.0, 0.0, x * wrench[1] - y * wrench[0]])
+    # the step turns the frame by half a step's worth before forces act: stand ahead by that
+    pose = np.array([0.0, 0.0, -period * before[2]])
+    state = PlanarState(jnp.asarray([pose]), jnp.asarray([origin]))
+    after = model.step(state, jnp.asarray([about]))
+    rate = float(after.velocity[0, 2])
+    lever = jax.device_get(after.pose[0, 2])
+    offset = np.array(
+        [x * np.cos(lever) - y * np.sin(lever), x * np.sin(lever) + y * np.cos(lever)]
+    )
+    velocity = np.asarray(after.velocity[0])
+    found = velocity + rate * np.array([-offset[1], offset[0], 0.0])
+    expected = _least(of, before, wrench, period)
+    scale = np.array([1.0, 1.0, np.sqrt(of["inertia"] / of["mass"])])
+    speed = np.linalg.norm(expected * scale)
+    assert np.linalg.norm((found - expected) * scale) < 4.0 * STICTION + 0.03 * speed
+
+
+@pytest.mark.parametrize("share", [1.2, 1.5, 3.0])
+def test_a_push_and_a_torque_beyond_what_feet_hold_move_a_body_from_rest(float64, share):
+    # each alone would be held for 1.2: together they are not, and no iteration may stick there
+    model = furniture(
+        [rectangle(1.8, 0.85)],
+        mass=57.0,
+        floor_friction=0.16,
+        floor_spread=0.85,
+        floor_damping=1e-6,
+        wheels=0,
+    )
+    limit = 57.0 * GRAVITY * 0.16
+    radius = 0.85 * float(np.hypot(0.9, 0.425))
+    push = jnp.asarray([[0.8 * share * limit, 0.0, 0.8 * share * radius * limit]])
+    more = dataclasses.replace(model, iterations=30)
+    start = PlanarState(jnp.zeros((1, 3)), jnp.zeros((1, 3)))
+    few, many = model.step(start, push), more.step(start, push)
+    assert float(jnp.linalg.norm(many.velocity)) > 20.0 * STICTION
+    np.testing.assert_allclose(few.velocity, many.velocity, atol=2.0 * STICTION)

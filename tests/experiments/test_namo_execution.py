@@ -3,14 +3,20 @@
 import numpy as np
 import pytest
 
-from palpate.experiments import namo_episode, namo_execution
+from palpate.experiments import namo_episode, namo_execution, namo_rooms
 from palpate.experiments.namo_episode import Fixed, Flag, episode
 from palpate.experiments.namo_execution import Contact, Execution, OutOfTimeError
 from palpate.experiments.namo_rooms import scenes
 from palpate.planning.movable_obstacles.physics_manipulation import ConstrainedManipulation, Drawn
 from palpate.planning.movable_obstacles.plan import TRANSIT, Plan, Segment
 from palpate.planning.movable_obstacles.planner import Planner
-from palpate.planning.movable_obstacles.primitives import FREE, PIVOT, STATIC, Constraint
+from palpate.planning.movable_obstacles.primitives import (
+    AXIS,
+    FREE,
+    PIVOT,
+    STATIC,
+    Constraint,
+)
 
 BUDGET = 60.0
 ROOM = scenes()["static constraint"]
@@ -83,6 +89,20 @@ def test_told_the_truth_a_locked_piece_is_turned_about_its_caster():
     assert outcome.reached, outcome.reason
     assert [name for name, _ in outcome.tried] == ["cabinet"]
     assert namo_episode.truth_of(room)["cabinet"].kind == PIVOT
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind"),
+    [(2004, AXIS), (2092, PIVOT), (2006, PIVOT)],
+    ids=["on wheels across the way", "held twice", "close by the wall"],
+)
+def test_told_the_truth_the_one_piece_that_gives_way_is_got_past(seed, kind):
+    room = namo_rooms.generated_room(seed)
+    truth = namo_episode.truth_of(room)
+    outcome = episode(room, Fixed(truth))
+    assert outcome.reached, outcome.reason
+    assert outcome.failures == 0
+    assert {truth[name].kind for name, _ in outcome.tried} == {kind}
 
 
 def test_the_flag_falls_after_one_failure():

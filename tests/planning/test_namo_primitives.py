@@ -7,8 +7,10 @@ import pytest
 
 from palpate.planning.movable_obstacles.geometry import placed
 from palpate.planning.movable_obstacles.manipulation import (
+    BACKWARD,
     FORWARD,
     LEFT,
+    RIGHT,
     Grasp,
     ManipulationModel,
     RigidCarry,
@@ -24,6 +26,7 @@ from palpate.planning.movable_obstacles.primitives import (
     APART,
     AXIS,
     FREE,
+    LEVER,
     PIVOT,
     STATIC,
     Constraint,
@@ -105,15 +108,42 @@ def test_what_is_too_heavy_for_the_hand_stays_and_energy_is_force_times_way():
 
 def test_grasps_stand_as_the_table_says():
     grasps = outline_grasps(OUTLINE, 0.3)
-    normals = np.array([grasp.normal for grasp in grasps])
-    uniform = grasp_share(Constraint(FREE), grasps)
-    assert uniform == pytest.approx(np.full(len(grasps), 1 / len(grasps)))
-    across = grasp_share(Constraint(AXIS, (0.0, 0.0), 0.0), grasps)
-    assert ((across > 0) == (np.abs(np.cos(normals)) > 0.9)).all()
-    far = grasp_share(Constraint(PIVOT, (-0.5, -0.3)), grasps)
-    levers = np.array([math.dist(grasp.point, (-0.5, -0.3)) for grasp in grasps])
-    assert levers[far > 0].min() > levers[far == 0].max()
+    uniform = np.full(len(grasps), 1 / len(grasps))
+    for constraint in (Constraint(FREE), Constraint(AXIS, (-0.4, 0.0), 0.0)):
+        assert grasp_share(constraint, grasps) == pytest.approx(uniform)
+    point = (0.0, -0.25)
+    away = grasp_share(Constraint(PIVOT, point), grasps)
+    levers = np.array([math.dist(grasp.point, point) for grasp in grasps])
+    assert ((away > 0) == (levers >= LEVER)).all()
+    assert 0 < (away > 0).sum() < len(grasps)
     assert not grasp_share(Constraint(STATIC), grasps).any()
+
+
+def test_a_piece_on_wheels_is_pulled_along_its_axis_from_any_face():
+    axis = Constraint(AXIS, (-0.4, 0.0), 0.0)
+    model = ConstrainedManipulation({"piece": Drawn((axis,))}, 100.0)
+    for grasp in model.grasps(PIECE, 0.3):
+        across = abs(math.cos(grasp.normal)) > 0.9
+        offered = [p for p in model.primitives(PIECE, grasp, "holonomic") if not p.turn]
+        assert offered == ([BACKWARD, FORWARD] if across else [LEFT, RIGHT])
+        robot = grasp.robot_pose(POSE, 0.4)
+        for primitive in offered:
+            motion = model.motion(PIECE, POSE, robot, primitive, LENGTHS, 0)
+            step = motion.object_poses[-1, :2] - POSE[:2]
+            assert np.linalg.norm(step) == pytest.approx(LENGTHS[-1])
+            assert abs(step @ [-math.sin(POSE[2]), math.cos(POSE[2])]) < 1e-9
+
+
+def test_a_hand_at_the_point_that_is_held_in_place_turns_nothing():
+    axis, grasp = Constraint(AXIS, (-0.4, 0.0), 0.0), Grasp((-0.5, 0.0), math.pi)
+    for draws, held in (((axis,), False), ((axis, Constraint(FREE)), True)):
+        model = ConstrainedManipulation({"piece": Drawn(draws)}, 100.0)
+        near = [
+            one
+            for one in model.primitives(PIECE, grasp, "holonomic")
+            if isinstance(one, Turn) and math.dist(one.anchor, grasp.point) < LEVER
+        ]
+        assert bool(near) == held
 
 
 def test_points_to_turn_about_are_where_most_draws_have_one():

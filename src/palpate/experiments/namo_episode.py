@@ -19,7 +19,7 @@ from palpate.experiments.namo_execution import (
     Frame,
     OutOfTimeError,
 )
-from palpate.experiments.namo_rooms import TIGHT, Room, ends_of
+from palpate.experiments.namo_rooms import MARGIN, TIGHT, Room, ends_of
 from palpate.planning.movable_obstacles.belief import Belief
 from palpate.planning.movable_obstacles.map import Map
 from palpate.planning.movable_obstacles.physics_manipulation import ConstrainedManipulation, Drawn
@@ -43,6 +43,8 @@ SEARCH = Settings(iterations=30)  # for every planner
 DRAWS = 8  # of the belief, for planning
 SEARCHES = 4  # with other seeds before there counts as no way
 MOVABLE, THRESHOLD, FAILS = 0.7, 0.5, 0.1  # flag: prior, and how often a movable object fails
+# m: each is tried where there is no way with the one before (from rooms of development).
+MARGINS = (MARGIN, TIGHT, 0.0)
 
 
 @runtime_checkable
@@ -239,30 +241,33 @@ def _episode(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> 
 
 
 def _planned(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> Plan | None:
-    """The plan from here; None if there is none, even after relenting."""
-    world = room.map(run.outlines, run.poses(), run.robot())
+    """The plan from here; None if there is none, even close by things and after relenting."""
     try:
-        world.check()
+        _seen(run, room, MARGIN).check()
     except PalpateError:  # so near to something that it could not turn
         run.back_off()
-        world = room.map(run.outlines, run.poses(), run.robot())
-    tight = room.map(run.outlines, run.poses(), run.robot(), TIGHT)
-    begin, end = ends_of(tight)
+    maps = {margin: _seen(run, room, margin) for margin in MARGINS}
+    begin, end = ends_of(maps[TIGHT])
     if begin == end >= 0:  # nothing needs to be moved
-        world = tight
+        maps = {TIGHT: maps[TIGHT]}
     for again in range(SEARCHES):
-        began = timed()
-        planner = Planner(opinion.model(), SEARCH, seed=SEARCHES * outcome.attempts + again)
-        try:
-            plan = planner.plan(world, immovable=opinion.immovable())
-        except NoWayError:
-            opinion.relent()
-            continue
-        finally:
-            outcome.planning_s += timed() - began
-        outcome.plans.append((world, plan))
-        return plan
+        for world in maps.values():
+            began = timed()
+            planner = Planner(opinion.model(), SEARCH, seed=SEARCHES * outcome.attempts + again)
+            try:
+                plan = planner.plan(world, immovable=opinion.immovable())
+            except NoWayError:
+                continue
+            finally:
+                outcome.planning_s += timed() - began
+            outcome.plans.append((world, plan))
+            return plan
+        opinion.relent()
     return None
+
+
+def _seen(run: Execution, room: Room, margin: float) -> Map:
+    return room.map(run.outlines, run.poses(), run.robot(), margin)
 
 
 # --- the truth, for the planner that is told ----------------------------------------------------

@@ -11,19 +11,18 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import shapely
-from scipy import ndimage
 from shapely.geometry.base import BaseGeometry
 
 from palpate.planning.movable_obstacles.collisions import Clearance
-from palpate.planning.movable_obstacles.geometry import placed, polygons
+from palpate.planning.movable_obstacles.geometry import placed
 from palpate.planning.movable_obstacles.manipulation import (
     Grasp,
     ManipulationModel,
     Motion,
     Primitive,
 )
-from palpate.planning.movable_obstacles.occupancy import Footprint, Space, Window
+from palpate.planning.movable_obstacles.occupancy import Space, Window
+from palpate.planning.movable_obstacles.passages import Passage
 from palpate.planning.movable_obstacles.paths import distances
 from palpate.planning.movable_obstacles.transfers import Carry, Opening
 from palpate.planning.movable_obstacles.tree_search import Found, Settings, Step, search
@@ -37,10 +36,8 @@ _REACH = 4.0  # how far an object is carried at most, in its own and the robot's
 _SHARES = (1.0, 0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
 _DETOUR = 8.0  # sizes of robot and object that the way on may be longer than without it
 _RELEASES = 3  # places on a primitive's way where letting go is tried
-_STRIDE = 4  # steps between looks whether the way is open
 _CHUNK = 16  # steps checked for collision at once
 _BETTER = 0.98  # of the best cost: what saves less is not worth the search
-_EIGHT = np.ones((3, 3), int)
 _JUDGED = 6  # sequences that are tried in every draw
 _FINE = 8  # times as many steps for what is handed out
 
@@ -99,29 +96,23 @@ class OpeningSearch:
         window: Window,
         keep_out: BaseGeometry | None = None,
     ) -> None:
-        self._keep_out = keep_out
-        self.space, self.model, self.name, self.window = space, model, name, window
+        self.space, self.model, self.name = space, model, name
         self.draws = model.draws
         self.movable = space.movables[name]
-        self._towards = np.asarray(towards, float)[:2]
         world = space.map
         self.standoff = world.robot.radius + world.reach
         self._nearby = {name: self.standoff}
         self._reached = distances(space, window, robot, standing=True)
-        self._base = space.free_without({name, *ignored}, window)
-        self._ignored = set(ignored) - {name}
-        self._passed = dict.fromkeys(self._ignored, 0.0)
-        nearby = {**self._passed, name: 0.0}
-        self._onward = distances(space, window, self._towards, self._base, nearby)
+        self._passage = Passage(space, window, name, towards, ignored, keep_out)
         spacing = max(world.robot.radius / 2, 2 * world.cell_size)
         self.grasps = tuple(model.grasps(self.movable, spacing))
-        self._step = world.cell_size / 2
+        # what is kept for between two steps is to be little beside the margin
+        self._step = min(world.cell_size / 2, max(world.margin, world.cell_size / 10))
         self._clearance = Clearance.at_start(space, name, self._step)
         self._fine = Clearance.at_start(space, name, self._step / _FINE)
         size = world.clearance + self.movable.radius
         self._farthest = _REACH * size
         self.scale = size  # m: a cost of this much halves the reward
-        self._footprint = Footprint(self.movable, space.inflation, world.cell_size)
         self._approaches: dict[int, float] = {}
         self._sweeps: dict[Any, _Sweep] = {}
         self._best = math.inf
@@ -206,7 +197,7 @@ class OpeningSearch:
             [np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1
         )
         to = self._reached.at(back) - 1.5 * self.space.cell
-        beyond = self._beyond(poses)
+        beyond = self._passage.beyond(poses)
         bounds = {}
         for index, pose in enumerate(poses):
             bound = max(0.0, to[index]) + self._handling + beyond[index]
@@ -241,7 +232,7 @@ class OpeningSearch:
             return Step(state, 0.0)
         x, y, theta = (float(value) for value in self._robot_at[grasp])
         spent = length + self._handling
-        least = spent + float(self._beyond(self._robot_at[grasp : grasp + 1])[0])
+        least = spent + float(self._passage.beyond(self._robot_at[grasp : grasp + 1])[0])
         return Step(State(state.draw, grasp, state.object_pose, (x, y, theta), spent, least))
 
     # --- carrying -----------------------------------------------------------------------------
@@ -252,11 +243,11 @@ class OpeningSearch:
         lengths, cost = self._lengths(robot, pose, primitive)
         motion = self.model.motion(self.movable, pose, robot, primitive, lengths, state.draw)
         spent = state.spent + cost * lengths
-        least = spent + self._beyond(motion.robot_poses)
+        least = spent + self._passage.beyond(motion.robot_poses)
         limit = self._possible(motion, least)
         opened, begin = None, 0
         for _ in range(_RELEASES):
-            index = self._first_open(motion, begin, limit)
+            index = self._passage.first_open(motion, begin, limit)
             if index is None:
                 break
             opened = self._released(state, primitive, motion, index, float(spent[index]))
@@ -296,18 +287,6 @@ class OpeningSearch:
                 break
         return done
 
-    def _first_open(self, motion: Motion, begin: int, stop: int) -> int | None:
-        """The first step from `begin` to `stop` at which the way is open, as far as looks show."""
-        looks = np.arange(begin + _STRIDE - 1, stop, _STRIDE)
-        if stop > begin and (not len(looks) or looks[-1] != stop - 1):
-            looks = np.append(looks, stop - 1)
-        open_at = self._opened(motion, looks)
-        if open_at is None:
-            return None
-        between = np.arange(max(begin, looks[open_at] - _STRIDE + 1), looks[open_at])
-        earlier = self._opened(motion, between)
-        return int(looks[open_at] if earlier is None else between[earlier])
-
     def _released(
         self, state: State, primitive: Primitive, motion: Motion, index: int, spent: float
     ) -> Step | None:
@@ -325,31 +304,10 @@ class OpeningSearch:
         return Step(final, self._reward(cost))
 
     def _exit(self, object_pose: np.ndarray, robot_pose: np.ndarray, spent: float) -> float:
-        """How far it is from where the robot lets go to the aim, m; infinite if not worth it.
-
-        Only where a way of less than the limit could lead is looked.
-        """
-        after = self.space.moved(self.name, object_pose)
-        limit = _BETTER * self._best - spent
-        direct = float(self._beyond(robot_pose[None])[0])
-        limit = min(limit, direct + _DETOUR * self.scale)
-        xs, ys = self.space.xs[self.window[1]], self.space.ys[self.window[0]]
-        apart = np.hypot(xs[None, :] - robot_pose[0], ys[:, None] - robot_pose[1])
-        near = self._nearest + apart <= limit + 2 * self.space.cell
-        rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-        if not len(rows):
-            return math.inf
-        window = (
-            slice(self.window[0].start + int(rows[0]), self.window[0].start + int(rows[-1]) + 1),
-            slice(
-                self.window[1].start + int(columns[0]), self.window[1].start + int(columns[-1]) + 1
-            ),
-        )
-        free = after.free_without(self._ignored, window)
-        free &= near[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        nearby = {**self._passed, **self._nearby}
-        onward = distances(after, window, robot_pose, free, nearby, standing=True, limit=limit)
-        return onward.to(self._towards, self._passed)
+        """How far it is from where the robot lets go to the aim, m; infinite if not worth it."""
+        direct = float(self._passage.beyond(robot_pose[None])[0])
+        limit = min(_BETTER * self._best - spent, direct + _DETOUR * self.scale)
+        return self._passage.onward(object_pose, robot_pose, limit)
 
     def _keeps_clear(self, part: Carry) -> bool:
         """Whether the steps in between do as well, as if each were a rigid carry."""
@@ -379,66 +337,12 @@ class OpeningSearch:
             (ox, oy, ot),
             (rx, ry, rt),
             spent,
-            spent + float(self._beyond(part.robot_poses[-1:])[0]),
+            spent + float(self._passage.beyond(part.robot_poses[-1:])[0]),
             state.energy + energy,
             (*state.parts, part),
             left < math.inf,
             left,
         )
-
-    # --- judging ------------------------------------------------------------------------------
-
-    def _opened(self, motion: Motion, looks: np.ndarray) -> int | None:
-        """The first of the steps `looks` at which free cells join the robot's place to the aim."""
-        if not len(looks):
-            return None
-        poses, robots = motion.object_poses[looks], motion.robot_poses[looks]
-        (left, bottom), (right, top) = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
-        grown = self._footprint.extent
-        rows, columns = (
-            slice(max(part.start, whole.start), max(min(part.stop, whole.stop), whole.start))
-            for part, whole in zip(
-                self.space.window_of(left - grown, bottom - grown, right + grown, top + grown),
-                self.window,
-                strict=True,
-            )
-        )
-        covered = self._footprint.at(poses, self.space.xs[columns], self.space.ys[rows])
-        local = (
-            slice(rows.start - self.window[0].start, rows.stop - self.window[0].start),
-            slice(columns.start - self.window[1].start, columns.stop - self.window[1].start),
-        )
-        aim = _near(self.space, self.window, self._base.shape, self._towards, 1)
-        own = math.ceil(self.space.map.margin / self.space.cell) + 2
-        x, y = self._towards
-        blocked = self._footprint.at(poses, np.array([x]), np.array([y]))[:, 0, 0]
-        if self._keep_out is not None:
-            bodies = polygons(placed(self.movable.outline, poses))
-            blocked |= shapely.intersects(bodies, self._keep_out)
-        for index in np.flatnonzero(~blocked):
-            free = self._base.copy()
-            free[local] &= ~covered[index]
-            labels, _ = ndimage.label(free, _EIGHT)
-            beside = labels[_near(self.space, self.window, self._base.shape, robots[index], own)]
-            if np.intersect1d(labels[aim][labels[aim] > 0], beside).size:
-                return int(index)
-        return None
-
-    def _beyond(self, poses: np.ndarray) -> np.ndarray:
-        """At least how far it is from robot poses (steps, 3) to the aim, with the object gone."""
-        rows, columns = self.space.cells(poses)
-        rows, columns = rows - self.window[0].start, columns - self.window[1].start
-        lengths = self._nearest
-        known = (rows >= 0) & (rows < lengths.shape[0])
-        known &= (columns >= 0) & (columns < lengths.shape[1])
-        rows, columns = np.where(known, rows, 0), np.where(known, columns, 0)
-        return np.where(known, np.maximum(lengths[rows, columns], 0.0), np.inf)
-
-    @cached_property
-    def _nearest(self) -> np.ndarray:
-        """Lengths to the aim from each cell, or from one beside it, at least."""
-        around = 2 * self.space.cell * math.sqrt(2)
-        return ndimage.minimum_filter(self._onward.lengths, 3) * 0.92 - around
 
     def _reward(self, cost: float) -> float:
         return self.scale / (self.scale + max(cost, 0.0))
@@ -486,15 +390,3 @@ def _undoes(last: Primitive, primitive: Primitive) -> bool:
     """Whether it goes on with, or takes back, what was just done."""
     along = abs(last.forward * primitive.forward + last.left * primitive.left) > 0.99
     return along or bool(last.turn and primitive.turn)
-
-
-def _near(
-    space: Space, window: Window, shape: tuple[int, ...], point: np.ndarray, around: int
-) -> Window:
-    """The cells of a window within `around` of a place, as a window in it."""
-    row, column = space.cell_at(point)
-    row, column = row - window[0].start, column - window[1].start
-    return (
-        slice(max(0, row - around), max(0, min(shape[0], row + around + 1))),
-        slice(max(0, column - around), max(0, min(shape[1], column + around + 1))),
-    )

@@ -28,7 +28,9 @@ from palpate.planning.movable_obstacles.manipulation import (
 from palpate.planning.movable_obstacles.map import Movable
 from palpate.planning.movable_obstacles.primitives import (
     AXIS,
+    FACING,
     FREE,
+    LEVER,
     Constraint,
     Turn,
     grasp_share,
@@ -72,17 +74,22 @@ class ConstrainedManipulation:
         return [grasp for grasp, share in zip(every, total, strict=True) if share > 0]
 
     def primitives(self, movable: Movable, grasp: Grasp, drive: str) -> Sequence[Primitive]:
-        """What moves it in any draw: straight if one is free or has an axis, and turns."""
+        """What moves it in any draw: straight if one is free or along an axis, and turns."""
         drawn = self.drawn[movable.name]
         key = movable.name, drawn.version
         if key not in self._turns:
             self._turns[key] = turns(drawn.constraints)
-        straight: list[Primitive] = []
         if any(one.kind == FREE for one in drawn.constraints):
-            straight = [BACKWARD, FORWARD, LEFT, RIGHT]
-        elif any(one.kind == AXIS for one in drawn.constraints):
-            straight = [BACKWARD, FORWARD]
-        return [*straight, *self._turns[key]]
+            return [BACKWARD, FORWARD, LEFT, RIGHT, *self._turns[key]]
+        straight: list[Primitive] = []
+        axes = [one.direction for one in drawn.constraints if one.kind == AXIS]
+        across = np.abs(np.cos(grasp.normal - np.array(axes)))
+        if (across > FACING).any():
+            straight += [BACKWARD, FORWARD]
+        if (np.sqrt(1 - across**2) > FACING).any():
+            straight += [LEFT, RIGHT]
+        turned = [one for one in self._turns[key] if math.dist(grasp.point, one.anchor) >= LEVER]
+        return [*straight, *turned]
 
     def motion(
         self,

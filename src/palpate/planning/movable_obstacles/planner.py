@@ -5,6 +5,9 @@ it would do from where the robot stands is worked out below, in order, each on t
 earlier actions leave it; what is found replaces what was hoped for, and value iteration is solved
 anew, until the whole policy consists of actions that have been worked out (the lazy evaluation of
 LAO*, Hansen and Zilberstein 2001). Objects that the policy never needs are never simulated.
+
+An object is held once for each way that it opens. Only where no plan is found so, it may be put
+down halfway and held elsewhere.
 """
 
 import dataclasses
@@ -20,6 +23,7 @@ from palpate.planning.movable_obstacles.occupancy import Space, Window
 from palpate.planning.movable_obstacles.openings import OpeningSearch, open_way
 from palpate.planning.movable_obstacles.plan import TRANSIT, Plan, timed
 from palpate.planning.movable_obstacles.policy import Move, PolicyGraph
+from palpate.planning.movable_obstacles.regrasps import stops_of
 from palpate.planning.movable_obstacles.situation import (
     Situation,
     at_hand,
@@ -86,25 +90,16 @@ class Planner:
         if len(self._known) > _MOST_KNOWN:
             self._known.clear()
         self._world = _fingerprint(world)
-        now = Situation(Space(world, fixed), np.array(world.start))
         sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
-        hoped, stale = np.inf, 0
-        for stage in range(2 * len(world.movables) + 3):
-            graph = PolicyGraph(now.space, now.robot, goal, beside(now))
-            # what was moved has to lead nearer, or it is moved to and fro without end
-            stale = stale + 1 if graph.hoped >= hoped - 1e-6 else 0
-            hoped = min(hoped, graph.hoped)
-            if stage == 0:
-                sizes |= {"regions": graph.regions.free, "borders": len(graph.regions.borders)}
-            reached = self._advance(graph, now, goal, sizes)
-            if reached is None or stale == _STALE:
-                raise NoWayError(graph.complaint(world.name))
-            now = reached
-            if len(now.segments) and now.segments[-1].kind == TRANSIT:
-                break
-        else:
-            raise NoWayError(graph.complaint(world.name))
-        segments = tuple(now.segments)
+        begin = Situation(Space(world, fixed), np.array(world.start))
+        try:
+            done = self._planned(begin, goal, sizes, regrasps=False)
+        except NoWayError as closed:
+            try:
+                done = self._planned(begin, goal, sizes, regrasps=True)
+            except NoWayError:
+                raise closed from None
+        segments = tuple(done.segments)
         beliefs = {s.name: self.model.belief(s.name) for s in segments if s.name is not None}
         return Plan(world.name, goal, segments, timed() - began, sizes, beliefs)
 
@@ -132,8 +127,36 @@ class Planner:
 
     # --- above --------------------------------------------------------------------------------
 
+    def _planned(
+        self, now: Situation, goal: Pose, sizes: dict[str, int], regrasps: bool
+    ) -> Situation:
+        """The situation at the goal, stage by stage; raises `NoWayError`."""
+        world = now.space.map
+        hoped, stale = np.inf, 0
+        for stage in range(2 * len(world.movables) + 3):
+            graph = PolicyGraph(now.space, now.robot, goal, beside(now))
+            # what was moved has to lead nearer, or it is moved to and fro without end
+            stale = stale + 1 if graph.hoped >= hoped - 1e-6 else 0
+            hoped = min(hoped, graph.hoped)
+            if stage == 0:
+                sizes |= {"regions": graph.regions.free, "borders": len(graph.regions.borders)}
+            reached = self._advance(graph, now, goal, sizes, regrasps)
+            if reached is None or stale == _STALE:
+                raise NoWayError(graph.complaint(world.name))
+            now = reached
+            if len(now.segments) and now.segments[-1].kind == TRANSIT:
+                break
+        else:
+            raise NoWayError(graph.complaint(world.name))
+        return now
+
     def _advance(
-        self, graph: PolicyGraph, now: Situation, goal: Pose, sizes: dict[str, int]
+        self,
+        graph: PolicyGraph,
+        now: Situation,
+        goal: Pose,
+        sizes: dict[str, int],
+        regrasps: bool,
     ) -> Situation | None:
         """To the goal, or as far as the policy leads before it needs another graph."""
         farthest: Situation | None = None
@@ -146,6 +169,8 @@ class Planner:
             spent: dict[int, tuple[float, float]] = {}  # an action may need several moves
             for move in moves:
                 resolved = self._resolve(ahead, move, sizes, _DEPTH)
+                if resolved is None and regrasps:
+                    resolved = self._regrasped(ahead, move, sizes)
                 if resolved is None:
                     graph.fail(move.action)
                     failed = True
@@ -222,6 +247,27 @@ class Planner:
             carried_out(ahead, opening), cost + opening.cost, probability * opening.probability
         )
 
+    def _regrasped(self, ahead: Situation, move: Move, sizes: dict[str, int]) -> _Resolved | None:
+        """The move in two carries of the same object, the cheaper the better."""
+        best: _Resolved | None = None
+        for stop in self._stops(ahead, move):
+            halfway = carried_out(ahead, stop)
+            opening = self._open(halfway, move, sizes)
+            if opening is None:
+                continue
+            cost, probability = stop.cost + opening.cost, stop.probability * opening.probability
+            if best is None or cost / probability < best.cost_m / best.probability:
+                best = _Resolved(carried_out(halfway, opening), cost, probability)
+        return best
+
+    def _stops(self, ahead: Situation, move: Move) -> list[Opening]:
+        """Where the object may be put down to be held elsewhere."""
+        for window in (window_of(ahead.space, ahead.robot, move), whole(ahead.space)):
+            below = self._below(ahead, move, window)
+            if below.reachable:
+                return stops_of(below)
+        return []
+
     def _open(self, ahead: Situation, move: Move, sizes: dict[str, int]) -> Opening | None:
         """What the tree search says of one move, in a window if that is enough."""
         space = ahead.space
@@ -237,21 +283,24 @@ class Planner:
                         "an opening: its objects stand too much in one another's way"
                     )
                 sizes["evaluations"] += 1
-                below = OpeningSearch(
-                    space,
-                    self.model,
-                    move.name,
-                    ahead.robot,
-                    np.array(move.towards),
-                    move.ignored,
-                    window,
-                    move.keep_out,
-                )
+                below = self._below(ahead, move, window)
                 self._known[key] = open_way(below, self.settings, self.seed), below.reachable
             opening, reachable = self._known[key]
             if opening is not None or reachable:
                 return opening
         return None
+
+    def _below(self, ahead: Situation, move: Move, window: Window) -> OpeningSearch:
+        return OpeningSearch(
+            ahead.space,
+            self.model,
+            move.name,
+            ahead.robot,
+            np.array(move.towards),
+            move.ignored,
+            window,
+            move.keep_out,
+        )
 
     def _key(self, ahead: Situation, move: Move, window: Window) -> Hashable:
         """All that decides what a search finds."""

@@ -2,9 +2,13 @@
 
 Scholz et al.'s manipulation primitives: linear velocities along the object's free directions and a
 turn about one point, and where to hold it. Free: any direction, a turn about the centroid, held
-anywhere. A free axis (fixed wheels): along it, a turn about the wheels' middle, held at faces
-across the axis. A fixed point (a locked caster, a hinge): a turn about it, held far from it.
-Static: none.
+anywhere. A free axis (fixed wheels): along it, a turn about a point beside the wheels' middle. A
+fixed point (a locked caster, a hinge): a turn about it. What is turned about a point that is held
+in place is held away from that point. Static: none.
+
+The deck holds a piece on wheels at faces across the axis alone, as one takes a cart by its handle.
+A gripper that holds on pulls it along from any face, and the face that can be reached in a doorway
+is often the other one.
 """
 
 import math
@@ -17,7 +21,7 @@ from palpate.planning.movable_obstacles.manipulation import Grasp, Primitive
 
 FREE, AXIS, PIVOT, STATIC = "free", "axis", "pivot", "static"
 CONSTRAINTS = (FREE, AXIS, PIVOT, STATIC)
-LEVER = 0.5  # of the longest lever to the fixed point is the least that a grasp should have
+LEVER = 0.2  # m between hand and fixed point: nearer, the hand's own torque would have to turn it
 FACING = math.cos(math.radians(50))  # between a face's normal and the free axis
 ASIDE = 0.5  # m beside the wheels of an axis
 APART = 0.15  # m between points worth turning about
@@ -89,14 +93,11 @@ def grasp_share(constraint: Constraint, grasps: Sequence[Grasp]) -> np.ndarray:
     """The distribution (grasps,) of where to hold an object so constrained; 0 for a static one."""
     if constraint.kind == STATIC:
         return np.zeros(len(grasps))
-    if constraint.kind == FREE:
-        weights = np.ones(len(grasps))
-    elif constraint.kind == AXIS:
-        off = np.array([abs(math.cos(g.normal - constraint.direction)) for g in grasps])
-        weights = (off > FACING).astype(float)
+    if constraint.kind == PIVOT:
+        levers = np.array([math.dist(grasp.point, constraint.anchor) for grasp in grasps])
+        weights = (levers >= LEVER).astype(float)
     else:
-        levers = np.array([math.dist(g.point, constraint.anchor) for g in grasps])
-        weights = (levers > LEVER * levers.max()).astype(float)
+        weights = np.ones(len(grasps))
     return weights / max(weights.sum(), 1.0)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import shapely
 from shapely import affinity
 
-from palpate.experiments import cart_agents, cart_online
+from palpate.experiments import cart_agents, cart_online, cart_trials
 from palpate.experiments.cart_agents import (
     FRAMES,
     Decision,
@@ -17,14 +18,23 @@ from palpate.experiments.cart_agents import (
     Handled,
     Knowing,
     PhysicsAgent,
+    PiecePosterior,
     RegressionAgent,
     around,
     due,
     piece_model,
     scene_model,
 )
-from palpate.experiments.cart_tasks import DONE, TURN, Turns, apartment, shopping_cart
-from palpate.experiments.cart_trials import Planning, Trial
+from palpate.experiments.cart_tasks import (
+    CLEAR,
+    DONE,
+    TURN,
+    Turns,
+    apartment,
+    clearance,
+    shopping_cart,
+)
+from palpate.experiments.cart_trials import Planning, Trial, best_scene
 from palpate.identification.segments import Segments
 from palpate.models.planar import Planar, PlanarState
 from palpate.planning.sampling import SamplingPlanner
@@ -45,6 +55,14 @@ def test_starts_and_goals_are_apart_and_in_the_room(task):
         ]
         assert all(one.distance(walls) > 0.02 for one in placed)
         assert all(a.distance(b) > 0 for a, b in itertools.combinations(placed, 2))
+
+
+def test_starts_of_the_apartment_stand_clear_whatever_the_seed():
+    task = apartment()
+    starts = [task.start(np.random.default_rng([seed, 8])) for seed in range(2000)]
+    least = min(clearance(task.kinds, poses) for poses in starts)
+    assert CLEAR < least < 2 * CLEAR  # some were drawn again
+    assert clearance(task.kinds, np.zeros((3, 3))) == 0
 
 
 def test_the_reward_is_distance_and_heading_the_short_way_round():
@@ -216,7 +234,61 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
     run(task, agent, 3, 4)
     assert updates == [FRAMES, 2 * FRAMES, 3 * FRAMES, FRAMES]
     assert kept == [1]
-    assert float(agent.believed(0).mass[0]) == 14.0
+    believed = agent.believed(0)
+    assert isinstance(believed, Planar)
+    assert float(believed.mass[0]) == 14.0
+
+
+def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
+    """Beside the best: some of its coordinates drawn anew, the others as they are."""
+    begun = []
+
+    def climb(target, start, steps):
+        begun.append(np.asarray(start))
+        return SimpleNamespace(position=start)
+
+    monkeypatch.setattr(cart_agents, "climb", climb)
+    task = shopping_cart()
+    trial = Trial(task, Knowing(None), SMALL, 3)
+    for _ in range(4):
+        trial.decide()
+    posterior = PiecePosterior(piece_model(task, 0), 0)
+    assert posterior.update([]) is None
+    for _ in range(2):
+        posterior.update(trial.episodes[0].handling(0))
+    first, second = begun
+    assert not first[0].any()
+    np.testing.assert_array_equal(second[:2], first[:2])
+    kept = second[2:] == first[0]
+    assert 0.4 < kept.mean() < 1.0
+
+
+def test_the_best_scene_is_learnt_from_handling_and_from_other_starts(monkeypatch):
+    seen, task = [], dataclasses.replace(shopping_cart(), episode=2)
+    scene = scene_model(task, [piece_model(task, 0)])
+
+    class Learner:
+        def __init__(self, task, seed, handled):
+            seen.append([len(stretches) for stretches in handled])
+
+        def search(self, times):
+            seen.append(times)
+            return scene
+
+        def learn(self, episodes):
+            seen.append(episodes[-1].first)
+
+        def believed(self, held):
+            return None
+
+    monkeypatch.setattr(cart_trials, "PhysicsAgent", Learner)
+    monkeypatch.setattr(cart_trials, "HANDLED", 0.2)
+    monkeypatch.setattr(cart_trials, "PRACTISED", 1)
+    assert best_scene(task, SMALL, 3) is scene
+    assert seen[:2] == [[3], cart_trials.SEARCHES]
+    assert seen[4:] == [cart_trials.SEARCHES]
+    _, trial = run(task, Knowing(None), 3, 1)
+    assert np.abs(trial.episodes[0].first - seen[2]).max() > 0.1
 
 
 def earned(worlds: int, decisions: int) -> cart_online.Rewards:

@@ -1,5 +1,6 @@
 """Sampling MPC on a cart: it gets where it is told, within limits and within its time."""
 
+import dataclasses
 import time
 
 import jax
@@ -111,6 +112,20 @@ def test_a_plan_without_any_finite_future_is_still_a_command() -> None:
         plan = plans.init(jnp.zeros(1), jax.random.key(0))
         _, command = plans(plan, CartState(jnp.zeros(1), jnp.zeros(1)), None)
         assert bool(jnp.isfinite(command).all())
+
+
+def test_samples_about_a_share_of_the_plan_let_go_of_what_achieves_nothing() -> None:
+    """Where all plans are as good, the new one is the mean of the shares of the old."""
+    for shares, left in (((1.0,), 1.0), ((1.0, 0.0, 1.0, 0.5), 0.625)):
+        plans = planner(Mppi(), samples=16, deviation=0.0, rate_limit=None, shares=shares)
+        plans = dataclasses.replace(plans, stage_loss=lambda *_: jnp.zeros(16))
+        plan = plans.init(jnp.zeros(1), jax.random.key(0))
+        plan = dataclasses.replace(plan, knots=jnp.full_like(plan.knots, 3.0))
+        plan, command = plans(plan, CartState(jnp.zeros(1), jnp.zeros(1)), jnp.zeros(20))
+        np.testing.assert_allclose(plan.knots, 3.0 * left, rtol=1e-5)
+        np.testing.assert_allclose(command, LIMIT * 3 * left / np.hypot(1, 3 * left), rtol=1e-5)
+    with pytest.raises(PalpateError, match="first of the shares"):
+        planner(Mppi(), shares=(0.0, 1.0))
 
 
 def test_counts_that_make_no_planner_are_refused() -> None:

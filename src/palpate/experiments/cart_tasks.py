@@ -18,22 +18,27 @@ The reward of a decision, given at its end, is minus the mean over the pieces of
 the goal in metres plus half the error of heading in radians. An episode has 50 decisions in the
 cart's task and 100 in the apartment's, whether or not the goal was reached; then the pieces stand
 at rest at another start: the cart anywhere 1 to 2.5 m from its goal at any heading, the apartment's
-pieces within 0.3 m and at any heading about theirs. Hidden parameters are drawn by the world's
+pieces within 0.3 m and up to 54 (chair: 90) degrees of theirs, drawn again until they stand clear
+of each other. Hidden parameters are drawn by the world's
 seed and stay as they are for the 1,000 decisions.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 
 from palpate.worlds.furniture import KINDS, FurnitureWorld, Piece
+from palpate.worlds.furniture_pieces import placed
 
 DECISION = 0.2  # s
 HEADING_WEIGHT = 0.5  # m/rad
 DONE = 0.15  # m or rad: a piece that is nearer is left alone
 TURN = 20  # decisions for which a piece is held at a stretch
 WALL = 0.2  # m thick
+CLEAR = 0.05  # m between pieces at a start
 
 
 @dataclass(frozen=True)
@@ -109,13 +114,26 @@ def apartment() -> CartTask:
     middle = np.array([[-1.4, 0.0, 0.0], [0.6, 0.9, 0.0], [0.8, -0.8, 0.0]])
     goals = np.array([[-2.6, -2.3, 0.0], [2.2, 2.3, 0.0], [2.7, -2.2, 0.0]])
 
-    def start(random: np.random.Generator) -> np.ndarray:
-        offset = random.uniform(-0.3, 0.3, (3, 2))
-        turn = random.uniform(-np.pi / 2, np.pi / 2, (3, 1)) * [[0.6], [0.6], [1.0]]
-        return middle + np.concatenate([offset, turn], axis=1)
-
     kinds = "table", "couch", "chair"
+
+    def start(random: np.random.Generator) -> np.ndarray:
+        while True:
+            offset = random.uniform(-0.3, 0.3, (3, 2))
+            turn = random.uniform(-np.pi / 2, np.pi / 2, (3, 1)) * [[0.6], [0.6], [1.0]]
+            poses = middle + np.concatenate([offset, turn], axis=1)
+            if clearance(kinds, poses) > CLEAR:
+                return poses
+
     return CartTask("apartment", kinds, (7.0, 6.0), goals, np.zeros((3, 2)), start, 100)
+
+
+def clearance(kinds: tuple[str, ...], poses: np.ndarray) -> float:
+    """The least distance (m) between any two of the pieces at poses (bodies, 3)."""
+    shapes = [
+        shapely.Polygon(placed(np.asarray(KINDS[kind].outline), pose))
+        for kind, pose in zip(kinds, poses, strict=True)
+    ]
+    return min(one.distance(other) for one, other in itertools.combinations(shapes, 2))
 
 
 class Turns:

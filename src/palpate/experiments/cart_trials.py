@@ -14,8 +14,7 @@ from palpate.experiments.cart_agents import (
     Decision,
     Episode,
     Handled,
-    PiecePosterior,
-    piece_model,
+    PhysicsAgent,
 )
 from palpate.experiments.cart_tasks import HEADING_WEIGHT, CartTask, Turns
 from palpate.models.model import Model
@@ -28,8 +27,10 @@ from palpate.worlds.furniture_handling import record_handling
 
 ESTIMATED = 5  # frames that velocities are estimated from
 VISIBLE = 0.02  # m or rad, in a decision: what moves by more has moved
+SHARES = 1.0, 0.0, 1.0, 0.5  # of the plan that samples are about: forces may cancel
 CLOSE = 0.02  # m: what is nearer is taken as touching
-HANDLED, SEARCHES = 15.0, 15  # s, three times, and climbs: what TRUE is told of
+HANDLED, PRACTISED, SEARCHES = 15.0, 4, 15  # s, three times; episodes; and climbs: of TRUE
+HANDLING, PRACTICE = 10_000, 20_000  # episodes' numbers, unlike those that count
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Planning:
     samples: int = 128
     knots: int = 7
     spacing: int = 3
-    deviation: float = 0.7
+    deviation: float = 1.0
     iterations: int = 1
     temperature: float = 0.1
 
@@ -54,7 +55,7 @@ def stage_loss(
     off = states.pose - goal
     heading = jnp.abs(off[..., 2] - 2 * jnp.pi * jnp.round(off[..., 2] / (2 * jnp.pi)))
     distance = jnp.sqrt(jnp.sum(off[..., :2] ** 2, axis=-1) + 1e-8)
-    effort = 0.01 * jnp.sum(actions**2, axis=-1)
+    effort = 0.03 * jnp.sum(actions**2, axis=-1)
     return jnp.mean(distance + HEADING_WEIGHT * heading, axis=-1) + effort
 
 
@@ -67,11 +68,12 @@ class Trial:
     planning: Planning
     seed: int
     idle: bool = False  # does nothing where it has nothing to plan with, instead of anything
+    first_episode: int = 0  # with the seed draws starts and noise
 
     def __post_init__(self) -> None:
         self._world = self.task.world()
-        self._random = np.random.default_rng([self.seed, 7])
-        self._starts = np.random.default_rng([self.seed, 8])
+        self._random = np.random.default_rng([self.seed, 7, self.first_episode])
+        self._starts = np.random.default_rng([self.seed, 8, self.first_episode])
         self._turns = Turns(self.task)
         self._tracker = furniture(self.task.outlines, control_period=CONTROL_PERIOD)
         self._shapes = [shapely.Polygon(outline) for outline in self.task.outlines]
@@ -111,7 +113,8 @@ class Trial:
 
     def _begin(self) -> None:
         start = self.task.start(self._starts)
-        first = self._world.reset(self.seed, episode=len(self.episodes), poses=start).poses
+        number = self.first_episode + len(self.episodes)
+        first = self._world.reset(self.seed, episode=number, poses=start).poses
         self.episodes.append(Episode(first))
         self._frames = [first] * ESTIMATED  # at rest, as everybody knows
         self._turns.begin()
@@ -142,6 +145,7 @@ class Trial:
             samples=options.samples,
             iterations=options.iterations,
             deviation=options.deviation,
+            shares=SHARES,
         )
         if self._plan is None or held != self._planned_for:
             key = jax.random.key(int(self._random.integers(2**31)))
@@ -176,31 +180,36 @@ class Trial:
         )
 
 
-def best_models(task: CartTask, seed: int, seconds: float = HANDLED) -> list[Planar]:
-    """The planar model of each piece that explains much handling of it best: what TRUE is told.
+def best_scene(task: CartTask, planning: Planning, seed: int) -> Planar:
+    """The planar model that explains most of what it meets in this task: what TRUE is told.
 
-    The same pieces, of the same hidden parameters, stand apart and without walls, and each is
-    wiggled for three times `seconds`.
+    Of the same pieces, of the same hidden parameters: as they stand apart, without walls, and each
+    is wiggled for three times `HANDLED`; and as an agent that learnt from this brings them to
+    their places for `PRACTISED` episodes of the task, from other starts than those that count.
     """
+    agent = PhysicsAgent(task, seed, _wiggled(task, seed))
+    agent.search(SEARCHES)
+    trial = Trial(task, agent, planning, seed, first_episode=PRACTICE)
+    for _ in range(PRACTISED * task.episode):
+        trial.decide()
+    return agent.search(SEARCHES)
+
+
+def _wiggled(task: CartTask, seed: int) -> list[list[tuple[Aligned, bool]]]:
+    """Handling of each piece, that begins at rest, as `Episode.handling` has it."""
     apart = [(4.0 * index, 0.0, 0.0) for index in range(len(task.kinds))]
     world = FurnitureWorld(
         [Piece(kind, pose) for kind, pose in zip(task.kinds, apart, strict=True)]
     )
-    posteriors = [PiecePosterior(piece_model(task, b), b) for b in range(len(task.kinds))]
+    stretches: list[list[tuple[Aligned, bool]]] = [[] for _ in task.kinds]
     for repetition in range(3):
-        first = 10_000 + 10 * repetition
-        for body, trial in enumerate(record_handling(world, seed, seconds, first).trials):
+        first = HANDLING + 10 * repetition
+        for body, trial in enumerate(record_handling(world, seed, HANDLED, first).trials):
             poses = trial.channels["pose"].values[:, body : body + 1]
             wrenches = trial.channels["wrench"].values[:, body : body + 1]
             aligned = Aligned(CONTROL_PERIOD, poses[None], wrenches[None], np.array([len(poses)]))
-            posteriors[body].keep([(aligned, True)])
-    models = []
-    for posterior in posteriors:
-        # From other draws of the prior each time: what TRUE is told must not be a lesser mode.
-        for _ in range(SEARCHES):
-            found = posterior.update([])
-        models.append(found)
-    return models
+            stretches[body].append((aligned, True))
+    return stretches
 
 
 def _rotation(angle: float) -> np.ndarray:

@@ -185,9 +185,9 @@ def chain(
         )
         return (state, step), out
 
-    within = solve_lower(root, position[:, None])[:, 0]
+    within = solve_lower(root, jnp.asarray(position)[:, None])[:, 0]
     start = HMCState(within, value, slope @ root)
     inputs = jax.random.split(key, BLOCK), jnp.arange(BLOCK)
     (end, _), trace = jax.lax.scan(advance, (start, step), inputs)
-    slope = solve_upper(root, end.logdensity_grad[:, None])[:, 0]
+    slope = solve_upper(root, jnp.asarray(end.logdensity_grad)[:, None])[:, 0]
     return (root @ end.position, end.logdensity, slope), trace

@@ -65,12 +65,18 @@ class Cem:
 
 
 class SamplingPlanner(CurvePlanner):
-    """MPPI or CEM through any model; see `CurvePlanner`."""
+    """MPPI or CEM through any model; see `CurvePlanner`.
+
+    `shares` say, in turn, about how much of the plan samples are drawn: 0 is about no command at
+    all. A plan has no reason to give up what achieves nothing, such as parts of a wrench that
+    cancel, and commands that are limited as a whole then leave no room for what is needed.
+    """
 
     rule: Rule = eqx.field(static=True, kw_only=True)
     samples: int = eqx.field(static=True, default=64)
     iterations: int = eqx.field(static=True, default=1)
     deviation: float = eqx.field(static=True, default=0.5)  # of a sampled knot from the plan
+    shares: tuple[float, ...] = eqx.field(static=True, default=(1.0,))  # the first is 1
 
     def __check_init__(self) -> None:
         counts = self.samples, self.iterations, self.knots, self.spacing
@@ -79,16 +85,20 @@ class SamplingPlanner(CurvePlanner):
                 "a sampling planner needs at least two samples, one iteration, two knots and one "
                 f"period between them, got {', '.join(map(str, counts))}"
             )
+        if self.shares[:1] != (1.0,):
+            raise PalpateError(f"the first of the shares of a plan is 1, not {self.shares}")
 
     def _improved(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
         """The samples' weighted mean."""
         knots = plan.knots
         deviation = jnp.full_like(knots, self.deviation)
+        share = jnp.resize(jnp.asarray(self.shares, knots.dtype), (self.samples,))
+        share = share.reshape(-1, *(1,) * knots.ndim)
         for iteration in range(self.iterations):
             noise = jax.random.normal(
                 jax.random.fold_in(key, iteration), (self.samples, *knots.shape), knots.dtype
             )
-            tried = knots + deviation * noise.at[0].set(0.0)
+            tried = share * knots + deviation * noise.at[0].set(0.0)
             losses = self._losses(tried, plan.command, state, goals)
             weights = self.rule.weights(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
             knots = jnp.tensordot(weights, tried, axes=1)

@@ -69,7 +69,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     """Scenes, then rooms; `quick` is fewer rooms."""
     count = ROOMS["quick" if quick else "full"]
     first = SEEDS + 1000 * seed
-    minutes = 4 if quick else 45
+    minutes = 2 if quick else 12
     print(
         f"{NAME}: 4 scenes and {count} rooms, 4 planners each, about {minutes} minutes", flush=True
     )

@@ -28,30 +28,14 @@ def solve_lower(
     root: Float[Array, "*batch size size"], right: Float[Array, "*batch size columns"]
 ) -> Float[Array, "*batch size columns"]:
     """L^-1 `right` for a lower triangular L."""
-
-    def substitute(rest: Array, index: Array) -> tuple[Array, Array]:
-        column = jnp.take(root, index, axis=-1)
-        found = jnp.take(rest, index, axis=-2)
-        found = found / jnp.take(column, index, axis=-1)[..., None]
-        return rest - column[..., :, None] * found[..., None, :], found
-
-    _, found = jax.lax.scan(substitute, right, jnp.arange(root.shape[-1]))
-    return jnp.moveaxis(found, 0, -2)
+    return _substituted(root, right, backwards=False)
 
 
 def solve_upper(
     root: Float[Array, "*batch size size"], right: Float[Array, "*batch size columns"]
 ) -> Float[Array, "*batch size columns"]:
     """L'^-1 `right` for a lower triangular L."""
-
-    def substitute(rest: Array, index: Array) -> tuple[Array, Array]:
-        row = jnp.take(root, index, axis=-2)
-        found = jnp.take(rest, index, axis=-2)
-        found = found / jnp.take(row, index, axis=-1)[..., None]
-        return rest - row[..., :, None] * found[..., None, :], found
-
-    _, found = jax.lax.scan(substitute, right, jnp.arange(root.shape[-1]), reverse=True)
-    return jnp.moveaxis(found, 0, -2)
+    return _substituted(jnp.swapaxes(root, -1, -2), right, backwards=True)
 
 
 def solve(
@@ -59,3 +43,17 @@ def solve(
 ) -> Float[Array, "*batch size"]:
     """(L L')^-1 `right` for a lower triangular L."""
     return solve_upper(root, solve_lower(root, right[..., None]))[..., 0]
+
+
+def _substituted(triangle: Array, right: Array, backwards: bool) -> Array:
+    """Solve for one unknown after another, the last one first if `backwards`."""
+
+    def substitute(rest: Array, index: Array) -> tuple[Array, Array]:
+        column = jnp.take(triangle, index, axis=-1)
+        found = jnp.take(rest, index, axis=-2)
+        found = found / jnp.take(column, index, axis=-1)[..., None]
+        return rest - column[..., :, None] * found[..., None, :], found
+
+    order = jnp.arange(triangle.shape[-1])
+    _, found = jax.lax.scan(substitute, right, order, reverse=backwards)
+    return jnp.moveaxis(found, 0, -2)

@@ -9,6 +9,7 @@ from scipy.stats import multivariate_normal
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
 from palpate.identification.likelihood import (
+    MEMORY,
     VAGUE,
     discrepancy_covariance,
     from_start,
@@ -91,12 +92,16 @@ def test_curvature_is_that_of_the_expected_information():
 
 
 @pytest.mark.usefixtures("float64")
-def test_the_discrepancy_is_twice_integrated_white_noise():
+def test_the_discrepancy_is_twice_integrated_from_an_acceleration_that_is_forgotten():
     rng = np.random.default_rng(0)
     step, count = 1e-3, 4000
-    rate = np.cumsum(rng.normal(size=(count, 1000)) * np.sqrt(step), axis=1)
-    path = np.cumsum(rate, axis=1) * step
-    at = [249, 499, 999]
+    kept = np.exp(-step / MEMORY)
+    acceleration = rng.normal(size=(count, 1000)) / np.sqrt(2.0 * MEMORY)
+    for now in range(1, 1000):
+        acceleration[:, now] *= np.sqrt(1.0 - kept**2)
+        acceleration[:, now] += kept * acceleration[:, now - 1]
+    path = np.cumsum(np.cumsum(acceleration, axis=1), axis=1) * step**2
+    at = [49, 249, 499, 999]
     expected = discrepancy_covariance(step * (np.array(at) + 1.0))
     np.testing.assert_allclose(np.cov(path[:, at], rowvar=False), expected, rtol=0.1)
 

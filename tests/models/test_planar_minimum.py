@@ -49,20 +49,27 @@ def _body(random: np.random.Generator) -> tuple[Planar, dict[str, np.ndarray | f
     }
 
 
+def _huber(size: np.ndarray, least: float) -> np.ndarray:
+    """The size, and quadratic below the least."""
+    return np.where(size < least, 0.5 * np.square(size) / least, size - 0.5 * least)
+
+
 def _least(of: dict, before: np.ndarray, wrench: np.ndarray, period: float) -> np.ndarray:
     """Velocity of the centre of mass and turning at the end of a step, by a search of simplices."""
     inertia = np.array([of["mass"], of["mass"], of["inertia"]])
     free = before + period * wrench / inertia
     cosine, sine = np.cos(of["direction"]), np.sin(of["direction"])
     x, y = of["wheel"]
+    # a wheel sticks below the power of its lesser friction at that speed, or about that
+    along, across = of["along"], of["across"]
+    least = STICTION * np.sqrt(2.0 * (along * across) ** 2 / (along**2 + across**2))
 
     def cost(velocity: np.ndarray) -> float:
         vx, vy, turning = velocity
         speeds = np.hypot(vx - turning * of["feet"][:, 1], vy + turning * of["feet"][:, 0])
         wx, wy = vx - turning * y, vy + turning * x
-        along = of["along"] * (cosine * wx + sine * wy)
-        across = of["across"] * (cosine * wy - sine * wx)
-        taken = of["held"] @ speeds + np.hypot(along, across)
+        power = np.hypot(along * (cosine * wx + sine * wy), across * (cosine * wy - sine * wx))
+        taken = of["held"] @ _huber(speeds, STICTION) + _huber(power, least)
         return 0.5 * inertia @ np.square(velocity - free) + period * taken
 
     best = min(
@@ -103,7 +110,7 @@ def test_feet_and_a_wheel_together_leave_the_least_of_the_potential(float64, see
     expected = _least(of, before, wrench, period)
     scale = np.array([1.0, 1.0, np.sqrt(of["inertia"] / of["mass"])])
     speed = np.linalg.norm(expected * scale)
-    assert np.linalg.norm((found - expected) * scale) < 4.0 * STICTION + 0.03 * speed
+    assert np.linalg.norm((found - expected) * scale) < 1e-3 + 0.02 * speed
 
 
 @pytest.mark.parametrize("share", [1.2, 1.5, 3.0])
@@ -123,5 +130,5 @@ def test_a_push_and_a_torque_beyond_what_feet_hold_move_a_body_from_rest(float64
     more = dataclasses.replace(model, iterations=30)
     start = PlanarState(jnp.zeros((1, 3)), jnp.zeros((1, 3)))
     few, many = model.step(start, push), more.step(start, push)
-    assert float(jnp.linalg.norm(many.velocity)) > 20.0 * STICTION
-    np.testing.assert_allclose(few.velocity, many.velocity, atol=2.0 * STICTION)
+    assert float(jnp.linalg.norm(many.velocity)) > 3.0 * STICTION
+    np.testing.assert_allclose(few.velocity, many.velocity, atol=1e-3)

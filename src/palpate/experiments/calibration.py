@@ -61,7 +61,7 @@ class Size:
     minutes: int
 
 
-FULL, QUICK = Size(320, 16, 30), Size(64, 8, 5)
+FULL, QUICK = Size(320, 16, 20), Size(64, 8, 5)
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:

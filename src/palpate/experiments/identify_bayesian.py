@@ -33,7 +33,7 @@ from palpate.result import Figure, Result, read_result
 from palpate.runs import RESULT, Run
 
 DRAWS = "posterior.npz"
-PIECE, SCORED = 1.0, 2.0  # s: pieces that are fitted, and those that are predicted open loop
+PIECE = 2.0  # s, of what is fitted, and of what is predicted open loop
 LEVEL = 0.9
 STILL = 0.1  # s
 
@@ -189,7 +189,7 @@ def _write(
     model = posterior.target.coordinates.reference
     which = scored or fitted
     aligned = which.align(model.control_period, options.observation, options.action)
-    pieces = cut(aligned, model, SCORED, begins_at_rest(aligned, model))
+    pieces = cut(aligned, model, PIECE, begins_at_rest(aligned, model))
     predicted = posterior.predict(pieces)
     score = posterior.score(pieces)
     write_evidence(run.path, _horizon(predicted, pieces, model))
@@ -284,6 +284,6 @@ def _print(result: Result) -> None:
         if name.startswith("rmse_")
     )
     print(
-        f"predicted over {SCORED:g} s: root mean square error {errors}; 90 % intervals hold "
+        f"predicted over {PIECE:g} s: root mean square error {errors}; 90 % intervals hold "
         f"{coverage:.0%} of what was seen ({settings['scored_on']})"
     )

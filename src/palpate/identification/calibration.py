@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from palpate.errors import PalpateError
 from palpate.identification.diagnostics import bulk_size
 from palpate.identification.hamiltonian import BLOCK, GAIN, chain, pooled
-from palpate.identification.laplace import Modes, climb_each
+from palpate.identification.laplace import STARTS, Modes, search
 from palpate.identification.likelihood import (
     MotionPosterior,
     from_start,
@@ -35,11 +35,9 @@ from palpate.identification.likelihood import (
 from palpate.identification.segments import known_start
 from palpate.models.model import Model
 
-STARTS, SCREENING = 24, 10  # of the climb, for each data set, and the steps of each
-FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on for
-WARM_UP = 7  # blocks; the metric is learnt after each but the first and the last
-LEAPS = 8  # of a trajectory: about a quarter turn, with the metric of the posterior
-THIN = 4  # draws for each that is kept
+WARM_UP = 12  # blocks; the metric is learnt after each but the first and the last
+LEAPS = 12  # of a trajectory: more than a quarter turn, with the metric of the posterior
+THIN = 16  # draws for each that is kept: curved posteriors are explored slowly
 
 
 class Problem(eqx.Module):
@@ -95,9 +93,7 @@ def ranks_of(given: Problem, key: PRNGKeyArray, simulations: int, draws: int = 6
     size = truth.shape[1]
     noise = np.array(jax.random.normal(second, (simulations, STARTS, size)))
     noise[:, 0] = 0.0
-    look = partial(_look, given.target, observed)
-    screened = climb_each(look, noise, SCREENING)
-    modes = climb_each(look, np.asarray(screened.position[:, :FOLLOWED]), CLIMBING)
+    modes = search(partial(_look, given.target, observed), noise)
     position = _sampled(given.target, observed, modes, third, draws)
     if not np.all(np.isfinite(position)):
         raise PalpateError("a posterior draw is not finite: expected a model that stays finite")

@@ -21,6 +21,8 @@ LONGEST = 1.5  # prior standard deviations that a step may have
 DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
 SETTLED = 0.1  # gain of the density's logarithm in a few steps below which a climb has arrived
 ROUNDS = 3  # in which the start's errors are propagated anew
+STARTS, SCREENING = 24, 10  # of a search, and the steps of each
+FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on for
 
 
 class Modes(eqx.Module):
@@ -56,7 +58,10 @@ def find_modes(target: Target, key: PRNGKeyArray, starts: int = 8, steps: int = 
 
 def climb(target: Target, position: Float[Array, "starts free"], steps: int = 40) -> Modes:
     """Climb from given positions; raises `PalpateError` when all of them fail."""
-    modes = climb_each(functools.partial(_look, target), np.asarray(position), steps)
+    return _found(target, climb_each(functools.partial(_look, target), np.asarray(position), steps))
+
+
+def _found(target: Target, modes: Modes) -> Modes:
     if not np.any(np.isfinite(modes.density)):
         raise PalpateError(
             "the likelihood is not finite anywhere a search began: expected data that the model "
@@ -106,6 +111,18 @@ def climb_each(
     return Modes(*map(sorted_by_density, found))
 
 
+def search(
+    curvature: Callable[[Array], tuple[Array, Array, Array]],
+    position: Float[np.ndarray, "*batch starts free"],
+) -> Modes:
+    """Climb from many starts for a few steps, and from where the best of them are to the top.
+
+    Most starts of a body that may stick end where it sticks for ever, and climb no further.
+    """
+    screened = climb_each(curvature, position, SCREENING)
+    return climb_each(curvature, np.asarray(screened.position[..., :FOLLOWED, :]), CLIMBING)
+
+
 def look(
     target: Target, position: Float[np.ndarray, "starts free"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -136,19 +153,18 @@ def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
     return jax.vmap(target.curvature)(position)
 
 
-def settle(
-    target: MotionPosterior, key: PRNGKeyArray, starts: int = 8, steps: int = 40
-) -> tuple[MotionPosterior, Modes]:
+def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior, Modes]:
     """Modes, and the target linearised about the best of them, by turns.
 
-    The reference model is among the starts.
+    The reference model is among the starts. Raises `PalpateError` when the density is finite at
+    none of them.
     """
-    noise = jax.random.normal(key, (starts, target.dimension))
+    noise = jax.random.normal(key, (STARTS, target.dimension))
     position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
-    modes = climb(target, position, steps)
+    modes = _found(target, search(functools.partial(_look, target), np.asarray(position)))
     if target.sensitivity is None:
         return target, modes
     for _ in range(ROUNDS - 1):
         target = target.linearised(modes.position[0])
-        modes = climb(target, modes.position, steps)
+        modes = climb(target, modes.position, CLIMBING)
     return target, modes

@@ -13,6 +13,8 @@ from palpate.parameters import Parameter
 
 State = TypeVar("State")
 
+SOLVED = "solved"  # `checkpoint_name` of a solver's result, which nothing is to solve for again
+
 
 class Model(eqx.Module):
     """Differentiable dynamics at a control rate: a frozen pytree of parameters and structure.
@@ -86,7 +88,8 @@ def rollout(model: Model, state: State, actions: Array) -> State:
     lead with the same batch axis; the result's leaves are (time, ...) or (batch, time, ...).
 
     Reverse-mode derivatives keep only the state at each control period and compute the inside of
-    a period again: memory grows with control periods, not with integration steps.
+    a period again: memory grows with control periods, not with integration steps. What a model
+    names `SOLVED` is kept too.
     """
     batched = batch_size(model, actions) is not None
     in_time = jnp.moveaxis(actions, 1, 0) if batched else actions
@@ -95,7 +98,9 @@ def rollout(model: Model, state: State, actions: Array) -> State:
         following = model.step(state, action)
         return following, following
 
-    _, states = jax.lax.scan(jax.checkpoint(advance, prevent_cse=False), state, in_time)
+    keep = jax.checkpoint_policies.save_only_these_names(SOLVED)
+    again = jax.checkpoint(advance, prevent_cse=False, policy=keep)
+    _, states = jax.lax.scan(again, state, in_time)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states) if batched else states
 
 

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from palpate.models.planar_friction import STICTION
 from palpate.models.planar_geometry import Shapes, nearest, pick
 
+SLOWEST = 5e-4  # m/s: friction of a contact that slides more slowly is viscous
 STIFFNESS = 3e3  # of a contact, in the mass it feels
 SLOTS = 3  # pairs of parts that a step looks at for each body
 SOFT_APPROACH = 0.02  # m/s: slower impacts do not bounce, twice as fast ones in full
@@ -206,5 +206,5 @@ def size(speed: Array) -> Array:
 def remaining(speed: Array, taken: Array) -> Array:
     """What is left of a speed (m/s) from which some is taken, smoothly, and at least a little."""
     left = speed - taken
-    left = 0.5 * (left + jnp.sqrt(jnp.square(left) + 4.0 * STICTION**2))
-    return jnp.sqrt(jnp.square(left) + STICTION**2)
+    left = 0.5 * (left + jnp.sqrt(jnp.square(left) + 4.0 * SLOWEST**2))
+    return jnp.sqrt(jnp.square(left) + SLOWEST**2)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-STICTION = 5e-4  # m/s: what sticks creeps no faster
+STICTION = 5e-3  # m/s: what sticks creeps no faster
 
 # A body's velocity along its own axes and its turning, or what belongs to it; one array for each:
 # components side by side would be cut out and put together again in every derivative.

@@ -22,9 +22,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from palpate.models import planar_contact
+from palpate.models.model import SOLVED
 from palpate.models.planar_contact import Contacts
 from palpate.models.planar_friction import (
     Entries,
@@ -130,10 +132,13 @@ def advance(
 def solve_velocity(resisting: Resistance, free: Triple, links: Rows, iterations: int) -> Triple:
     """Velocity at the end of a step without contacts; `free` is the velocity without resistance."""
     fixed = jax.lax.stop_gradient((resisting, links))
-    velocity = jax.lax.stop_gradient(free)
-    for _ in range(iterations):
-        velocity = newton(*fixed, velocity)
-    velocity = held_back(*fixed, velocity)
+    # a loop, as in each search: written out it compiles for twice as long and runs slower
+    velocity, _ = jax.lax.scan(
+        lambda velocity, _: (newton(*fixed, velocity), None),
+        jax.lax.stop_gradient(free),
+        length=iterations,
+    )
+    velocity = jax.tree.map(lambda part: checkpoint_name(part, SOLVED), held_back(*fixed, velocity))
     # the slope is zero and stays so: its derivative says how the velocity follows what it is of
     left = leftover(resisting, links, velocity)
     change = tuple(part - jax.lax.stop_gradient(part) for part in left)
@@ -159,7 +164,6 @@ def solve_contacts(
         rows = joined._replace(weight=jnp.concatenate([links.weight, touching]))
         return newton(resisting, rows, velocity), touching
 
-    # a loop, and not written out: derivatives of what is written out take minutes to compile
     carry, _ = jax.lax.scan(
         lambda carry, _: (iterate(*carry), None),
         iterate(velocity, None),
@@ -220,12 +224,13 @@ def step_length(
         return -total(jnp.sum(weight * (a * by_first + b * by_second), axis=1))
 
     zero = jnp.zeros_like(straight)
-    low, high = zero, zero + 1.0
     fall = -total(dot(left, step))
     steady = fall - taken(zero)  # of what is quadratic, at the velocity
-    below, above = fall, steady + straight + taken(high)
+    below, above = fall, steady + straight + taken(zero + 1.0)
     whole = above <= 0.0
-    for _ in range(SEARCHES):
+
+    def look(ends: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], Array]:
+        low, below, high, above = ends
         secant = -below / jnp.where(above > below, above - below, 1.0)
         share = low + (high - low) * jnp.clip(secant, 0.05, 0.95)
         found = steady + share * straight + taken(share)
@@ -233,7 +238,10 @@ def step_length(
         # the slope jumps where something comes to rest: an end that stays counts for half
         low, below = jnp.where(rising, low, share), jnp.where(rising, 0.5 * below, found)
         high, above = jnp.where(rising, share, high), jnp.where(rising, found, 0.5 * above)
-    return jnp.where(whole, 1.0, share)
+        return (low, below, high, above), share
+
+    _, shares = jax.lax.scan(look, (zero, below, zero + 1.0, above), length=SEARCHES)
+    return jnp.where(whole, 1.0, shares[-1])
 
 
 def leftover(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:

@@ -124,6 +124,7 @@ COMMANDS = {
                 "namo-scaling",
                 "namo-online",
                 "calibration",
+                "one-shot",
                 "cart-online",
             ),
             "palpate.experiments.options:Reproduce",

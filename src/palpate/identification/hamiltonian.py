@@ -27,7 +27,7 @@ BLOCK = 50  # draws between two looks at the chains: one compiled piece of work
 WARM_UP = 4  # blocks
 LEARNED = 2  # from this block of the warm-up on the metric is learnt from the draws of the last
 ACCEPTANCE = 0.8
-DOUBLINGS = 5
+DOUBLINGS = 6
 GAIN = 0.15  # of the step size's logarithm per draw, at first; falls as the root of the draws
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]  # position, density and slope of each chain

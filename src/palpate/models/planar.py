@@ -181,8 +181,10 @@ class Planar(Model):
         return state.pose
 
     def difference(
-        self, predicted: Float[Array, "*batch bodies 3"], observed: Float[Array, "*batch bodies 3"]
-    ) -> Float[Array, "*batch bodies 3"]:
+        self,
+        predicted: Float[Array, "*#batch bodies 3"],
+        observed: Float[Array, "*#batch bodies 3"],
+    ) -> Float[Array, "*_ bodies 3"]:
         """Predicted minus observed poses, angles between -pi and pi."""
         off = predicted - observed
         return off.at[..., 2].set(wrapped(off[..., 2]))

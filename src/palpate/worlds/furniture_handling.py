@@ -91,6 +91,18 @@ class Wiggle(Hand):
         return wrenches
 
 
+class Together(Hand):
+    """Several hands at the same time, each with a piece of its own."""
+
+    def __init__(self, hands: Sequence[Hand]):
+        self._hands = tuple(hands)
+        self.steps = max(hand.steps for hand in self._hands)
+
+    def wrench(self, step: int, truth: FurnitureTruth) -> np.ndarray:
+        busy = [hand.wrench(step, truth) for hand in self._hands if step < hand.steps]
+        return np.sum(busy, axis=0)
+
+
 class Push(Hand):
     """One push from rest: a wrench that is constant or rises and falls as a half sine.
 

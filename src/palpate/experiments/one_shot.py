@@ -1,0 +1,292 @@
+"""`palpate reproduce one-shot`: ten seconds of handling, then pushes that nobody has seen.
+
+Each kind of furniture of the MuJoCo world is wiggled for ten seconds. From poses and wrenches alone
+palpate finds out what a piece most probably is (on a wheel, on feet, hinged, bolted down), samples
+the posterior of its parameters, and predicts pushes of two seconds open loop. Beside it regressions
+after 1 to 100 samples, mujoco.sysid which is told the structure, other samplers of the same
+posterior, and five pieces in one scene fitted jointly.
+
+Each stage is a run in a folder below `out`, and resumes there.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.experiments import one_shot_sysid
+from palpate.experiments.furniture_recording import POSE, WRENCH, starting_furniture
+from palpate.experiments.identify_bayesian import posterior_of
+from palpate.experiments.one_shot_figure import shares_figure
+from palpate.experiments.one_shot_pieces import (
+    BOLTED,
+    HANDLED,
+    MOVABLE,
+    PERIOD,
+    SCENE,
+    error_share,
+    fit,
+    fit_jointly,
+    judged,
+    pushes_of,
+    recordings,
+    scene,
+)
+from palpate.experiments.one_shot_regression import OURS, RIVALS, SIZES, shares
+from palpate.experiments.one_shot_sampling import OURS as NUTS
+from palpate.experiments.one_shot_sampling import Pace, race
+from palpate.identification.bayesian import sample
+from palpate.result import Figure, Result
+from palpate.runs import RESULT, Run, progress
+from palpate.storage import read_json
+from palpate.worlds.furniture import FurnitureWorld
+from palpate.worlds.furniture_pieces import KINDS, Piece
+
+NAME = "one-shot"
+FIGURE = "shares.png"
+SEEDS = 910_000  # of hidden constants, handling and pushes, used by nothing else
+RACED = "couch"  # whose posterior the samplers race on
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """How much of everything: pieces of each kind, pushes of each, draws of each chain."""
+
+    pieces: int
+    pushes: int
+    draws: int
+    compared_draws: int
+    scene_draws: int
+    scene_pushes: int  # of each piece
+    raced_draws: int
+    budget: float  # s, of each rival sampler
+    minutes: dict[str, int] = dataclasses.field(default_factory=dict)
+
+
+FULL = Size(
+    2, 10, 300, 100, 150, 6, 800, 60.0, {"pieces": 25, "samples": 25, "samplers": 5, "scene": 15}
+)
+QUICK = Size(1, 4, 100, 50, 50, 2, 100, 5.0, {"pieces": 4, "samples": 2, "samplers": 1})
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Handle, identify and push every kind below `out`; `quick` is the same, smaller.
+
+    Raises `PalpateError` when `out` holds another run's stages.
+    """
+    size = QUICK if quick else FULL
+    parts = ", ".join(f"{stage} {time}" for stage, time in size.minutes.items())
+    total = sum(size.minutes.values())
+    print(f"{NAME}: about {total} minutes on two cores ({parts})", flush=True)
+    one_shot_sysid.mujoco_sysid()  # an hour later would be late to say that it is missing
+    movable = ("cart", "couch") if quick else MOVABLE
+    first = SEEDS + 1000 * seed
+    pieces = {
+        kind: [_piece(out, kind, first + number, size) for number in range(size.pieces)]
+        for kind in progress((*movable, BOLTED), "handling, identifying and pushing")
+    }
+    compared = {
+        kind: _compared(out, kind, first, size) for kind in progress(movable, "sample sizes")
+    }
+    told = {kind: _told(out, kind, first, size) for kind in progress(movable, "mujoco.sysid")}
+    raced = _raced(out, first, size)
+    joint = None if quick else _joint(out, first, size)
+    stages = [stage for of in pieces.values() for stage in of]
+    stages += [*compared.values(), *told.values(), raced, *([joint] if joint else [])]
+    shares_figure(out / FIGURE, compared)
+    return Result(
+        NAME,
+        _figures(pieces, compared, told, raced, joint),
+        {
+            "quick": quick,
+            "handled_s": HANDLED,
+            "sizes": SIZES,
+            **{name: value for name, value in vars(size).items() if name != "minutes"},
+        },
+        [seed],
+        {
+            "fitted": f"{HANDLED:g} s of handling of each piece, seeds from {first}",
+            "evaluated": f"{size.pushes} pushes of 2 s of the same pieces from rest",
+        },
+        sum(stage["wall_time_s"] for stage in stages),
+    )
+
+
+def _stage(path: Path, configuration: dict[str, Any], work: Callable[[], dict]) -> dict[str, Any]:
+    """What a stage found, from its run if that is finished."""
+    with Run.open(path, configuration) as run:
+        if not run.finished:
+            content = work()
+            run.finish({"name": f"{NAME} {path.name}", "wall_time_s": run.elapsed, **content})
+    return read_json(path / RESULT)
+
+
+def _piece(out: Path, kind: str, seed: int, size: Size) -> dict[str, Any]:
+    """One piece: its structure and posterior, and what they say of pushes."""
+
+    def work() -> dict[str, Any]:
+        handled, pushes = recordings(kind, seed, size.pushes)
+        found, seconds = fit(handled, size.draws, seed)
+        model = found.posterior.target.coordinates.reference
+        asked = pushes_of(pushes, model)
+        result = judged(model, found.posterior.predict(asked), asked)
+        return {
+            **result.to_dict(),
+            "structure": found.structure,
+            "probability": found.probability,
+            "rhat": found.posterior.rhat_of_predictions,
+            "ess": found.posterior.size_of_predictions,
+            "divergences": found.posterior.draws.divergences,
+            "fit_s": seconds,
+            "sampling_s": found.posterior.draws.seconds,
+        }
+
+    stage = {"stage": "piece", "kind": kind, "seed": seed, "pushes": size.pushes}
+    return _stage(out / f"{kind}-{seed}", stage | {"draws": size.draws}, work)
+
+
+def _compared(out: Path, kind: str, seed: int, size: Size) -> dict[str, Any]:
+    """One piece after growing numbers of samples, beside regressions."""
+
+    def work() -> dict[str, Any]:
+        handled, pushes = recordings(kind, seed, size.pushes)
+        found = shares(handled, pushes, size.compared_draws, seed)
+        return {"shares": {name: {str(n): v for n, v in of.items()} for name, of in found.items()}}
+
+    stage = {"stage": "samples", "kind": kind, "seed": seed, "pushes": size.pushes}
+    return _stage(out / f"samples-{kind}", stage | {"draws": size.compared_draws}, work)
+
+
+def _told(out: Path, kind: str, seed: int, size: Size) -> dict[str, Any]:
+    """mujoco.sysid on the first piece of a kind, which is told all but constants."""
+
+    def work() -> dict[str, Any]:
+        handled, pushes = recordings(kind, seed, size.pushes)
+        world = FurnitureWorld([Piece(kind)])
+        world.reset(seed)
+        truth = world.truth().parameters[0]
+        fitted = one_shot_sysid.fit_scene(handled, KINDS[kind], truth.locked, truth.anchor, seed)
+        asked = pushes_of(pushes, starting_furniture(handled, PERIOD))
+        motion = one_shot_sysid.predict_pieces(fitted, asked)
+        target, start = np.asarray(asked.target), np.asarray(asked.pose)
+        return {
+            "error_m": np.linalg.norm((motion - target)[:, -1, 0, :2], axis=-1).tolist(),
+            "displacement_m": np.linalg.norm((target[:, -1] - start)[:, 0, :2], axis=-1).tolist(),
+            "converged": fitted.converged,
+        }
+
+    stage = {"stage": "sysid", "kind": kind, "seed": seed, "pushes": size.pushes}
+    return _stage(out / f"sysid-{kind}", stage, work)
+
+
+def _raced(out: Path, seed: int, size: Size) -> dict[str, Any]:
+    """The samplers on the posterior of a couch."""
+
+    def work() -> dict[str, Any]:
+        handled, _ = recordings(RACED, seed, 1)
+        model = starting_furniture(handled, PERIOD)
+        target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
+        posterior = sample(target, draws=size.raced_draws, seed=seed)
+        paces = race(posterior, seed, size.budget)
+        parameters = posterior.target.parameters
+        return {
+            "parameters": parameters,
+            "compiling_s": posterior.draws.compiling,
+            "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
+        }
+
+    stage = {"stage": "samplers", "kind": RACED, "seed": seed, "draws": size.raced_draws}
+    return _stage(out / "samplers", stage | {"budget_s": size.budget}, work)
+
+
+def _joint(out: Path, seed: int, size: Size) -> dict[str, Any]:
+    """Five pieces in one scene, fitted together from ten seconds in which all are handled."""
+
+    def work() -> dict[str, Any]:
+        handled, pushes = scene(seed, size.scene_pushes)
+        posterior = fit_jointly(handled, size.scene_draws, seed)
+        model = posterior.target.coordinates.reference
+        asked = pushes_of(pushes, model)
+        result = judged(model, posterior.predict(asked), asked)
+        return {
+            **result.to_dict(),
+            "rhat": posterior.rhat_of_predictions,
+            "ess": posterior.size_of_predictions,
+            "sampling_s": posterior.draws.seconds,
+        }
+
+    stage = {"stage": "scene", "kinds": SCENE, "seed": seed, "pushes": size.scene_pushes}
+    return _stage(out / "scene", stage | {"draws": size.scene_draws}, work)
+
+
+def _figures(
+    pieces: dict[str, list[dict[str, Any]]],
+    compared: dict[str, dict[str, Any]],
+    told: dict[str, dict[str, Any]],
+    raced: dict[str, Any],
+    joint: dict[str, Any] | None,
+) -> list[Figure]:
+    movable = {kind: of for kind, of in pieces.items() if kind != BOLTED}
+    each = {kind: pooled(of) for kind, of in movable.items()}
+    every = [stage for of in movable.values() for stage in of]
+    inside = [stage["inside"] for stage in every]
+    paces = {name: Pace(**pace) for name, pace in raced["paces"].items()}
+    wins, cells = victories(compared)
+    figures = [
+        Figure("error_share", pooled(every), "", bar=0.05, seed_document="one-shot learning",
+               spread=deviation([pooled([stage]) for stage in every])),
+        Figure("error_share_worst_kind", max(each.values()), "", bar=0.2),
+        Figure("bolted_drift_cm", 100.0 * max(stage["drift_m"] for stage in pieces[BOLTED]), "cm",
+               bar=1.0),
+        Figure("coverage_90", float(np.mean(inside)), "", bar=0.85, better="higher",
+               spread=deviation(inside)),
+        Figure("coverage_90_over", float(np.mean(inside)), "", bar=0.95),
+        Figure("wins_against_regression", wins / cells, "", bar=0.9, better="higher"),
+        Figure("rhat_max_predictions", paces[NUTS].rhat, "", bar=1.01),
+        Figure("ess_min", paces[NUTS].size, "", bar=400, better="higher"),
+        Figure("sampling_s", paces[NUTS].seconds + raced["compiling_s"], "s", bar=60),
+        Figure("ess_per_s_over_metropolis", paces[NUTS].rate / paces["metropolis"].rate, "",
+               bar=20, better="higher"),
+        Figure("ess_per_s_over_adapted", paces[NUTS].rate / paces["adapted"].rate, "", bar=1,
+               better="higher"),
+    ]  # fmt: skip
+    if joint is not None:
+        share = error_share(np.array(joint["error_m"]), np.array(joint["displacement_m"]))
+        figures += [
+            Figure("scene.coverage_90", joint["inside"], "", bar=0.85, better="higher"),
+            Figure("scene.error_share", share, ""),
+        ]
+    figures += [Figure(f"error_share.{kind}", share, "") for kind, share in each.items()]
+    figures += [
+        Figure(f"coverage_90.{kind}", float(np.mean([stage["inside"] for stage in of])), "")
+        for kind, of in pieces.items()
+    ]
+    figures += [
+        Figure(f"error_share_of_sysid.{kind}", pooled([stage]), "") for kind, stage in told.items()
+    ]
+    figures.append(Figure("rhat_worst_piece", max(s["rhat"] for s in every), ""))
+    figures.append(Figure("ess_worst_piece", min(s["ess"] for s in every), "", better="higher"))
+    return figures
+
+
+def pooled(stages: list[dict[str, Any]]) -> float:
+    """Error share over all pushes of these pieces."""
+    error = np.concatenate([stage["error_m"] for stage in stages])
+    return error_share(error, np.concatenate([stage["displacement_m"] for stage in stages]))
+
+
+def victories(compared: dict[str, dict[str, Any]]) -> tuple[int, int]:
+    """In how many cells of kind and number of samples no regression has a smaller error share."""
+    wins = cells = 0
+    for stage in compared.values():
+        for size, ours in stage["shares"][OURS].items():
+            cells += 1
+            wins += ours < min(stage["shares"][rival][size] for rival in RIVALS)
+    return wins, cells
+
+
+def deviation(values: list[float]) -> float:
+    """Two standard errors of a mean; zero of one value, which says nothing of its spread."""
+    return float(2.0 * np.std(values) / np.sqrt(len(values)))

@@ -1,0 +1,129 @@
+"""After how many samples which method knows how a piece moves: ours beside regressions.
+
+A sample is a tenth of a second of handling: pose and velocity before and after, smoothed from what
+a tracker shows, and the mean wrench between. The first n samples of the same handling are given to
+all; pushes of 2 s are then predicted open loop. Regressions get the inputs that suit them: raw as
+in the deck (whole state, whole wrench) and in the piece's own axes, and of both the better on these
+very pushes counts.
+"""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from palpate.experiments.furniture_recording import (
+    POSE,
+    WRENCH,
+    names_of,
+    starting_furniture,
+)
+from palpate.experiments.one_shot_pieces import (
+    PERIOD,
+    error_share,
+    judged,
+    pushes_of,
+)
+from palpate.experiments.planar_features import body_features, raw_features
+from palpate.identification.bayesian import sample
+from palpate.identification.likelihood import inferred_scales, motion_posterior
+from palpate.identification.regression_model import RegressedModel, regressed
+from palpate.identification.segments import Segments, cut, noise_scale
+from palpate.models.model import rollout
+from palpate.models.planar import Planar, PlanarState
+from palpate.recording import Aligned, Recording
+
+SAMPLE = 0.1  # s
+SIZES = (1, 2, 5, 10, 20, 50, 100)
+PIECE = 10  # samples: longest piece of the handling that the posterior is asked to explain
+RIVALS = ("lwr", "oo-lwr", "gp")
+OURS = "posterior"
+
+
+def shares(
+    handled: Recording, pushes: Recording, draws: int, seed: int
+) -> dict[str, dict[int, float]]:
+    """Error share on the pushes by method and number of samples."""
+    aligned = handled.align(PERIOD, POSE, WRENCH)
+    found: dict[str, dict[int, float]] = {name: {} for name in (OURS, *RIVALS)}
+    for size in SIZES:
+        found[OURS][size] = _ours(handled, aligned, pushes, size, draws, seed)
+        for rival in RIVALS:
+            found[rival][size] = _theirs(handled, aligned, pushes, rival, size)
+    return found
+
+
+def first_samples(aligned: Aligned, size: int) -> Aligned:
+    """The first `size` samples of a recording's first trial."""
+    steps = size * round(SAMPLE / aligned.period)
+    steps = min(steps, int(aligned.length[0]) - 1)
+    return Aligned(
+        aligned.period,
+        aligned.observation[:1, : steps + 1],
+        aligned.action[:1, :steps],
+        np.array([steps + 1]),
+    )
+
+
+def _ours(
+    handled: Recording,
+    aligned: Aligned,
+    pushes: Recording,
+    size: int,
+    draws: int,
+    seed: int,
+) -> float:
+    """Of the posterior given the samples; padded, so that all sizes compile once."""
+    model = starting_furniture(handled, PERIOD)
+    seconds = PIECE * SAMPLE
+    pieces = cut(
+        first_samples(aligned, size), model, seconds, at_rest=True, count=max(SIZES) // PIECE
+    )
+    scales = inferred_scales(model, noise_scale(aligned, model))
+    posterior = sample(motion_posterior(model, pieces, scales), draws=draws, seed=seed)
+    asked = pushes_of(pushes, model)
+    result = judged(model, posterior.predict(asked), asked)
+    return error_share(result.error, result.displacement)
+
+
+def _theirs(handled: Recording, aligned: Aligned, pushes: Recording, kind: str, size: int) -> float:
+    """Of the better of two choices of inputs; the object-oriented kind needs the piece's own."""
+    prototype = starting_furniture(handled, SAMPLE)
+    fine = starting_furniture(handled, PERIOD)
+    outline = np.asarray(json.loads(str(handled.provenance["outlines"]))[names_of(handled)[0]])
+    before, wrench, after = transitions(aligned, fine, size)
+    asked = pushes_of(pushes, fine)
+    choices = [body_features([outline])] + ([] if kind == "oo-lwr" else [raw_features()])
+    return min(
+        _share(regressed(prototype, features, kind, before, wrench, after), asked)
+        for features in choices
+    )
+
+
+def transitions(
+    aligned: Aligned, model: Planar, size: int
+) -> tuple[PlanarState, jax.Array, PlanarState]:
+    """States before the samples, mean wrenches, and states after; each leads with the samples.
+
+    The state after the last sample is smoothed over frames that follow it: what the regressions
+    see of those is more than the posterior does.
+    """
+    starts = cut(first_samples(aligned, size + 1), model, SAMPLE, at_rest=True)
+    states = PlanarState(starts.pose, starts.rate)
+    wrench = jnp.mean(starts.action, axis=1)
+    before = jax.tree.map(lambda leaf: leaf[:-1], states)
+    after = jax.tree.map(lambda leaf: leaf[1:], states)
+    return before, wrench[:-1], after
+
+
+def _share(model: RegressedModel, pushes: Segments) -> float:
+    """Error share of open-loop predictions, a sample's time a step; infinite where it diverges."""
+    every = round(SAMPLE / PERIOD)
+    action = pushes.action.reshape(pushes.count, -1, every, *pushes.action.shape[2:]).mean(axis=2)
+    states = rollout(model, PlanarState(pushes.pose, pushes.rate), action)
+    final, target = np.asarray(states.pose)[:, -1, 0, :2], np.asarray(pushes.target)[:, -1, 0, :2]
+    if not np.isfinite(final).all():
+        return float("inf")
+    displacement = target - np.asarray(pushes.pose)[:, 0, :2]
+    return error_share(np.linalg.norm(final - target, axis=1), np.linalg.norm(displacement, axis=1))

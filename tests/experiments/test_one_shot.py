@@ -1,0 +1,100 @@
+"""The parts of `reproduce one-shot` that count: what is judged, and against what."""
+
+import numpy as np
+import pytest
+
+from palpate.experiments import one_shot, one_shot_pieces
+from palpate.experiments.furniture_recording import POSE, WRENCH, starting_furniture
+from palpate.experiments.one_shot_figure import shares_figure
+from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
+from palpate.experiments.one_shot_regression import OURS, RIVALS, first_samples, transitions
+from palpate.identification.predictive import Predicted
+from palpate.worlds.furniture import FurnitureWorld, Piece
+from palpate.worlds.furniture_handling import Together, Wiggle, record, record_pushes
+
+KINDS = "cart", "chair"
+
+
+@pytest.fixture(scope="module")
+def pushes():
+    """Two pieces, each pushed once while the other stands."""
+    pieces = [Piece(kind, (0.0, 4.0 * row, 0.0)) for row, kind in enumerate(KINDS)]
+    return record_pushes(FurnitureWorld(pieces), seed=3, count=2)
+
+
+def predicted_with(asked, off, spread, draws=200):
+    """Draws about the truth, shifted by `off` in x, normal with the standard deviation `spread`."""
+    target = np.asarray(asked.target, float)
+    shift = np.zeros(3)
+    shift[0] = off
+    noise = np.random.default_rng(0).normal(size=(draws, *target.shape)) * spread
+    motion = np.broadcast_to(target + shift, noise.shape)
+    return Predicted(motion, motion + noise, np.full(noise.shape, spread))
+
+
+def test_only_what_was_pushed_is_judged(pushes):
+    model = starting_furniture(pushes, PERIOD)
+    asked = pushes_of(pushes, model)
+    found = judged(model, predicted_with(asked, 0.1, 0.05), asked)
+    np.testing.assert_allclose(found.error, 0.1, rtol=1e-5)
+    assert found.error.shape == found.displacement.shape == (2,)
+    moved = np.asarray(asked.target[:, -1] - asked.pose)[[0, 1], [0, 1], :2]
+    np.testing.assert_allclose(found.displacement, np.linalg.norm(moved, axis=1), rtol=1e-5)
+    assert found.displacement.min() > 0.1
+    # two standard deviations off in x of three channels: there the interval misses
+    assert found.inside == pytest.approx(2 / 3, abs=0.01)
+    assert judged(model, predicted_with(asked, 0.0, 0.05), asked).inside == 1.0
+    assert found.drift == pytest.approx(np.linalg.norm(moved, axis=1).max(), abs=0.12)
+
+
+def test_shares_are_pooled_over_pushes_and_not_averaged():
+    stages = [
+        {"error_m": [0.1], "displacement_m": [1.0]},
+        {"error_m": [0.1], "displacement_m": [0.1]},
+    ]
+    assert one_shot.pooled(stages) == pytest.approx(0.02 / 1.01)
+    assert error_share(np.array([0.3, 0.4]), np.array([0.0, 5.0])) == pytest.approx(0.01)
+
+
+def test_a_cell_is_won_against_the_best_regression():
+    shares = {OURS: {"1": 0.2, "2": 0.1}, **{of: {"1": 0.3, "2": 0.3} for of in RIVALS}}
+    shares[RIVALS[1]] = {"1": 0.19, "2": float("inf")}
+    assert one_shot.victories({"cart": {"shares": shares}}) == (1, 2)
+
+
+def test_the_figure_shows_every_kind_and_bears_what_diverged(tmp_path):
+    shares = {name: {"1": 0.5, "2": float("inf"), "5": 0.01} for name in (OURS, *RIVALS)}
+    shares_figure(tmp_path / "shares.png", {of: {"shares": shares} for of in "abcd"})
+    assert (tmp_path / "shares.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_scene_is_handled_all_at_once_and_can_be_taken_apart():
+    pieces = [Piece(kind, (0.0, 4.0 * row, 0.0)) for row, kind in enumerate(KINDS)]
+    hands = Together([Wiggle(3, 0, 1.0), Wiggle(3, 1, 1.5)])
+    handled = record(FurnitureWorld(pieces), [hands], 3, ["all"])
+    wrench = handled.trials[0][WRENCH].values
+    assert len(wrench) == 75
+    assert np.abs(wrench[10:50]).max(axis=(0, 2)).min() > 1.0
+    assert np.abs(wrench[50:, 1]).max() > 1.0 > np.abs(wrench[51:, 0]).max()
+    alone = one_shot_pieces._alone(handled, 1)
+    np.testing.assert_array_equal(
+        alone.trials[0][POSE].values[:, 0], handled.trials[0][POSE].values[:, 1]
+    )
+    model, whole = starting_furniture(alone, PERIOD), starting_furniture(handled, PERIOD)
+    np.testing.assert_array_equal(model.half_extent[0], whole.half_extent[1])
+
+
+def test_regressions_see_the_states_between_which_a_sample_lies(pushes):
+    model = starting_furniture(pushes, PERIOD)
+    aligned = pushes.align(PERIOD, POSE, WRENCH)
+    before, wrench, after = transitions(aligned, model, 10)
+    assert wrench.shape == (10, 2, 3)
+    truth = np.asarray(aligned.observation[0])
+    np.testing.assert_allclose(before.pose, truth[0:50:5], atol=0.01)
+    np.testing.assert_allclose(after.pose, truth[5:55:5], atol=0.01)
+    np.testing.assert_allclose(
+        wrench[3], np.asarray(aligned.action[0])[15:20].mean(axis=0), rtol=1e-5
+    )
+    rate = (after.pose - before.pose) / 0.1
+    np.testing.assert_allclose(0.5 * (before.velocity + after.velocity), rate, atol=0.05)
+    assert first_samples(aligned, 4).observation.shape[1] == 21

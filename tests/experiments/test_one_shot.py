@@ -84,17 +84,22 @@ def test_a_scene_is_handled_all_at_once_and_can_be_taken_apart():
     np.testing.assert_array_equal(model.half_extent[0], whole.half_extent[1])
 
 
-def test_regressions_see_the_states_between_which_a_sample_lies(pushes):
+def test_samples_count_from_where_the_piece_is_seen_to_have_moved(pushes):
     model = starting_furniture(pushes, PERIOD)
     aligned = pushes.align(PERIOD, POSE, WRENCH)
-    before, wrench, after = transitions(aligned, model, 10)
-    assert wrench.shape == (10, 2, 3)
     truth = np.asarray(aligned.observation[0])
-    np.testing.assert_allclose(before.pose, truth[0:50:5], atol=0.01)
-    np.testing.assert_allclose(after.pose, truth[5:55:5], atol=0.01)
-    np.testing.assert_allclose(
-        wrench[3], np.asarray(aligned.action[0])[15:20].mean(axis=0), rtol=1e-5
-    )
+    kept = first_samples(aligned, 1)
+    assert kept.observation.shape[1] == kept.action.shape[1] + 1 == int(kept.length[0])
+    moved = np.linalg.norm(kept.observation[0, :, 0, :2] - truth[0, 0, :2], axis=-1)
+    assert moved[:-6].max() < 0.02 < moved[-6:].max()
+    assert len(first_samples(aligned, 3).observation[0]) == len(kept.observation[0]) + 10
+    assert len(first_samples(aligned, 1000).observation[0]) == len(truth)
+    before, wrench, after = transitions(aligned, model, 5)
+    count = len(wrench)
+    assert count == (len(kept.observation[0]) - 1) // 5 + 4
+    np.testing.assert_allclose(before.pose, truth[0 : 5 * count : 5], atol=0.01)
+    np.testing.assert_allclose(after.pose, truth[5 : 5 * count + 5 : 5], atol=0.01)
+    mean = np.asarray(aligned.action[0])[5:10].mean(axis=0)
+    np.testing.assert_allclose(wrench[1], mean, rtol=1e-5)
     rate = (after.pose - before.pose) / 0.1
     np.testing.assert_allclose(0.5 * (before.velocity + after.velocity), rate, atol=0.05)
-    assert first_samples(aligned, 4).observation.shape[1] == 21

@@ -1,8 +1,9 @@
 """After how many samples which method knows how a piece moves: ours beside regressions.
 
 A sample is a tenth of a second of handling: pose and velocity before and after, smoothed from what
-a tracker shows, and the mean wrench between. The first n samples of the same handling are given to
-all; pushes of 2 s are then predicted open loop. Regressions get the inputs that suit them: raw as
+a tracker shows, and the mean wrench between. All are given the same handling up to n samples after
+the piece is first seen to have moved, before which nobody could know how it does; pushes of 2 s are
+then predicted open loop. Regressions get the inputs that suit them: raw as
 in the deck (whole state, whole wrench) and in the piece's own axes, and of both the better on these
 very pushes counts.
 """
@@ -36,6 +37,7 @@ from palpate.recording import Aligned, Recording
 
 SAMPLE = 0.1  # s
 SIZES = (1, 2, 5, 10, 20, 50, 100)
+MOVED = 0.02  # m: beyond any noise
 PIECE = 10  # samples: longest piece of the handling that the posterior is asked to explain
 RIVALS = ("lwr", "oo-lwr", "gp")
 OURS = "posterior"
@@ -55,9 +57,12 @@ def shares(
 
 
 def first_samples(aligned: Aligned, size: int) -> Aligned:
-    """The first `size` samples of a recording's first trial."""
-    steps = size * round(SAMPLE / aligned.period)
-    steps = min(steps, int(aligned.length[0]) - 1)
+    """A recording's first trial up to `size` samples after its one body has first moved."""
+    each, last = round(SAMPLE / aligned.period), int(aligned.length[0]) - 1
+    way = aligned.observation[0, : last + 1, 0, :2]
+    far = np.linalg.norm(way - way[0], axis=-1) > MOVED
+    begun = int(np.argmax(far)) if far.any() else 0
+    steps = min(each * (begun // each + size), last)
     return Aligned(
         aligned.period,
         aligned.observation[:1, : steps + 1],

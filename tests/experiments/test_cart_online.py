@@ -39,6 +39,7 @@ from palpate.identification.segments import Segments
 from palpate.models.planar import Planar, PlanarState
 from palpate.planning.sampling import SamplingPlanner
 from palpate.worlds.furniture import KINDS
+from palpate.worlds.furniture_pieces import draw_parameters
 
 TASKS = [shopping_cart(), apartment()]
 SMALL = Planning(samples=4, knots=3, spacing=1)
@@ -101,6 +102,20 @@ def test_a_wrench_acts_on_the_piece_that_is_held_at_its_handle():
     np.testing.assert_allclose(twist[1], [0, 0, task.strength[1, 2]], atol=1e-4)
     many = handled.wrench(jnp.stack([pose, pose]), jnp.stack([action, action]))
     np.testing.assert_allclose(many[1], wrench, atol=1e-4)
+
+
+def test_whatever_its_hidden_constants_the_force_on_a_table_drags_its_locked_caster():
+    """A push along the table at its middle that is held straight."""
+    task = apartment()
+    force, _, torque = task.strength[0]
+    for seed in range(200):
+        hidden = draw_parameters(KINDS["table"], np.random.default_rng(seed))
+        mounts = np.array([mount.place for mount in KINDS["table"].mounts])
+        locked = next(i for i, angle in enumerate(hidden.locked) if angle is not None)
+        centre = KINDS["table"].load_fraction * np.array(hidden.load_place)
+        share = np.prod(1 + centre * mounts[locked] / mounts[locked] ** 2) / 4
+        drag = hidden.friction * hidden.mass * 9.81 * share
+        assert (drag / force) ** 2 + (drag * abs(mounts[locked, 1]) / torque) ** 2 < 1
 
 
 def test_the_scene_has_the_parameters_of_its_pieces_and_the_contacts_of_the_one_held():
@@ -191,6 +206,47 @@ def test_a_regression_is_asked_once_its_piece_was_held():
     assert np.abs(predicted.pose - last.after.pose).max() < 0.2
 
 
+def pushed_chair(task, x: float, way: float, force: float) -> Decision:
+    """A decision in which the chair stands at x, is pushed along the room and goes that way."""
+    before = np.array(task.goals)
+    before[2] = x, -1.0, 0.0
+    after = before + np.array([[0], [0], [way]]) * [1, 0, 0]
+    wrench = np.zeros((3, 3))
+    wrench[2, 0] = force
+    still = jnp.zeros((3, 3))
+    old, new = (PlanarState(jnp.asarray(p, jnp.float32), still) for p in (before, after))
+    poses, wrenches = np.stack([after] * FRAMES), np.stack([wrench] * FRAMES)
+    moved, touched = np.array([False, False, True]), np.zeros(3, bool)
+    return Decision(poses, wrenches, old, new, wrench, 2, moved, touched)
+
+
+def test_of_two_regressions_only_the_one_of_contact_conditions_knows_what_a_wall_stops():
+    """The same push moves a chair that stands free and none at the wall, 10 mm away."""
+    task = apartment()
+    at_wall = task.room[0] / 2 - 0.32 - 0.01
+    forces = np.linspace(10.0, 20.0, 6)
+    free = [pushed_chair(task, 0.5, 0.1, force) for force in forces]
+    stopped = [pushed_chair(task, at_wall, 0.0, force) for force in forces]
+
+    def ways(kind: str, seen: list[Decision]) -> list[float]:
+        agent = RegressionAgent(task, kind, 16)
+        episode = Episode(task.goals)
+        for one in seen:
+            episode.decisions.append(one)
+            agent.learn([episode])
+        model = agent.believed(2)
+        assert model is not None
+        asked = pushed_chair(task, 0.5, 0.0, 15.0), pushed_chair(task, at_wall, 0.0, 15.0)
+        after = [model.step(one.before, jnp.asarray(one.wrench, jnp.float32)) for one in asked]
+        return [
+            float((a.pose - one.before.pose)[2, 0]) for a, one in zip(after, asked, strict=True)
+        ]
+
+    np.testing.assert_allclose(ways("oo-lwr", free[:5] + stopped[:5]), [0.1, 0.0], atol=5e-3)
+    np.testing.assert_allclose(ways("lwr", free[:5] + stopped[:5]), [0.05, 0.05], atol=0.02)
+    assert ways("oo-lwr", free) == ways("lwr", free)  # of a contact never seen nothing is known
+
+
 def test_a_planner_is_asked_for_what_is_believed(monkeypatch):
     """With a model the action comes from the planner, kept from one decision to the next."""
     asked = []
@@ -214,7 +270,7 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
     updates, kept = [], []
 
     class Posterior:
-        def __init__(self, model, seed):
+        def __init__(self, model, seed, told):
             self.model, self.mass = model, 10.0
 
         def keep(self, stretches):
@@ -263,12 +319,35 @@ def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
     assert 0.4 < kept.mean() < 1.0
 
 
+def test_who_is_told_a_model_climbs_from_it_first(monkeypatch):
+    """From the hidden constants themselves, as a planar model has them."""
+    begun, task = [], apartment()
+
+    def climb(target, start, steps):
+        begun.append(target.model(start[0]))
+        return SimpleNamespace(position=start)
+
+    monkeypatch.setattr(cart_agents, "climb", climb)
+    trial = Trial(task, Knowing(None), SMALL, 3)
+    trial.decide()
+    told, truth = cart_trials._told(task, 3), trial._world.truth()
+    PiecePosterior(piece_model(task, 0), 0, told[0]).update(trial.episodes[0].handling(0))
+    hidden = truth.parameters[0]
+    locked = next(i for i, angle in enumerate(hidden.locked) if angle is not None)
+    place = begun[0].wheel_position[0, 0] * begun[0].half_extent[0]
+    np.testing.assert_allclose(begun[0].mass, hidden.mass, rtol=1e-4)
+    np.testing.assert_allclose(place, truth.wheel_places[0][locked], atol=1e-4)
+    np.testing.assert_allclose(told[1].floor_friction, truth.parameters[1].friction, rtol=1e-5)
+    np.testing.assert_allclose(told[1].wheel_along, piece_model(task, 1).wheel_along)
+
+
 def test_the_best_scene_is_learnt_from_handling_and_from_other_starts(monkeypatch):
     seen, task = [], dataclasses.replace(shopping_cart(), episode=2)
     scene = scene_model(task, [piece_model(task, 0)])
 
     class Learner:
-        def __init__(self, task, seed, handled):
+        def __init__(self, task, seed, handled, told):
+            assert len(told) == len(handled)
             seen.append([len(stretches) for stretches in handled])
 
         def search(self, times):

@@ -20,7 +20,12 @@ from jaxtyping import Array, Float, Int
 from palpate.experiments.cart_tasks import DECISION, CartTask
 from palpate.experiments.planar_features import body_features
 from palpate.identification.laplace import climb
-from palpate.identification.likelihood import inferred_scales, motion_posterior
+from palpate.identification.likelihood import (
+    MotionPosterior,
+    inferred_scales,
+    initial_position,
+    motion_posterior,
+)
 from palpate.identification.regression import LocallyWeighted, locally_weighted
 from palpate.identification.regression_model import Features, RegressedModel
 from palpate.identification.segments import Segments, cut
@@ -202,10 +207,14 @@ def scene_model(task: CartTask, pieces: list[Planar]) -> Planar:
 
 
 class PiecePosterior:
-    """What handling has told of one piece: its motion, cut to pieces, and the posterior's modes."""
+    """What handling has told of one piece: its motion, cut to pieces, and the posterior's modes.
 
-    def __init__(self, model: Planar, seed: int):
+    The first climb begins at what is `told` of it, if anything, or at the prior's centre.
+    """
+
+    def __init__(self, model: Planar, seed: int, told: Planar | None = None):
         self.model = model
+        self._told = told
         self._key = jax.random.key(seed)
         self._kept: list[Segments] = []
         self._modes: Array | None = None
@@ -226,6 +235,8 @@ class PiecePosterior:
         target = motion_posterior(self.model, _telling(parts), scales)
         self._key, draw, choose = jax.random.split(self._key, 3)
         start = jax.random.normal(draw, (STARTS, target.dimension)).at[0].set(0.0)
+        if self._told is not None:
+            start = start.at[0].set(_position(target, self._told))
         if self._modes is not None:
             target = target.linearised(self._modes[0])
             # The last modes, and the best with some coordinates drawn anew: where sliding sets in
@@ -245,7 +256,7 @@ class PiecePosterior:
 class PhysicsAgent:
     """Physics-based RL: plans through the most probable planar model of every piece so far.
 
-    `handled` is what it saw of each piece before, if anything.
+    `handled` is what it saw of each piece before, if anything, and `told` where to look first.
     """
 
     def __init__(
@@ -253,10 +264,13 @@ class PhysicsAgent:
         task: CartTask,
         seed: int,
         handled: Sequence[list[tuple[Aligned, bool]]] = (),
+        told: Sequence[Planar] = (),
     ):
         self._task = task
-        bodies = range(len(task.kinds))
-        self._pieces = [PiecePosterior(piece_model(task, b), 100 * seed + b) for b in bodies]
+        self._pieces = [
+            PiecePosterior(piece_model(task, body), 100 * seed + body, told[body] if told else None)
+            for body in range(len(task.kinds))
+        ]
         self._models = [piece.model for piece in self._pieces]
         for piece, stretches in zip(self._pieces, handled, strict=False):
             piece.keep(stretches)
@@ -344,6 +358,12 @@ def _datum(features: Features, before: PlanarState, wrench: Array, after: Planar
     if features.condition is not None:
         condition = features.condition(before)
     return inputs, features.change(before, after), condition
+
+
+def _position(target: MotionPosterior, model: Planar) -> Array:
+    """Where a model is among the coordinates of a posterior, the scales at their medians."""
+    told = motion_posterior(model, target.segments, target.scales)
+    return initial_position(told)
 
 
 def _telling(parts: list[Segments]) -> Segments:

@@ -9,10 +9,12 @@ and a chair, all in the middle, are to be brought to their places at the walls, 
 
 A decision is held for 0.2 s: a wrench (two components of force, torque) on one piece, in the
 piece's axes when the decision is taken, within a ball of the kind's hand force and of half of that
-times its radius as torque. A cart is held at its handle, the middle of its rear edge, so that a
-force across it turns it; the other pieces at their centroid. The piece that is held is the first in
-order that is not yet within 0.15 m and 0.15 rad of its place, and is let go for the next after 4 s
-at the latest.
+times its radius as torque. The table takes 120 N, and not the 50 N of somebody who wiggles it: its
+locked caster holds with 20 to 90 N, and less could only turn the table about it, so that who knows
+how it rolls could do no better than who does not. A cart is held at its handle, the middle of its
+rear edge, so that a force across it turns it; the other pieces at their centroid. The piece that is
+held is the first in order that is not yet within 0.15 m and 0.15 rad of its place, and is let go
+for the next after 4 s at the latest.
 
 The reward of a decision, given at its end, is minus the mean over the pieces of the distance from
 the goal in metres plus half the error of heading in radians. An episode has 50 decisions in the
@@ -38,6 +40,7 @@ HEADING_WEIGHT = 0.5  # m/rad
 DONE = 0.15  # m or rad: a piece that is nearer is left alone
 TURN = 20  # decisions for which a piece is held at a stretch
 WALL = 0.2  # m thick
+FORCES = {"table": 120.0}  # N, of kinds for which the hand force is too little; see above
 CLEAR = 0.05  # m between pieces at a start
 
 
@@ -69,10 +72,9 @@ class CartTask:
     @property
     def strength(self) -> np.ndarray:
         """(bodies, 3): greatest force along and across (N) and torque (N m)."""
-        kinds = [KINDS[name] for name in self.kinds]
-        return np.array(
-            [[k.hand_force, k.hand_force, 0.5 * k.radius * k.hand_force] for k in kinds]
-        )
+        forces = np.array([FORCES.get(name, KINDS[name].hand_force) for name in self.kinds])
+        radii = np.array([KINDS[name].radius for name in self.kinds])
+        return np.stack([forces, forces, 0.5 * radii * forces], axis=1)
 
     @property
     def outlines(self) -> list[np.ndarray]:

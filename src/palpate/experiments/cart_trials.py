@@ -15,15 +15,18 @@ from palpate.experiments.cart_agents import (
     Episode,
     Handled,
     PhysicsAgent,
+    piece_model,
 )
 from palpate.experiments.cart_tasks import HEADING_WEIGHT, CartTask, Turns
 from palpate.models.model import Model
 from palpate.models.planar import Planar, PlanarState
 from palpate.models.planar_shapes import furniture
+from palpate.parameters import with_values
 from palpate.planning.sampling import Mppi, SamplingPlanner
 from palpate.recording import Aligned
 from palpate.worlds.furniture import CONTROL_PERIOD, FurnitureWorld, Piece
 from palpate.worlds.furniture_handling import record_handling
+from palpate.worlds.furniture_scene import GRAVITY
 
 ESTIMATED = 5  # frames that velocities are estimated from
 VISIBLE = 0.02  # m or rad, in a decision: what moves by more has moved
@@ -186,13 +189,45 @@ def best_scene(task: CartTask, planning: Planning, seed: int) -> Planar:
     Of the same pieces, of the same hidden parameters: as they stand apart, without walls, and each
     is wiggled for three times `HANDLED`; and as an agent that learnt from this brings them to
     their places for `PRACTISED` episodes of the task, from other starts than those that count.
+    The search begins at the hidden constants: from elsewhere it may end at a table that is too
+    heavy to be moved, is believed, and so never seen to move.
     """
-    agent = PhysicsAgent(task, seed, _wiggled(task, seed))
+    agent = PhysicsAgent(task, seed, _wiggled(task, seed), _told(task, seed))
     agent.search(SEARCHES)
     trial = Trial(task, agent, planning, seed, first_episode=PRACTICE)
     for _ in range(PRACTISED * task.episode):
         trial.decide()
     return agent.search(SEARCHES)
+
+
+def _told(task: CartTask, seed: int) -> list[Planar]:
+    """Each piece with the hidden constants that mean the same in a planar model."""
+    world = task.world()
+    world.reset(seed)
+    truth, pieces = world.truth(), []
+    for body, hidden in enumerate(truth.parameters):
+        piece = piece_model(task, body)
+        extent, centre = np.asarray(piece.half_extent)[0], truth.centres[body]
+        feet = all(mount.type == "foot" for mount in truth.kinds[body].mounts)
+        gyration = np.sqrt(truth.inertias[body] / hidden.mass) / np.asarray(piece.even_gyration)
+        values = {
+            "mass": [hidden.mass],
+            "centre_of_mass": [centre / extent],
+            "gyration": gyration,
+            "floor_friction": [hidden.friction if feet else hidden.rolling_resistance],
+        }
+        for place, angle in zip(truth.wheel_places[body], hidden.locked, strict=True):
+            if angle is not None:
+                share = np.prod(1 + centre * place / place**2) / 4  # of the weight, on this wheel
+                drag = hidden.friction * hidden.mass * GRAVITY * share
+                values |= {
+                    "wheel_position": [[place / extent]],
+                    "wheel_along": [[drag]],
+                    "wheel_across": [[drag]],
+                }
+        told = {path: jnp.asarray(value, piece.mass.dtype) for path, value in values.items()}
+        pieces.append(with_values(piece, told))
+    return pieces
 
 
 def _wiggled(task: CartTask, seed: int) -> list[list[tuple[Aligned, bool]]]:

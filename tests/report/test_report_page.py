@@ -218,6 +218,15 @@ def test_a_rendering_is_embedded(tmp_path):
     assert page.loads == ["data:image/webp;base64,cGljdHVyZQ=="]
 
 
+def test_pictures_of_the_run_that_the_page_is_about_are_embedded(tmp_path):
+    runs = [write_run(tmp_path / name, name) for name in ("one", "two")]
+    for run in runs:
+        (run / "ranks & <more>.png").write_bytes(run.name.encode())
+    page = page_of(build_report(runs, tmp_path / "page.html", "One"))
+    assert page.headings[0] == "Pictures"
+    assert page.loads == ["data:image/png;base64,b25l"]
+
+
 def test_no_run_is_refused(tmp_path):
     with pytest.raises(PalpateError, match="at least one run"):
         build_report([], tmp_path / "page.html", "None")

@@ -87,6 +87,7 @@ class Evidence:
 
     `unit` is that of `horizon`. `metrics` are the run's logged lines. `rendering` is a moving
     picture of the scene, `rendering.webp`, `.gif` or `.png`, where the machine could render one.
+    `pictures` are all others that the run has drawn, PNGs.
     """
 
     path: Path
@@ -102,6 +103,7 @@ class Evidence:
     environment: dict[str, Any] = field(default_factory=dict)
     result: dict[str, Any] = field(default_factory=dict)
     rendering: Path | None = None
+    pictures: tuple[Path, ...] = ()
 
 
 def write_evidence(run: str | Path, arrays: Mapping[str, ArrayLike]) -> Path:
@@ -158,6 +160,7 @@ def read_evidence(run: str | Path) -> Evidence:
         environment=_object(run / ENVIRONMENT),
         result=result,
         rendering=next((path for path in renderings if path.exists()), None),
+        pictures=tuple(p for p in sorted(run.glob("*.png")) if p.stem != "rendering"),
     )
 
 

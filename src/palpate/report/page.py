@@ -41,8 +41,9 @@ def build_report(
 ) -> Path:
     """Write one page about `runs` (their folders, in the order to be told) to the file `out`.
 
-    A section appears where some run left evidence for it: results, motion, tip path, error against
-    horizon, parameters, learning, energy, and what was run. `notes` are sentences shown on top.
+    A section appears where some run left evidence for it: results, pictures (of the first run,
+    which the page is about), motion, tip path, error against horizon, parameters, learning,
+    energy, and what was run. `notes` are sentences shown on top.
     The same files give the same page.
 
     Raises `PalpateError` when a folder holds no run, when a file in it is damaged, or when `out`
@@ -63,6 +64,7 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
     """Every section that has evidence, in the order a reader asks."""
     parts = (
         ("Results", lambda e, looks: _results(e.figures)),
+        ("Pictures", lambda e, looks: _pictures(e) if e is found[0] else ""),
         ("Motion", _motion),
         ("Path of the tip", _tips),
         ("Error against horizon", lambda e, looks: _horizon(e.horizon, looks, e.unit)),
@@ -127,6 +129,17 @@ def _results(figures: Sequence[Figure]) -> str:
     return _table(rows, "results")
 
 
+def _pictures(evidence: Evidence) -> str:
+    return "".join(
+        f'<img alt="{_readable(path.stem)}" src="data:image/png;base64,{_encoded(path)}">'
+        for path in evidence.pictures
+    )
+
+
+def _encoded(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode()
+
+
 def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
     content = ""
     if evidence.motions:
@@ -139,9 +152,9 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
         content += f'<div class="player">{_data(scene(evidence.motions, looks))}</div>'
     if evidence.rendering is not None:
         kind = RENDERINGS[evidence.rendering.suffix]
-        picture = base64.b64encode(evidence.rendering.read_bytes()).decode()
         content += _caption("The same scene as its simulator renders it.")
-        content += f'<img alt="The scene in motion" src="data:{kind};base64,{picture}">'
+        source = f"data:{kind};base64,{_encoded(evidence.rendering)}"
+        content += f'<img alt="The scene in motion" src="{source}">'
     return content
 
 

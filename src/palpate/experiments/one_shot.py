@@ -192,7 +192,7 @@ def _raced(out: Path, seed: int, size: Size) -> dict[str, Any]:
         paces = race(posterior, seed, size.budget)
         parameters = posterior.target.parameters
         return {
-            "parameters": parameters,
+            "free_parameters": parameters,
             "compiling_s": posterior.draws.compiling,
             "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
         }

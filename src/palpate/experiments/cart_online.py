@@ -16,7 +16,6 @@ Each task is a run in a folder below `out`, and resumes with the agent and world
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -216,10 +215,10 @@ def draw(path: Path, earned: dict[str, Rewards]) -> None:
             axis.fill_between(
                 ends, middle - 2 * error, middle + 2 * error, color=style.light, alpha=0.15, lw=0
             )
-            look: dict[str, Any] = {"color": style.light, "lw": style.width, "marker": style.marker}
-            if style.dash:  # Matplotlib counts in line widths
-                look["dashes"] = [length / style.width for length in style.dash]
-            axis.plot(ends, middle, label=agent, ms=4, **look)
+            axis.plot(
+                ends, middle, label=agent, color=style.light,
+                ls=style.linestyle, lw=style.width, marker=style.marker, ms=4,
+            )  # fmt: skip
         axis.set(title=f"{name}, {task.episode} decisions an episode", xlabel="decisions")
         axis.set_xlim(left=0)
     axes[0].set_ylabel("mean reward of an episode's decisions (m)")

@@ -37,6 +37,7 @@ from palpate.experiments.one_shot_pieces import (
 from palpate.experiments.one_shot_regression import OURS, RIVALS, SIZES, shares
 from palpate.experiments.one_shot_sampling import OURS as NUTS
 from palpate.experiments.one_shot_sampling import Pace, race
+from palpate.experiments.rope_stabilization import announce, finish
 from palpate.identification.bayesian import sample
 from palpate.result import Figure, Result
 from palpate.runs import RESULT, Run, progress
@@ -77,9 +78,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     Raises `PalpateError` when `out` holds another run's stages.
     """
     size = QUICK if quick else FULL
-    parts = ", ".join(f"{stage} {time}" for stage, time in size.minutes.items())
-    total = sum(size.minutes.values())
-    print(f"{NAME}: about {total} minutes on two cores ({parts})", flush=True)
+    announce(NAME, size.minutes)
     one_shot_sysid.mujoco_sysid()  # an hour later would be late to say that it is missing
     movable = ("cart", "couch") if quick else MOVABLE
     first = SEEDS + 1000 * seed
@@ -118,8 +117,7 @@ def _stage(path: Path, configuration: dict[str, Any], work: Callable[[], dict]) 
     """What a stage found, from its run if that is finished."""
     with Run.open(path, configuration) as run:
         if not run.finished:
-            content = work()
-            run.finish({"name": f"{NAME} {path.name}", "wall_time_s": run.elapsed, **content})
+            finish(run, NAME, path.name, work())
     return read_json(path / RESULT)
 
 
@@ -190,9 +188,8 @@ def _raced(out: Path, seed: int, size: Size) -> dict[str, Any]:
         target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
         posterior = sample(target, draws=size.raced_draws, seed=seed)
         paces = race(posterior, seed, size.budget)
-        parameters = posterior.target.parameters
         return {
-            "free_parameters": parameters,
+            "free_parameters": posterior.target.parameters,
             "compiling_s": posterior.draws.compiling,
             "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
         }
@@ -256,6 +253,7 @@ def _figures(
         share = error_share(np.array(joint["error_m"]), np.array(joint["displacement_m"]))
         figures += [
             Figure("scene.coverage_90", joint["inside"], "", bar=0.85, better="higher"),
+            Figure("scene.coverage_90_over", joint["inside"], "", bar=0.95),
             Figure("scene.error_share", share, ""),
         ]
     figures += [Figure(f"error_share.{kind}", share, "") for kind, share in each.items()]

@@ -30,16 +30,16 @@ def shares_figure(out: Path, compared: Mapping[str, Mapping[str, Any]]) -> None:
         axis.axhline(STILL, color=STYLES[0].light, lw=1.0, label="nothing moves")
         for style, method in zip(LOOKS, (OURS, *RIVALS), strict=True):
             found = {int(size): share for size, share in stage["shares"][method].items()}
-            look: dict[str, Any] = {"color": style.light, "lw": style.width, "marker": style.marker}
-            if style.dash:  # Matplotlib counts in line widths
-                look["dashes"] = [length / style.width for length in style.dash]
-            axis.plot(list(found), list(found.values()), label=method, ms=4, **look)
+            axis.plot(
+                list(found), list(found.values()), label=method, color=style.light,
+                ls=style.linestyle, lw=style.width, marker=style.marker, ms=4,
+            )  # fmt: skip
         axis.set(title=kind, xscale="log", yscale="log", ylim=(1e-4, 30.0))
         axis.spines[["top", "right"]].set_visible(False)
         if index % ACROSS == 0:
             axis.set_ylabel("error² / displacement²")
         if index >= len(compared) - ACROSS:
-            axis.set_xlabel("samples of 0.1 s")
+            axis.set_xlabel("samples of 0.1 s since it moved")
     lines, names = axes[0].get_legend_handles_labels()
     canvas.legend(lines, names, loc="outside upper center", ncols=len(names), frameon=False)
     buffer = io.BytesIO()

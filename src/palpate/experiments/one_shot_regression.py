@@ -3,9 +3,8 @@
 A sample is a tenth of a second of handling: pose and velocity before and after, smoothed from what
 a tracker shows, and the mean wrench between. All are given the same handling up to n samples after
 the piece is first seen to have moved, before which nobody could know how it does; pushes of 2 s are
-then predicted open loop. Regressions get the inputs that suit them: raw as
-in the deck (whole state, whole wrench) and in the piece's own axes, and of both the better on these
-very pushes counts.
+then predicted open loop. Regressions get the inputs that suit them: raw as in the deck (whole
+state, whole wrench) and in the piece's own axes; of both the better on these very pushes counts.
 """
 
 import json

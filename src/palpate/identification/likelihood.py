@@ -33,8 +33,8 @@ from palpate.models.model import Model, rollout
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
 from palpate.small_systems import cholesky, solve_lower
 
-# s. Of white noise and memories up to 4 s, furniture's handling makes none up to this one less
-# probable than white noise, and longer ones by many orders of magnitude.
+# s. The handling of furniture makes this one as probable as white noise (the logarithm of the
+# evidence is within 3, five kinds), 0.3 s less so by 3 to 15, and longer ones by more.
 MEMORY = 0.1
 VAGUE = 3.0  # by which the start's deviation is widened in the likelihood
 NOISE_SPREAD = 0.7  # standard deviation of the logarithm of s about what the sensor seems to have

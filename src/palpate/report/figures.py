@@ -121,7 +121,7 @@ def _round_ticks(low: float, high: float) -> list[float]:
 
 def _draw_chain(ax: "Axes", points: np.ndarray, style: Style, label: str) -> None:
     look = {"color": style.light, "lw": style.width * 0.75, "marker": style.marker}
-    look["linestyle"] = _dashes(style)
+    look["linestyle"] = style.linestyle
     every = max(1, round(len(points) / 8))
     ax.plot(*points.T, ms=3, markevery=(0, every), label=label, **look)
     ax.plot(*points[-1:].T, ms=6, color=style.light, marker=style.marker)
@@ -138,7 +138,7 @@ def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
             median,
             color=style.light,
             lw=style.width * 0.75,
-            ls=_dashes(style),
+            ls=style.linestyle,
             label=label,
         )
     ax.axhline(0.01, color=_INK, lw=0.8, ls=(0, (4, 3)))
@@ -146,11 +146,6 @@ def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
     ax.set_title("energy relative to the start", color=_INK)
     ax.set_yticks([1e-4, 1e-3, 1e-2, 1e-1, 1], ["0.01 %", "0.1 %", "1 %", "10 %", "100 %"])
     ax.minorticks_off()
-
-
-def _dashes(style: Style) -> Any:
-    """Matplotlib counts dashes in widths of the line."""
-    return (0, tuple(length / style.width for length in style.dash)) if style.dash else "-"
 
 
 def _legend(figure: "Figure") -> None:

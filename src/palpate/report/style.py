@@ -23,6 +23,11 @@ class Style:
     marker: str
     width: float
 
+    @property
+    def linestyle(self) -> str | tuple[int, tuple[float, ...]]:
+        """The dashes as Matplotlib takes them, which counts in line widths."""
+        return (0, tuple(length / self.width for length in self.dash)) if self.dash else "-"
+
 
 # The first is drawn broad and pale beneath the others, so that what agrees with it can be seen. It
 # is kept for what the others are held against.

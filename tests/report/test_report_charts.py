@@ -62,6 +62,11 @@ def test_a_loss_that_is_not_positive_has_a_linear_axis_and_none_is_a_gap():
     assert "shapes" not in chart["layout"]
 
 
+def test_six_losses_have_six_looks():
+    chart = learning([{"step": step} | {f"{k} loss": 1.0 for k in range(6)} for step in range(3)])
+    assert len({line["line"]["color"] for line in chart["data"]}) == 6
+
+
 def test_a_long_curve_is_smoothed_within_a_stage_and_thinned():
     steps = np.arange(6000)
     noise = np.where(steps % 10 == 0, 100.0, 1.0)

@@ -104,11 +104,12 @@ def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
     for index, name in enumerate(losses, start=1):
         values = _column(metrics, name)
         least, most = min(least, np.nanmin(values)), max(most, np.nanmax(values))
-        looks = {name: index}
+        look = index % len(STYLES)
+        looks = {name: look}
         smooth = _smooth(values, _column(metrics, "horizon"), every)
         if len(values) >= _MANY:
             raw = _line(name, looks, steps[::every], values[::every], "%{y:.4g}")
-            raw |= {"line": {"color": f"@series-{index}:0.35", "width": 1}, "hoverinfo": "skip"}
+            raw |= {"line": {"color": f"@series-{look}:0.35", "width": 1}, "hoverinfo": "skip"}
             del raw["hovertemplate"]
             data.append(raw | {"showlegend": False})
         line = _line(name, looks, steps[::every], smooth, "%{y:.4g}")

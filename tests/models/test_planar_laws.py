@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 from palpate.models.model import rollout
-from palpate.models.planar import Planar, PlanarState
-from palpate.models.planar_friction import STICTION
+from palpate.models.planar import Planar, PlanarState, turned_wheel
+from palpate.models.planar_friction import STICTION, Tensor, exponential
 from palpate.models.planar_shapes import furniture, rectangle
 from palpate.models.planar_step import GRAVITY
 
@@ -213,18 +214,42 @@ def test_a_fixed_wheel_goes_along_itself_only(float64):
 
 
 def test_a_wheel_has_the_symmetries_of_its_labels(float64):
-    """A quarter turn swaps along and across, a half turn changes nothing."""
-    settings = {"wheel_position": [0.5, -0.3], "floor_friction": 0.05}
-    one = body(1, wheel_direction=0.3, wheel_along=2.0, wheel_across=9.0, **settings)
-    swapped = body(
-        1, wheel_direction=0.3 + np.pi / 2, wheel_along=9.0, wheel_across=2.0, **settings
-    )
-    turned = dataclasses.replace(one, wheel_direction=one.wheel_direction - np.pi)
-    wrench = (8.0, 5.0, -2.0)
-    expected, _ = pushed(one, at(), 1.0, wheel_wrench := wrench)
-    for other in (swapped, turned):
-        poses, _ = pushed(other, at(), 1.0, wheel_wrench)
-        np.testing.assert_allclose(poses, expected, atol=1e-12)
+    """A quarter turn swaps along and across, a half turn changes nothing: one set of parameters."""
+    one = turned_wheel(0.3, 2.0, 9.0)
+    for other in (turned_wheel(0.3 + np.pi / 2, 9.0, 2.0), turned_wheel(0.3 - np.pi, 2.0, 9.0)):
+        for name, value in one.items():
+            np.testing.assert_allclose(other[name], value, rtol=1e-12)
+
+
+@pytest.mark.parametrize("law", ["coulomb", "viscous"])
+@pytest.mark.parametrize("direction", [0.3, -0.4, 2.5])
+def test_a_turned_wheel_under_a_body_is_a_square_one_under_a_turned_body(float64, law, direction):
+    """On one wheel under its centre and nothing else, only the wheel's axes matter."""
+    turned = body(1, law=law, **turned_wheel(direction, 2.0, 9.0))
+    square = body(1, law=law, wheel_along=2.0, wheel_across=9.0)
+    expected, _ = pushed(square, at(0.0, 0.0, direction), 1.0, (8.0, 5.0, 0.0))
+    poses, _ = pushed(turned, at(), 1.0, (8.0, 5.0, 0.0))
+    np.testing.assert_allclose(poses[:, 0, :2], expected[:, 0, :2], atol=1e-12)
+    assert abs(poses[-1, 0, 1] / poses[-1, 0, 0] - 5.0 / 8.0) > 0.05
+
+
+def test_the_friction_of_a_wheel_is_the_exponential_of_its_logarithm(float64):
+    entries = np.random.default_rng(0).normal(size=(3, 50)) * np.logspace(-6, 0.7, 50)
+    entries = np.concatenate([entries, np.zeros((3, 1)), np.full((3, 1), 2.0)], axis=1)
+    found = exponential(Tensor(*map(jnp.asarray, entries)))
+    expected = scipy.linalg.expm(np.stack([entries[[0, 2]], entries[[2, 1]]]).transpose(2, 0, 1))
+    scale = np.abs(expected).max(axis=(1, 2))
+    wanted = expected[:, 0, 0], expected[:, 1, 1], expected[:, 0, 1]
+    for entry, exact in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(entry / scale, exact / scale, atol=1e-14)
+
+
+def test_the_friction_of_a_wheel_has_derivatives_where_it_is_the_same_in_all_directions(float64):
+    """d exp(L) = exp(L) dL where L is a multiple of the identity."""
+    even = Tensor(jnp.asarray(0.7), jnp.asarray(0.7), jnp.asarray(0.0))
+    size = np.exp(0.7)
+    slopes = jax.jacrev(exponential)(even)
+    np.testing.assert_allclose(np.array(slopes), size * np.eye(3), atol=1e-14)
 
 
 # Links

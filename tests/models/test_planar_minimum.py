@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from palpate.models.planar import Planar, PlanarState
+from palpate.models.planar import Planar, PlanarState, turned_wheel
 from palpate.models.planar_friction import STICTION
 from palpate.models.planar_shapes import furniture, rectangle
 from palpate.models.planar_step import GRAVITY
@@ -29,9 +29,7 @@ def _body(random: np.random.Generator) -> tuple[Planar, dict[str, np.ndarray | f
         floor_damping=1e-6,
         floor_spread=0.8,
         wheel_position=place,
-        wheel_direction=direction,
-        wheel_along=along,
-        wheel_across=across,
+        **turned_wheel(direction, along, across),
     )
     gyration = float(np.sqrt(np.sum(HALF**2) / 3.0))
     signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])

@@ -6,15 +6,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from palpate.models import planar_step
 from palpate.models.model import Model
-from palpate.models.planar_friction import Rolling, Wheel, wheel_axes
+from palpate.models.planar_friction import Rolling, Tensor, Wheel
 from palpate.models.planar_geometry import Shapes
 from palpate.models.planar_links import COINCIDENT, Links, turn
 from palpate.parameters import LogNormal, Normal, Parameter, Uniform, as_floating, parameter
 
+WEAKEST = 1e-6  # N: what is less counts as this, as a logarithm needs it
 TIPPING = 0.95  # of the way to the feet on one side: where the centre of mass is at most
 
 
@@ -44,20 +45,23 @@ class Planar(Model):
     - the floor under every body: dry friction at four feet that share its weight, and damping in
       proportion to its mass about its centre of mass. The whole weight counts, whatever wheels
       carry: what rolls on casters has a small floor friction, and a wheel takes its own;
-    - wheels, each with a direction in the body. A dry one (`dry` = 1) gives way along and across
-      at the forces `wheel_along` and `wheel_across`, in any other direction on the ellipse between
-      them. A viscous one (`dry` = 0, the law of the thesis) resists with these forces at 1 m/s and
-      in proportion. Both large: a locked caster. Along small and across large: a fixed wheel;
+    - wheels, each with a symmetric tensor of friction F: a dry one (`dry` = 1) takes the power
+      |F v|, and so gives way along the axes of F at forces that are its eigenvalues, in any other
+      direction on the ellipse between them. A viscous one (`dry` = 0, the law of the thesis)
+      resists with F v. Both eigenvalues large: a locked caster. One small: a fixed wheel, which
+      rolls along that axis;
     - links: a pivot holds a point of the body at a point of the world or of another body, a
       distance keeps two such points as far apart as they are at `link_pose`.
 
     Lengths that place something on a body are shares of its half width and half depth, so that one
     prior serves a stool and a couch.
 
-    A wheel turned by a quarter with along and across swapped is the same wheel. The prior keeps
-    the direction within 45 degrees of the body's x axis, where each wheel has one name, and wheels
-    that are square to the furniture lie in the middle of it. (The other choice, any direction with
-    along <= across, cuts the posterior of a locked wheel in two.)
+    The parameters of a wheel are the entries of the logarithm of F in the body's axes: those on the
+    diagonal are the logarithms of `wheel_along` and `wheel_across`, the other is `wheel_shear`. So
+    a wheel has one name, although turned by a quarter with its two forces swapped it is the same,
+    and one that resists alike in all directions is a point like any other, where an angle would be
+    undefined and the posterior cut in two. Square to the body the shear is zero and the
+    others are the wheel's own forces; `turned_wheel` has those of one that is not.
 
     Which wheels and links there are, their law, what a link leads to (-1: the world) and which
     bodies are bolted down is data: hypotheses about it are a batch axis. Batch axes of parameters
@@ -110,22 +114,24 @@ class Planar(Model):
         prior=Normal(0.0, 0.6),
         about="where the wheel touches the floor from the centroid, in half extents along x and y",
     )
-    wheel_direction: Float[Array, "*batch bodies wheels"] = parameter(
-        "rad",
-        prior=Uniform(-jnp.pi / 4, jnp.pi / 4),
-        about="rolling direction from the body's x axis; a quarter turn swaps along and across",
-    )
     wheel_along: Float[Array, "*batch bodies wheels"] = parameter(
         "N",
         prior=LogNormal(5.0, 2.0),
         spread=0.3,
-        about="force at which a dry wheel rolls; of a viscous one the force at 1 m/s",
+        about="force at which a dry wheel gives way along the body's x axis; of a viscous one the "
+        "force at 1 m/s",
     )
     wheel_across: Float[Array, "*batch bodies wheels"] = parameter(
         "N",
         prior=LogNormal(5.0, 2.0),
         spread=0.3,
-        about="force at which a dry wheel slips sideways; of a viscous one the force at 1 m/s",
+        about="as `wheel_along`, along the body's y axis",
+    )
+    wheel_shear: Float[Array, "*batch bodies wheels"] = parameter(
+        "1",
+        prior=Normal(0.0, 1.4),
+        about="how the wheel's axes are turned from the body's: the entry off the diagonal of its "
+        "friction's logarithm",
     )
     link_anchor: Float[Array, "*batch bodies links 2"] = parameter(
         "half extent",
@@ -153,7 +159,7 @@ class Planar(Model):
     pairs: Int[Array, "*batch pairs 4"] = _data(int)
     control_period: float = eqx.field(static=True, default=0.02)
     substeps: int = eqx.field(static=True, default=1)
-    iterations: int = eqx.field(static=True, default=4)
+    iterations: int = eqx.field(static=True, default=5)
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     @property
@@ -294,11 +300,19 @@ class Planar(Model):
         lever = self.wheel_position * self.half_extent[:, None] - centre[:, None]
         wheels = []
         for i in range(self.wheel.shape[-1]):
-            along, across = wheel_axes(lever[:, i, 0], lever[:, i, 1], self.wheel_direction[:, i])
-            exists, dry = self.wheel[:, i], self.dry[:, i]
-            rolling = jnp.where(exists > 0, self.wheel_along[:, i], 1.0)
-            slipping = jnp.where(exists > 0, self.wheel_across[:, i], 1.0)
-            wheels.append(Wheel(along, across, rolling, slipping, dry, exists))
+            exists = self.wheel[:, i]
+            # A wheel that does not exist may have any values.
+            log = Tensor(
+                *(
+                    jnp.where(exists > 0, entry[:, i], 0.0)
+                    for entry in (
+                        jnp.log(jnp.maximum(self.wheel_along, WEAKEST)),
+                        jnp.log(jnp.maximum(self.wheel_across, WEAKEST)),
+                        self.wheel_shear,
+                    )
+                )
+            )
+            wheels.append(Wheel(lever[:, i, 0], lever[:, i, 1], log, self.dry[:, i], exists))
         anchor = self.link_anchor * self.half_extent[:, None]
         # a pivot holds on to where its own anchor is at `link_pose`
         cosine, sine = jnp.cos(self.link_pose[..., 2]), jnp.sin(self.link_pose[..., 2])
@@ -340,6 +354,25 @@ class Planar(Model):
 def wrapped(angle: Array) -> Array:
     """The angle between -pi and pi that points the same way."""
     return angle - 2.0 * jnp.pi * jnp.round(angle / (2.0 * jnp.pi))
+
+
+def turned_wheel(
+    direction: Float[ArrayLike, "*#batch"],
+    along: Float[ArrayLike, "*#batch"],
+    across: Float[ArrayLike, "*#batch"],
+) -> dict[str, Array]:
+    """Parameters of a wheel that stands at an angle (rad) to the body's x axis, by their names.
+
+    `along` and `across` are its forces in N, or in N s/m, in its own axes.
+    """
+    log_along, log_across = (jnp.log(jnp.maximum(force, WEAKEST)) for force in (along, across))
+    mean, half = 0.5 * (log_along + log_across), 0.5 * (log_along - log_across)
+    turned = half * jnp.cos(2.0 * jnp.asarray(direction))
+    return {
+        "wheel_along": jnp.exp(mean + turned),
+        "wheel_across": jnp.exp(mean - turned),
+        "wheel_shear": half * jnp.sin(2.0 * jnp.asarray(direction)),
+    }
 
 
 def _axes_of(kind: type) -> list[int]:

@@ -2,14 +2,17 @@
 
 The floor carries a body on four feet, which share its weight as its centre of mass asks; each is
 held by Coulomb's friction, so that a body that turns slides more easily (Goyal, Ruina and
-Papadopoulos, Wear 143, 1991). A dry wheel takes the power
+Papadopoulos, Wear 143, 1991). A dry wheel whose friction is the symmetric tensor F takes the power
 
-    sqrt((along v_along)^2 + (across v_across)^2):
+    |F v| = sqrt((along v_along)^2 + (across v_across)^2),
 
-an ellipse of forces, and of these the one that takes most. Both are elements that take an impulse
-in proportion to the slope of a convex function of the size of two rates, which is that size, and
-quadratic below `STICTION` (Huber's). The velocity at the end of a step minimises the sum of all of
-them and of what is quadratic, which Newton's method finds.
+along and across it being the axes of F: an ellipse of forces, and of these the one that takes most.
+Both are elements that take an impulse in proportion to the slope of a convex function of the size
+of two rates, which is that size, and quadratic below `STICTION` (Huber's). The velocity at the end
+of a step minimises the sum of all of them and of what is quadratic. Newton's method for it carries
+the pull of each element beside the velocity (Chan, Golub and Mulet, SIAM J. Sci. Comput. 20, 1999):
+a size has hardly any curvature away from zero, and without the pulls a step across an ellipse of
+1 : 60 goes astray again and again.
 """
 
 from typing import NamedTuple
@@ -26,17 +29,25 @@ Triple = tuple[Array, Array, Array]
 Entries = tuple[Array, Array, Array, Array, Array, Array]  # x, y, t, xy, xt, yt of symmetric 3 x 3
 
 
-class Wheel(NamedTuple):
-    """One wheel of every body: rows that map a body's velocity to that of the wheel, friction.
+class Tensor(NamedTuple):
+    """A symmetric 2 x 2 matrix, its entries of any shape."""
 
-    Friction in N (`dry` = 1) or N s/m (`dry` = 0), never zero: a wheel that does not exist
-    (`exists` = 0) has some and no weight, so that its derivatives are finite. All are (bodies,).
+    xx: Array
+    yy: Array
+    xy: Array
+
+
+class Wheel(NamedTuple):
+    """One wheel of every body: where it stands, and the logarithm of its friction.
+
+    `x` and `y` (bodies,) are from the centre of mass, in m, in the body's axes, as the tensor is:
+    of friction in N (`dry` = 1) or N s/m (`dry` = 0). A wheel that does not exist (`exists` = 0)
+    has some friction and no weight, so that its derivatives are finite.
     """
 
-    along: Triple
-    across: Triple
-    along_friction: Array
-    across_friction: Array
+    x: Array
+    y: Array
+    log_friction: Tensor
     dry: Array
     exists: Array
 
@@ -71,6 +82,16 @@ class Dry(NamedTuple):
     impulse: Array
 
 
+class Pull(NamedTuple):
+    """What each dry element takes along its two rates, in shares of the most: a disc (0: nothing).
+
+    (bodies, elements) each.
+    """
+
+    first: Array
+    second: Array
+
+
 class Resistance(NamedTuple):
     """What a body's velocity v costs in a step: v' A v / 2 - momentum' v + sum of what is dry."""
 
@@ -79,15 +100,37 @@ class Resistance(NamedTuple):
     dry: Dry
 
 
-def wheel_axes(x: Array, y: Array, direction: Array) -> tuple[Triple, Triple]:
-    """Velocity of a wheel along and across it from its body's velocity.
+def exponential(log: Tensor) -> Tensor:
+    """The exponential of symmetric matrices.
 
-    `x` and `y` are where the wheel stands from the centre of mass, in m, in the body's axes.
+    Smooth where the two eigenvalues meet, as their eigenvectors are not: a wheel that resists alike
+    in all directions has none to be told.
     """
-    cosine, sine = jnp.cos(direction), jnp.sin(direction)
-    along = (cosine, sine, x * sine - y * cosine)
-    across = (-sine, cosine, x * cosine + y * sine)
-    return along, across
+    mean, half = 0.5 * (log.xx + log.yy), 0.5 * (log.xx - log.yy)
+    squared = jnp.square(half) + jnp.square(log.xy)
+    small = squared < 0.1
+    radius = jnp.sqrt(jnp.where(small, 1.0, squared))
+    # Power series of cosh r and sinh r / r: the root of zero has no derivative.
+    cosine = jnp.where(small, _series(squared, 2), jnp.cosh(radius))
+    sine = jnp.where(small, _series(squared, 3), jnp.sinh(radius) / radius)
+    size = jnp.exp(mean)
+    even, uneven = size * cosine, size * sine
+    return Tensor(even + uneven * half, even - uneven * half, uneven * log.xy)
+
+
+def _series(squared: Array, factor: int) -> Array:
+    """1 + s / n(n - 1) (1 + s / (n + 2)(n + 1) (1 + ...)) from `factor` n on, exact below 0.1."""
+    total = jnp.ones_like(squared)
+    for n in range(factor + 10, factor - 1, -2):
+        total = 1.0 + squared / (n * (n - 1)) * total
+    return total
+
+
+def wheel_rows(wheel: Wheel, friction: Tensor) -> tuple[Triple, Triple]:
+    """F J: rows that map a body's velocity to a tensor times the velocity of its wheel."""
+    first = friction.xx, friction.xy, wheel.x * friction.xy - wheel.y * friction.xx
+    second = friction.xy, friction.yy, wheel.x * friction.yy - wheel.y * friction.xy
+    return first, second
 
 
 def resistance(bodies: Rolling, free: Triple, time_step: float) -> Resistance:
@@ -110,12 +153,16 @@ def resistance(bodies: Rolling, free: Triple, time_step: float) -> Resistance:
     second = [(nowhere, here, here * bodies.foot_x)]
     impulse = [time_step * STICTION * bodies.foot_friction]
     for wheel in bodies.wheels:
+        log = wheel.log_friction
         weight = time_step * wheel.exists * (1.0 - wheel.dry)
-        entries = add_row(entries, wheel.along, weight * wheel.along_friction)
-        entries = add_row(entries, wheel.across, weight * wheel.across_friction)
-        creep = least_power(wheel)
-        first.append(scaled(wheel.along, wheel.along_friction / creep))
-        second.append(scaled(wheel.across, wheel.across_friction / creep))
+        # v' F v is the square of F's root times v.
+        for row in wheel_rows(wheel, exponential(Tensor(*(0.5 * entry for entry in log)))):
+            entries = add_row(entries, row, weight)
+        friction = exponential(log)
+        creep = least_power(log, friction)
+        one, other = wheel_rows(wheel, friction)
+        first.append(scaled(one, 1.0 / creep))
+        second.append(scaled(other, 1.0 / creep))
         impulse.append((time_step * creep * wheel.exists * wheel.dry)[:, None])
 
     def joined(rows: list[Triple]) -> Triple:
@@ -126,12 +173,33 @@ def resistance(bodies: Rolling, free: Triple, time_step: float) -> Resistance:
     return Resistance(entries, momentum, dry)
 
 
+def pulls(resisting: Resistance, velocity: Triple) -> Pull:
+    """What dry elements take at a velocity."""
+    first, second = rates(resisting.dry.first, velocity), rates(resisting.dry.second, velocity)
+    soft = softened(first, second)
+    return Pull(soft * first, soft * second)
+
+
+def pulls_after(resisting: Resistance, velocity: Triple, pull: Pull, step: Triple) -> Pull:
+    """What dry elements take after a step back from a velocity, by its linearisation.
+
+    That of s pull = rates, where s is their size, or one where they are smaller.
+    """
+    dry = resisting.dry
+    soft, along = _directions(dry, velocity)
+    first, second = rates(dry.first, step), rates(dry.second, step)
+    growth = along.first * first + along.second * second
+    now = pulls(resisting, velocity)
+    first = now.first - soft * (first - pull.first * growth)
+    second = now.second - soft * (second - pull.second * growth)
+    within = softened(first, second)
+    return Pull(within * first, within * second)
+
+
 def slope(resisting: Resistance, velocity: Triple) -> Triple:
     """Derivative of the cost by the velocity: momentum that is left over, zero at the end."""
-    dry = resisting.dry
-    first, second = rates(dry.first, velocity), rates(dry.second, velocity)
-    taken = dry.impulse * softened(first, second)
-    first, second = taken * first, taken * second
+    dry, pull = resisting.dry, pulls(resisting, velocity)
+    first, second = dry.impulse * pull.first, dry.impulse * pull.second
     linear = product(resisting.entries, velocity)
     x, y, turning = (
         a - p + jnp.sum(first * f + second * s, axis=1)
@@ -140,23 +208,26 @@ def slope(resisting: Resistance, velocity: Triple) -> Triple:
     return x, y, turning
 
 
-def curvature(resisting: Resistance, velocity: Triple) -> Entries:
-    """Second derivative of the cost by the velocity, positive definite."""
+def curvature(resisting: Resistance, velocity: Triple, pull: Pull) -> Entries:
+    """Second derivative of the cost by the velocity, for elements that pull so; positive definite.
+
+    It is the cost's own where they pull as they do at that velocity, and more than that where they
+    pull less.
+    """
     dry = resisting.dry
+    soft, along = _directions(dry, velocity)
+    one = 1.0 - pull.first * along.first
+    other = 1.0 - pull.second * along.second
+    both = -0.5 * (pull.first * along.second + pull.second * along.first)
+    return _plus(resisting.entries, _weighted(dry, dry.impulse * soft, Tensor(one, other, both)))
+
+
+def _directions(dry: Dry, velocity: Triple) -> tuple[Array, Pull]:
+    """One over the size of the rates, at most one, and where they point; zero for what sticks."""
     first, second = rates(dry.first, velocity), rates(dry.second, velocity)
     soft = softened(first, second)
-    weight = dry.impulse * soft
-    fading = jnp.where(soft < 1.0, weight * jnp.square(soft), 0.0)
-    x, y, turning = (first * p + second * q for p, q in zip(dry.first, dry.second, strict=True))
-    faded = (
-        fading * x * x,
-        fading * y * y,
-        fading * turning * turning,
-        fading * x * y,
-        fading * x * turning,
-        fading * y * turning,
-    )
-    return _plus(resisting.entries, _weighted(dry, weight), faded)
+    sliding = jnp.where(soft < 1.0, soft, 0.0)
+    return soft, Pull(sliding * first, sliding * second)
 
 
 def as_viscous(resisting: Resistance, velocity: Triple) -> Entries:
@@ -166,43 +237,36 @@ def as_viscous(resisting: Resistance, velocity: Triple) -> Entries:
     """
     dry = resisting.dry
     soft = softened(rates(dry.first, velocity), rates(dry.second, velocity))
-    every = _weighted(dry, dry.impulse * soft)
-    return _plus(resisting.entries, every, (jnp.zeros_like(soft),) * 6)
+    one = jnp.ones_like(soft)
+    even = Tensor(one, one, jnp.zeros_like(soft))
+    return _plus(resisting.entries, _weighted(dry, dry.impulse * soft, even))
 
 
-def _weighted(dry: Dry, weight: Array) -> tuple[Array, ...]:
-    """Entries of w J'J of each element."""
-    a, b, c = dry.first
-    d, e, f = dry.second
-    return (
-        weight * (a * a + d * d),
-        weight * (b * b + e * e),
-        weight * (c * c + f * f),
-        weight * (a * b + d * e),
-        weight * (a * c + d * f),
-        weight * (b * c + e * f),
-    )
+def _weighted(dry: Dry, weight: Array, tensor: Tensor) -> tuple[Array, ...]:
+    """Entries of w J' T J of each element, for a tensor T of its two rates."""
+
+    def entry(i: int, j: int) -> Array:
+        (a, b), (c, d) = (dry.first[i], dry.second[i]), (dry.first[j], dry.second[j])
+        return weight * (tensor.xx * a * c + tensor.yy * b * d + tensor.xy * (a * d + b * c))
+
+    return entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2)
 
 
-def _plus(entries: Entries, more: tuple[Array, ...], less: tuple[Array, ...]) -> Entries:
+def _plus(entries: Entries, more: tuple[Array, ...]) -> Entries:
     x, y, t, xy, xt, yt = (
-        own + jnp.sum(added - taken, axis=1)
-        for own, added, taken in zip(entries, more, less, strict=True)
+        own + jnp.sum(added, axis=1) for own, added in zip(entries, more, strict=True)
     )
     return x, y, t, xy, xt, yt
 
 
-def least_power(wheel: Wheel) -> Array:
-    """Power (W) below which a wheel sticks.
+def least_power(log: Tensor, friction: Tensor) -> Array:
+    """Power (W) below which a wheel of this friction sticks, never zero.
 
     In proportion to its lesser friction, so that neither direction starts to slide later than the
-    other: the root of twice the harmonic mean of squares. Never zero, for wheels without friction.
+    other: the root of the harmonic mean of squares, twice det(F)^2 over the squares of F's entries.
     """
-    along_squared, across_squared = (
-        jnp.square(wheel.along_friction),
-        jnp.square(wheel.across_friction),
-    )
-    mean = 2.0 * along_squared * across_squared / (along_squared + across_squared + 1e-12)
+    squares = jnp.square(friction.xx) + jnp.square(friction.yy) + 2.0 * jnp.square(friction.xy)
+    mean = 2.0 * jnp.exp(2.0 * (log.xx + log.yy)) / (squares + 1e-12)
     return STICTION * jnp.sqrt(1e-8 + mean)
 
 

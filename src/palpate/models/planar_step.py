@@ -6,8 +6,8 @@ The velocity at the end of a step minimises a convex potential,
 
 where psi_i is half the power that a viscous element takes, or all that dry friction takes
 (maximum dissipation; Moreau, "Unilateral contact and dry friction in finite freedom dynamics",
-1988). Newton's method finds it, with a search along each of its directions: a few iterations from
-the velocity without resistance. At last every dry element counts as a viscous one of the same
+1988). Newton's method for velocity and friction together finds it in a few iterations from the
+velocity at the step's start. At last every dry element counts as a viscous one of the same
 force, which changes nothing at the minimum, and short of it takes energy and never adds any. How
 the minimum moves with what it depends on is the implicit function theorem's, so that nothing
 differentiates the iterations. What contacts take changes with the iterations (`planar_contact`);
@@ -30,16 +30,17 @@ from palpate.models.model import SOLVED
 from palpate.models.planar_contact import Contacts
 from palpate.models.planar_friction import (
     Entries,
+    Pull,
     Resistance,
     Rolling,
     Triple,
     as_viscous,
     curvature,
     product,
-    rates,
+    pulls,
+    pulls_after,
     resistance,
     slope,
-    softened,
 )
 from palpate.models.planar_geometry import Shapes
 from palpate.models.planar_links import Links, Rows, link_rows, no_rows, turn
@@ -47,7 +48,6 @@ from palpate.small_systems import cholesky, solve
 
 GRAVITY = 9.81  # m/s^2
 MORE_ITERATIONS = 2  # where bodies touch
-SEARCHES = 4  # points at which the slope along a direction is looked at
 BOLTED = 1e6  # how many times as heavy a bolted body is
 
 
@@ -103,7 +103,7 @@ def advance(
         centre = jnp.stack(system.centre, axis=-1)
         links = link_rows(system.links, bodies.mass, centre, middle, ahead, time_step)
     resisting = resistance(bodies, free, time_step)
-    velocity = solve_velocity(resisting, free, links, iterations)
+    velocity = solve_velocity(resisting, (start[0], start[1], rate), links, iterations)
     if system.shapes.pairs.shape[0]:
         contacts = planar_contact.contacts(
             system.shapes,
@@ -129,21 +129,20 @@ def advance(
     return pose, jnp.stack([end_x + rate * lever_y, end_y - rate * lever_x, rate], axis=-1)
 
 
-def solve_velocity(resisting: Resistance, free: Triple, links: Rows, iterations: int) -> Triple:
-    """Velocity at the end of a step without contacts; `free` is the velocity without resistance."""
+def solve_velocity(resisting: Resistance, start: Triple, links: Rows, iterations: int) -> Triple:
+    """Velocity at the end of a step without contacts, from the velocity at its start."""
     fixed = jax.lax.stop_gradient((resisting, links))
-    # a loop, as in each search: written out it compiles for twice as long and runs slower
-    velocity, _ = jax.lax.scan(
-        lambda velocity, _: (newton(*fixed, velocity), None),
-        jax.lax.stop_gradient(free),
-        length=iterations,
+    velocity = jax.lax.stop_gradient(start)
+    nothing = jax.tree.map(jnp.zeros_like, pulls(fixed[0], velocity))
+    # a loop: written out it compiles for twice as long and runs slower
+    (velocity, _), _ = jax.lax.scan(
+        lambda carry, _: (newton(*fixed, *carry), None), (velocity, nothing), length=iterations
     )
     velocity = jax.tree.map(lambda part: checkpoint_name(part, SOLVED), held_back(*fixed, velocity))
     # the slope is zero and stays so: its derivative says how the velocity follows what it is of
     left = leftover(resisting, links, velocity)
     change = tuple(part - jax.lax.stop_gradient(part) for part in left)
-    followed = solve_bodies(curvature(fixed[0], velocity), change, fixed[1])
-    return minus(velocity, followed)
+    return minus(velocity, solve_bodies(own_curvature(fixed[0], velocity), change, fixed[1]))
 
 
 def solve_contacts(
@@ -159,30 +158,33 @@ def solve_contacts(
         links.weight,
     )
 
-    def iterate(velocity: Triple, touching: Array | None) -> tuple[Triple, Array]:
+    def iterate(velocity: Triple, pull: Pull, touching: Array | None) -> tuple[Triple, Pull, Array]:
         touching = planar_contact.weights(contacts, jnp.stack(velocity, axis=-1), touching)
         rows = joined._replace(weight=jnp.concatenate([links.weight, touching]))
-        return newton(resisting, rows, velocity), touching
+        return *newton(resisting, rows, velocity, pull), touching
 
-    carry, _ = jax.lax.scan(
+    (velocity, _, touching), _ = jax.lax.scan(
         lambda carry, _: (iterate(*carry), None),
-        iterate(velocity, None),
+        iterate(velocity, pulls(resisting, velocity), None),
         length=iterations + MORE_ITERATIONS - 1,
     )
-    velocity, touching = carry
     rows = joined._replace(weight=jnp.concatenate([links.weight, touching]))
     velocity = held_back(resisting, rows, velocity)
     delayed = planar_contact.delayed(contacts, touching, jnp.stack(velocity, axis=-1))
     impulse = (delayed[:, 0], delayed[:, 1], delayed[:, 2])
-    return velocity, solve_bodies(curvature(resisting, velocity), impulse, links)
+    return velocity, solve_bodies(own_curvature(resisting, velocity), impulse, links)
 
 
-def newton(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
-    """A step towards the least cost, as long as the cost falls along it."""
+def newton(resisting: Resistance, rows: Rows, velocity: Triple, pull: Pull) -> tuple[Triple, Pull]:
+    """A step of velocity and friction towards the least cost."""
     left = leftover(resisting, rows, velocity)
-    step = solve_bodies(curvature(resisting, velocity), left, rows)
-    length = jax.lax.stop_gradient(step_length(resisting, rows, velocity, left, step))
-    return minus(velocity, tuple(length * part for part in step))
+    step = solve_bodies(curvature(resisting, velocity, pull), left, rows)
+    return minus(velocity, step), pulls_after(resisting, velocity, pull, step)
+
+
+def own_curvature(resisting: Resistance, velocity: Triple) -> Entries:
+    """Second derivative of the cost by the velocity."""
+    return curvature(resisting, velocity, pulls(resisting, velocity))
 
 
 def held_back(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
@@ -190,58 +192,10 @@ def held_back(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
 
     It has less energy than a step without resistance however far from there it is.
     """
-    x, y, turning = resisting.momentum
-    if rows.weight.size:
-        pull = jnp.einsum("r,rbi->bi", rows.weight * rows.target, rows.jacobian)
-        x, y, turning = x + pull[:, 0], y + pull[:, 1], turning + pull[:, 2]
-    return solve_bodies(as_viscous(resisting, velocity), (x, y, turning), rows)
-
-
-def step_length(
-    resisting: Resistance, rows: Rows, velocity: Triple, left: Triple, step: Triple
-) -> Array:
-    """Share (bodies,) of a Newton step at which the cost stops falling, one if it does not before.
-
-    The zero of the slope along the step, which only rises, by false position (Illinois). Bodies
-    that something joins go the same share of their way.
-    """
-    dry = resisting.dry
-    first, second = rates(dry.first, velocity), rates(dry.second, velocity)
-    by_first, by_second = rates(dry.first, step), rates(dry.second, step)
-    straight = dot(product(resisting.entries, step), step)
-    if rows.weight.size:
-        pulled = jnp.einsum("rbi,bi->r", rows.jacobian, jnp.stack(step, axis=-1))
-        straight = jnp.sum(straight) + jnp.sum(rows.weight * jnp.square(pulled))
-
-    def total(of_bodies: Array) -> Array:
-        return jnp.sum(of_bodies) if rows.weight.size else of_bodies
-
-    def taken(share: Array) -> Array:
-        """Slope of what is dry along the step back from the velocity."""
-        share = jnp.broadcast_to(share, velocity[0].shape)[:, None]
-        a, b = first - share * by_first, second - share * by_second
-        weight = dry.impulse * softened(a, b)
-        return -total(jnp.sum(weight * (a * by_first + b * by_second), axis=1))
-
-    zero = jnp.zeros_like(straight)
-    fall = -total(dot(left, step))
-    steady = fall - taken(zero)  # of what is quadratic, at the velocity
-    below, above = fall, steady + straight + taken(zero + 1.0)
-    whole = above <= 0.0
-
-    def look(ends: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], Array]:
-        low, below, high, above = ends
-        secant = -below / jnp.where(above > below, above - below, 1.0)
-        share = low + (high - low) * jnp.clip(secant, 0.05, 0.95)
-        found = steady + share * straight + taken(share)
-        rising = found > 0.0
-        # the slope jumps where something comes to rest: an end that stays counts for half
-        low, below = jnp.where(rising, low, share), jnp.where(rising, 0.5 * below, found)
-        high, above = jnp.where(rising, share, high), jnp.where(rising, found, 0.5 * above)
-        return (low, below, high, above), share
-
-    _, shares = jax.lax.scan(look, (zero, below, zero + 1.0, above), length=SEARCHES)
-    return jnp.where(whole, 1.0, shares[-1])
+    # As a correction: solved for itself, it would have the rounding of a matrix in which a wheel
+    # holds a million times as much across as along.
+    left = leftover(resisting, rows, velocity)
+    return minus(velocity, solve_bodies(as_viscous(resisting, velocity), left, rows))
 
 
 def leftover(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
@@ -252,11 +206,6 @@ def leftover(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
         pull = jnp.einsum("r,rbi->bi", rows.weight * off, rows.jacobian)
         x, y, turning = x + pull[:, 0], y + pull[:, 1], turning + pull[:, 2]
     return x, y, turning
-
-
-def dot(one: Triple, other: Triple) -> Array:
-    """Scalar product of each body's."""
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def minus(one: Triple, other: tuple[Array, ...]) -> Triple:

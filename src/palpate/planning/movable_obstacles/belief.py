@@ -329,6 +329,11 @@ def _model(
     }
     wheel, bolted, along, across = structure
     weak, strong = value["weak"], value["strong"]
+    turned = turned_wheel(
+        value["wheel_direction"],
+        jnp.where(along > 0, strong, weak),
+        jnp.where(across > 0, strong, weak),
+    )
     one = lambda x: jnp.reshape(x, (1,))  # noqa: E731
     return dataclasses.replace(
         reference,
@@ -337,9 +342,7 @@ def _model(
         floor_friction=one(value["floor_friction"]),
         floor_damping=one(value["floor_damping"]),
         wheel_position=jnp.stack([value["wheel_x"], value["wheel_y"]])[None, None],
-        wheel_direction=value["wheel_direction"][None, None],
-        wheel_along=jnp.where(along > 0, strong, weak)[None, None],
-        wheel_across=jnp.where(across > 0, strong, weak)[None, None],
+        **{path: entry[None, None] for path, entry in turned.items()},
         wheel=wheel[None, None],
         bolted=bolted[None],
         half_extent=half_extent[None],

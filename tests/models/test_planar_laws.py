@@ -213,6 +213,19 @@ def test_a_fixed_wheel_goes_along_itself_only(float64):
     assert poses[-1, 0, 2] == pytest.approx(0.3, abs=2e-3)
 
 
+@pytest.mark.parametrize("across", [1e3, 1e4, 1e5, 1e6])
+def test_a_wheel_that_hardly_slips_rolls_straight_in_single_precision(across):
+    """A matrix of condition up to 1e11: no NaN, and up to 1e7 the force along is what it is."""
+    for direction in np.linspace(0.0, np.pi, 9):
+        model = body(1, wheel_position=[0.3, 0.2], **turned_wheel(direction, 1.0, across))
+        way = np.array([np.cos(direction), np.sin(direction)])
+        start = at(velocity=(*(0.5 * way), 0.0))
+        poses, velocities = pushed(model, start, 1.0, (*(3.0 * way), 0.0))
+        assert np.all(np.isfinite(poses))
+        if across <= 1e4:
+            assert velocities[-1, 0, :2] @ way == pytest.approx(0.5 + 2.0 / 10.0, rel=0.02)
+
+
 def test_a_wheel_has_the_symmetries_of_its_labels(float64):
     """A quarter turn swaps along and across, a half turn changes nothing: one set of parameters."""
     one = turned_wheel(0.3, 2.0, 9.0)

@@ -257,16 +257,19 @@ def solve_three(entries: Entries, right: Triple) -> Triple:
     """Solve symmetric 3 x 3 systems by LDL', one for each body.
 
     Written out: a library call for each of thousands of 3 x 3 systems costs more than its sums.
-    Derivatives solve once more and do not differentiate the elimination.
+    Derivatives solve once more and do not differentiate the elimination. Where rounding would leave
+    nothing of a pivot, as of a wheel that holds 10 kN across and 1 N along, it is as small as it may
+    be: the solution errs, and is corrected by the iteration after it.
     """
     x, y, t, xy, xt, yt = entries
+    least = 4.0 * jnp.finfo(x.dtype).eps
 
     def solve(_: Any, right: Triple) -> Triple:
         lower_y, lower_t = xy / x, xt / x
-        pivot_y = y - lower_y * xy
+        pivot_y = jnp.maximum(y - lower_y * xy, least * y)
         rest = yt - lower_y * xt
         last = rest / pivot_y
-        pivot_t = t - lower_t * xt - last * rest
+        pivot_t = jnp.maximum(t - lower_t * xt - last * rest, least * t)
         a = right[0]
         b = right[1] - lower_y * a
         c = (right[2] - lower_t * a - last * b) / pivot_t

@@ -258,8 +258,8 @@ def solve_three(entries: Entries, right: Triple) -> Triple:
 
     Written out: a library call for each of thousands of 3 x 3 systems costs more than its sums.
     Derivatives solve once more and do not differentiate the elimination. Where rounding would leave
-    nothing of a pivot, as of a wheel that holds 10 kN across and 1 N along, it is as small as it may
-    be: the solution errs, and is corrected by the iteration after it.
+    nothing of a pivot, as of a wheel that holds 10 kN across and 1 N along, it is as small as it
+    may be: the solution errs, and is corrected by the iteration after it.
     """
     x, y, t, xy, xt, yt = entries
     least = 4.0 * jnp.finfo(x.dtype).eps

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from palpate.models.planar import Planar, turned_wheel
+from palpate.models.planar import Planar, PlanarState, turned_wheel
 from palpate.models.planar_shapes import centred, even_gyration, furniture, rectangle
 from palpate.models.planar_step import GRAVITY
 from palpate.parameters import LogNormal, Normal, Prior

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from palpate.models.model import rollout
 from palpate.models.planar import Planar, PlanarState, turned_wheel
 from palpate.models.planar_friction import STICTION
 from palpate.models.planar_shapes import furniture, rectangle
@@ -108,7 +109,7 @@ def test_feet_and_a_wheel_together_leave_the_least_of_the_potential(float64, see
     expected = _least(of, before, wrench, period)
     scale = np.array([1.0, 1.0, np.sqrt(of["inertia"] / of["mass"])])
     speed = np.linalg.norm(expected * scale)
-    assert np.linalg.norm((found - expected) * scale) < 1e-3 + 0.02 * speed
+    assert np.linalg.norm((found - expected) * scale) < 1e-4 + 1e-3 * speed
 
 
 @pytest.mark.parametrize("share", [1.2, 1.5, 3.0])
@@ -130,3 +131,30 @@ def test_a_push_and_a_torque_beyond_what_feet_hold_move_a_body_from_rest(float64
     few, many = model.step(start, push), more.step(start, push)
     assert float(jnp.linalg.norm(many.velocity)) > 3.0 * STICTION
     np.testing.assert_allclose(few.velocity, many.velocity, atol=1e-3)
+
+
+@pytest.mark.parametrize("across", [30.0, 300.0, 3000.0])
+def test_a_cart_steps_to_the_minimum_and_single_precision_hardly_matters(float64, across):
+    """Ten pushes of 0.4 s of what rolls a thousand times as easily as it slips sideways."""
+    pushes = np.random.default_rng(1).normal(size=(10, 1, 3)) * [30.0, 30.0, 10.0]
+
+    def poses(dtype: type, **fields) -> np.ndarray:
+        cart = furniture(
+            [rectangle(1.2, 0.6)],
+            mass=25.0,
+            centre_of_mass=[0.1, 0.05],
+            floor_friction=0.01,
+            wheel_position=[-0.7, 0.1],
+            wheel_along=0.5,
+            wheel_across=across,
+            **fields,
+        )
+        cast = lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x  # noqa: E731
+        rest = PlanarState(jnp.zeros((1, 3), dtype), jnp.zeros((1, 3), dtype))
+        wrench = jnp.asarray(np.repeat(pushes, 20, axis=0), dtype)
+        return np.asarray(rollout(jax.tree.map(cast, cart), rest, wrench).pose, np.float64)
+
+    exact = poses(np.float64, iterations=60)
+    assert np.abs(exact).max() > 1.0
+    np.testing.assert_allclose(poses(np.float64), exact, atol=1e-9)
+    np.testing.assert_allclose(poses(np.float32), exact, atol=5e-5)

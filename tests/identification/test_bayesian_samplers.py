@@ -9,7 +9,7 @@ from bayesian_toys import Linear, linear
 from palpate.errors import PalpateError
 from palpate.identification.diagnostics import bulk_size, rhat
 from palpate.identification.hamiltonian import no_u_turn
-from palpate.identification.laplace import find_modes
+from palpate.identification.laplace import climb_each, find_modes
 from palpate.identification.metropolis import covariance_adapted, prior_scaled
 from palpate.identification.target import Target
 from palpate.identification.tempered import batch_of, compare, temper
@@ -47,6 +47,18 @@ def test_draws_have_the_moments_of_the_normal_posterior(name):
 def test_the_same_key_gives_the_same_draws():
     first, second = (sampled("covariance adapted", linear()).position for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_climb_of_some_coordinates_ends_where_the_others_leave_them_most_probable():
+    target = linear()
+    mean, covariance = target.moments()
+    moving = np.arange(target.dimension) > 0
+    start = np.asarray(jax.random.normal(KEY, (5, target.dimension)))
+    found = climb_each(jax.vmap(target.curvature), start, 40, moving)
+    held = np.asarray(found.position[:, 0], float)
+    np.testing.assert_allclose(np.sort(held), np.sort(start[:, 0]), rtol=1e-6)
+    conditional = mean[1:] + np.outer(held - mean[0], covariance[1:, 0] / covariance[0, 0])
+    np.testing.assert_allclose(found.position[:, 1:], conditional, atol=5e-3)
 
 
 def test_one_mode_of_a_normal_posterior_is_the_posterior():

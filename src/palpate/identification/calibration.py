@@ -93,7 +93,8 @@ def ranks_of(given: Problem, key: PRNGKeyArray, simulations: int, draws: int = 6
     size = truth.shape[1]
     noise = np.array(jax.random.normal(second, (simulations, STARTS, size)))
     noise[:, 0] = 0.0
-    modes = search(partial(_look, given.target, observed), noise)
+    parameters = np.arange(size) < given.target.parameters
+    modes = search(partial(_look, given.target, observed), noise, parameters)
     position = _sampled(given.target, observed, modes, third, draws)
     if not np.all(np.isfinite(position)):
         raise PalpateError("a posterior draw is not finite: expected a model that stays finite")

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
 from palpate.identification.likelihood import MotionPosterior, initial_position
@@ -21,7 +21,8 @@ LONGEST = 1.5  # prior standard deviations that a step may have
 DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
 SETTLED = 0.1  # gain of the density's logarithm in a few steps below which a climb has arrived
 ROUNDS = 3  # in which the start's errors are propagated anew
-STARTS, SCREENING = 24, 10  # of a search, and the steps of each
+WIDE = 2.0  # prior standard deviations: scales while starts are screened
+STARTS, SCREENING = 24, 25  # of a search, and the steps of each
 FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on for
 
 
@@ -74,9 +75,14 @@ def climb_each(
     curvature: Callable[[Array], tuple[Array, Array, Array]],
     position: Float[np.ndarray, "*batch starts free"],
     steps: int = 40,
+    moving: Bool[np.ndarray, " free"] | None = None,
 ) -> Modes:
-    """Climb side by side, with density, slope and `curvature` at positions shaped like these."""
+    """Climb side by side, with density, slope and `curvature` at positions shaped like these.
+
+    Coordinates that are not `moving`, if that is given, stay where they are.
+    """
     here = np.array(position, np.float64)
+    moves = np.ones(here.shape[-1]) if moving is None else np.asarray(moving, float)
     value, slope, information = _finite(curvature, here)
     damping = np.full(value.shape, DAMPING[0])
     gained = np.full(value.shape, np.inf)
@@ -85,7 +91,8 @@ def climb_each(
             break
         diagonal = np.einsum("...ii->...i", information)
         matrix = information + np.eye(here.shape[-1]) * (damping[..., None] * diagonal)[..., None]
-        change = np.linalg.solve(matrix, slope[..., None])[..., 0]
+        matrix = matrix * np.outer(moves, moves) + np.diag(1.0 - moves)
+        change = np.linalg.solve(matrix, (moves * slope)[..., None])[..., 0]
         length = np.linalg.norm(change, axis=-1, keepdims=True)
         proposed = here + change * np.minimum(1.0, LONGEST / (length + 1e-12))
         after = _finite(curvature, proposed)
@@ -114,12 +121,15 @@ def climb_each(
 def search(
     curvature: Callable[[Array], tuple[Array, Array, Array]],
     position: Float[np.ndarray, "*batch starts free"],
+    moving: Bool[np.ndarray, " free"],
 ) -> Modes:
     """Climb from many starts for a few steps, and from where the best of them are to the top.
 
-    Most starts of a body that may stick end where it sticks for ever, and climb no further.
+    Most starts of a body that may stick end where it sticks for ever, and climb no further. Only
+    `moving` coordinates climb at first: scales that are free as well would grow until all that
+    happened is the model's discrepancy, and leave most climbs there.
     """
-    screened = climb_each(curvature, position, SCREENING)
+    screened = climb_each(curvature, position, SCREENING, moving)
     return climb_each(curvature, np.asarray(screened.position[..., :FOLLOWED, :]), CLIMBING)
 
 
@@ -161,7 +171,9 @@ def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior,
     """
     noise = jax.random.normal(key, (STARTS, target.dimension))
     position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
-    modes = _found(target, search(functools.partial(_look, target), np.asarray(position)))
+    parameters = np.arange(target.dimension) < target.parameters
+    position = np.where(parameters, position, WIDE)
+    modes = _found(target, search(functools.partial(_look, target), position, parameters))
     if target.sensitivity is None:
         return target, modes
     for _ in range(ROUNDS - 1):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.experiments import one_shot, one_shot_pieces
+from palpate.experiments import one_shot, one_shot_pieces, one_shot_regression
 from palpate.experiments.furniture_recording import POSE, WRENCH, starting_furniture
 from palpate.experiments.one_shot_figure import shares_figure
 from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
@@ -103,3 +103,24 @@ def test_samples_count_from_where_the_piece_is_seen_to_have_moved(pushes):
     np.testing.assert_allclose(wrench[1], mean, rtol=1e-5)
     rate = (after.pose - before.pose) / 0.1
     np.testing.assert_allclose(0.5 * (before.velocity + after.velocity), rate, atol=0.05)
+
+
+def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatch, pushes):
+    alone = one_shot_pieces._alone(pushes, 0)
+    aligned = alone.align(PERIOD, POSE, WRENCH)
+    call, given = one_shot_regression.cut, []
+
+    def noting(aligned, *arguments, **options):
+        given.append(aligned.observation)
+        return call(aligned, *arguments, **options)
+
+    def stop(target, **options):
+        raise StopIteration
+
+    monkeypatch.setattr(one_shot_regression, "cut", noting)
+    monkeypatch.setattr(one_shot_regression, "sample", stop)
+    with pytest.raises(StopIteration):
+        one_shot_regression._ours(alone, aligned, alone, 3, 10, 0)
+    transitions(aligned, starting_furniture(alone, PERIOD), 3)
+    np.testing.assert_array_equal(*given)
+    assert len(given[0][0]) < len(aligned.observation[0])

@@ -153,6 +153,12 @@ def test_pieces_at_rest_begin_at_rest_and_short_ones_are_padded():
         cut(recording, SLED, 1.0, count=3)
 
 
+@pytest.mark.parametrize(("frames", "kept"), [(61, [50, 10]), (60, [50]), (9, [8])])
+def test_what_remains_is_kept_unless_it_is_shorter_than_the_smoothing(frames, kept):
+    pieces = cut(pushes(SLED, 1, trials=1, frames=frames), SLED, 1.0, at_rest=True)
+    np.testing.assert_array_equal(np.asarray(pieces.seen).all(axis=2).sum(axis=1), kept)
+
+
 def test_a_recording_in_which_nothing_is_seen_is_refused():
     recording = pushes(SLED, 1)
     with pytest.raises(PalpateError, match="no piece of 1 s can begin"):

@@ -2,8 +2,9 @@
 
 A sample is a tenth of a second of handling: pose and velocity before and after, smoothed from what
 a tracker shows, and the mean wrench between. All are given the same handling up to n samples after
-the piece is first seen to have moved, before which nobody could know how it does; pushes of 2 s are
-then predicted open loop. Regressions get the inputs that suit them: raw as in the deck (whole
+the piece is first seen to have moved, before which nobody could know how it does, and the tenth of
+a second after it, without which nobody knows the last velocity; pushes of 2 s are then predicted
+open loop. Regressions get the inputs that suit them: raw as in the deck (whole
 state, whole wrench) and in the piece's own axes; of both the better on these very pushes counts.
 """
 
@@ -78,11 +79,11 @@ def _ours(
     draws: int,
     seed: int,
 ) -> float:
-    """Of the posterior given the samples; padded, so that all sizes compile once."""
+    """Of the posterior given the same frames; padded, so that all sizes compile once."""
     model = starting_furniture(handled, PERIOD)
     seconds = PIECE * SAMPLE
     pieces = cut(
-        first_samples(aligned, size), model, seconds, at_rest=True, count=max(SIZES) // PIECE
+        first_samples(aligned, size + 1), model, seconds, at_rest=True, count=max(SIZES) // PIECE
     )
     scales = inferred_scales(model, noise_scale(aligned, model))
     posterior = sample(motion_posterior(model, pieces, scales), draws=draws, seed=seed)
@@ -108,11 +109,7 @@ def _theirs(handled: Recording, aligned: Aligned, pushes: Recording, kind: str, 
 def transitions(
     aligned: Aligned, model: Planar, size: int
 ) -> tuple[PlanarState, jax.Array, PlanarState]:
-    """States before the samples, mean wrenches, and states after; each leads with the samples.
-
-    The state after the last sample is smoothed over frames that follow it: what the regressions
-    see of those is more than the posterior does.
-    """
+    """States before the samples, mean wrenches, and states after; each leads with the samples."""
     starts = cut(first_samples(aligned, size + 1), model, SAMPLE, at_rest=True)
     states = PlanarState(starts.pose, starts.rate)
     wrench = jnp.mean(starts.action, axis=1)

@@ -70,21 +70,23 @@ def cut(
     """Cut aligned trials into consecutive pieces of `seconds`, each beginning where one ended.
 
     `at_rest` says that every trial begins at rest, so that its first piece begins with a velocity
-    that is known to be zero. What remains of a trial is a padded piece if it is at least half as
-    long. `count` pads the pieces with ones in which nothing is seen, so that recordings of
-    different lengths have the same shape and compile once.
+    that is known to be zero. What remains of a trial is a padded piece, unless it is shorter than
+    `REACH`, from which little is learnt but where it begins. `count` pads the pieces with ones in
+    which nothing is seen, so that recordings of different lengths have the same shape and compile
+    once.
 
     Raises `PalpateError` when no piece can begin anywhere, or `count` is too small.
     """
     period = aligned.period
     horizon = max(1, round(seconds / period))
+    shortest = min(horizon, max(1, round(REACH / period)))
     spread = noise_scale(aligned, model)
     pieces = []
     for trial, length in enumerate(aligned.length):
         observed = aligned.observation[trial, :length]
         for first in range(0, int(length) - 1, horizon):
             last = min(first + horizon, int(length) - 1)
-            if last - first < min(horizon, int(length) - 1) / 2:
+            if last - first < min(shortest, int(length) - 1):
                 continue
             still = at_rest and first == 0
             start = _smoothed(observed, model, first, period, spread, still)

@@ -1,13 +1,21 @@
 """The parts of `reproduce one-shot` that count: what is judged, and against what."""
 
+import jax
 import numpy as np
 import pytest
 
 from palpate.experiments import one_shot, one_shot_pieces, one_shot_regression
-from palpate.experiments.furniture_recording import POSE, WRENCH, starting_furniture
+from palpate.experiments.furniture_recording import (
+    POSE,
+    WRENCH,
+    starting_furniture,
+    structures,
+)
+from palpate.experiments.identify_bayesian import posterior_of
 from palpate.experiments.one_shot_figure import shares_figure
 from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
 from palpate.experiments.one_shot_regression import OURS, RIVALS, first_samples, transitions
+from palpate.identification.laplace import settle
 from palpate.identification.predictive import Predicted
 from palpate.worlds.furniture import FurnitureWorld, Piece
 from palpate.worlds.furniture_handling import Together, Wiggle, record, record_pushes
@@ -124,3 +132,11 @@ def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatc
     transitions(aligned, starting_furniture(alone, PERIOD), 3)
     np.testing.assert_array_equal(*given)
     assert len(given[0][0]) < len(aligned.observation[0])
+
+
+@pytest.mark.slow
+def test_a_hinge_is_found_where_climbs_with_free_scales_call_all_that_happens_noise():
+    handled, _ = one_shot_pieces.recordings("hinged", 912_000, 1)
+    target = posterior_of(structures(handled, PERIOD)["hinge"], handled.align(PERIOD, POSE, WRENCH))
+    _, modes = settle(target, jax.random.key(0))
+    assert float(modes.density[0]) > 7700.0  # 6680 is where the others end

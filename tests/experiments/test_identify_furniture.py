@@ -15,8 +15,8 @@ from palpate.experiments.furniture_recording import (
     names_of,
     record_pieces,
     starting_furniture,
-    structures,
 )
+from palpate.experiments.furniture_structures import structures
 from palpate.experiments.identify_bayesian import begins_at_rest
 from palpate.recording import Channel, Recording, Role, Trial
 

@@ -8,9 +8,10 @@ from palpate.experiments import one_shot, one_shot_pieces, one_shot_regression
 from palpate.experiments.furniture_recording import (
     POSE,
     WRENCH,
+    alone,
     starting_furniture,
-    structures,
 )
+from palpate.experiments.furniture_structures import structures
 from palpate.experiments.identify_bayesian import posterior_of
 from palpate.experiments.one_shot_figure import shares_figure
 from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
@@ -84,11 +85,11 @@ def test_a_scene_is_handled_all_at_once_and_can_be_taken_apart():
     assert len(wrench) == 75
     assert np.abs(wrench[10:50]).max(axis=(0, 2)).min() > 1.0
     assert np.abs(wrench[50:, 1]).max() > 1.0 > np.abs(wrench[51:, 0]).max()
-    alone = one_shot_pieces._alone(handled, 1)
+    second = alone(handled, 1)
     np.testing.assert_array_equal(
-        alone.trials[0][POSE].values[:, 0], handled.trials[0][POSE].values[:, 1]
+        second.trials[0][POSE].values[:, 0], handled.trials[0][POSE].values[:, 1]
     )
-    model, whole = starting_furniture(alone, PERIOD), starting_furniture(handled, PERIOD)
+    model, whole = starting_furniture(second, PERIOD), starting_furniture(handled, PERIOD)
     np.testing.assert_array_equal(model.half_extent[0], whole.half_extent[1])
 
 
@@ -114,8 +115,8 @@ def test_samples_count_from_where_the_piece_is_seen_to_have_moved(pushes):
 
 
 def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatch, pushes):
-    alone = one_shot_pieces._alone(pushes, 0)
-    aligned = alone.align(PERIOD, POSE, WRENCH)
+    first = alone(pushes, 0)
+    aligned = first.align(PERIOD, POSE, WRENCH)
     call, given = one_shot_regression.cut, []
 
     def noting(aligned, *arguments, **options):
@@ -128,8 +129,8 @@ def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatc
     monkeypatch.setattr(one_shot_regression, "cut", noting)
     monkeypatch.setattr(one_shot_regression, "sample", stop)
     with pytest.raises(StopIteration):
-        one_shot_regression._ours(alone, aligned, alone, 3, 10, 0)
-    transitions(aligned, starting_furniture(alone, PERIOD), 3)
+        one_shot_regression._ours(first, aligned, first, 3, 10, 0)
+    transitions(aligned, starting_furniture(first, PERIOD), 3)
     np.testing.assert_array_equal(*given)
     assert len(given[0][0]) < len(aligned.observation[0])
 

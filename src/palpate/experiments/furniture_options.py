@@ -57,7 +57,8 @@ class IdentifyFurniture(IdentifyBayesian):
     A recording has the channels "pose" (m, m, rad) and "wrench" (N, N, N m, about the middle of
     each outline, in the world's axes). Bayesian: the result is draws of models that all agree with
     the recording, and what it could not tell. With --structure compare, wheels, feet, a hinge and
-    bolts are compared by how probable they make the recording.
+    bolts are compared by how probable they make the recording, for each body; and whether some of
+    them are joined.
 
     1. A recording of palpate:                  palpate identify furniture R.npz
     2. Scored on pushes it was not fitted to:   palpate identify furniture R.npz --validate P.npz
@@ -77,7 +78,7 @@ class IdentifyFurniture(IdentifyBayesian):
     """Of a rectangle around each body, m."""
     structure: Literal["wheels", "feet", "hinge", "bolted", "compare"] = "wheels"
     """What every body is taken to be; a wheel that resists enough is as good as a hinge. To compare
-    all four takes minutes."""
+    all four takes minutes, for each body."""
     wheels: int = 1
     """Of each body that has wheels: those that resist; free casters need none."""
     law: Literal["coulomb", "viscous"] = "coulomb"
@@ -90,13 +91,16 @@ class IdentifyFurniture(IdentifyBayesian):
         return checked(recording)
 
     def hypotheses(self, recording: Recording, period: float) -> Mapping[str, Model]:
-        """Models to be compared, by name: see `structures`."""
-        from palpate.experiments.furniture_recording import starting_furniture, structures
+        """Models to be compared, by name: see `furniture_structures`."""
+        from palpate.experiments import furniture_structures
+        from palpate.experiments.furniture_recording import starting_furniture
 
         if self.wheels < 1:
             raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
         if self.structure == "wheels":  # without the links that only a hinge needs
             like = {"wheels": self.wheels, "law": self.law}
             return {"wheels": starting_furniture(recording, period, self.size, **like)}
-        found = structures(recording, period, self.size, self.wheels, self.law)
-        return found if self.structure == "compare" else {self.structure: found[self.structure]}
+        about = recording, period, self.size, self.wheels, self.law
+        if self.structure == "compare":
+            return furniture_structures.hypotheses(*about, seed=self.seed)
+        return {self.structure: furniture_structures.structures(*about)[self.structure]}

@@ -4,9 +4,8 @@ import dataclasses
 import json
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
@@ -100,40 +99,6 @@ def starting_furniture(
     )
 
 
-def structures(
-    recording: Recording,
-    period: float,
-    size: tuple[float, float] | None = None,
-    wheels: int = 1,
-    law: Literal["coulomb", "viscous"] = "coulomb",
-) -> dict[str, Planar]:
-    """What each body may be, as models of one shape: on wheels, on feet, hinged, or bolted down.
-
-    What is on feet or on a hinge has no wheels that resist; free casters are small friction of the
-    floor. Arguments as of `starting_furniture` and `furniture`.
-    """
-    bodies = range(recording.trials[0][POSE].values.shape[1])
-    model = starting_furniture(
-        recording, period, size, wheels=wheels, law=law, pivots=dict.fromkeys(bodies)
-    )
-    rolling, held = jnp.ones_like(model.wheel), jnp.ones_like(model.pivot)
-    none = 0.0
-    return {
-        name: dataclasses.replace(
-            model,
-            wheel=wheel * rolling,
-            pivot=pivot * held,
-            bolted=bolted * jnp.ones_like(model.bolted),
-        )
-        for name, wheel, pivot, bolted in (
-            ("wheels", 1.0, none, none),
-            ("feet", none, none, none),
-            ("hinge", none, 1.0, none),
-            ("bolted", none, none, 1.0),
-        )
-    }
-
-
 def record_pieces(
     kinds: Sequence[str], seed: int, trials: int, duration: float, pushes: bool
 ) -> Recording:
@@ -158,6 +123,24 @@ def record_pieces(
         for trial in part.trials
     ]
     return dataclasses.replace(parts[0], trials=tuple(named))
+
+
+def alone(recording: Recording, body: int) -> Recording:
+    """A recording as if one of its bodies had been alone."""
+    trials = [
+        dataclasses.replace(
+            trial,
+            channels={
+                of: dataclasses.replace(trial[of], values=trial[of].values[:, body : body + 1])
+                for of in (POSE, WRENCH)
+            },
+        )
+        for trial in recording.trials
+    ]
+    told = {"bodies": json.dumps([names_of(recording)[body]])}
+    return dataclasses.replace(
+        recording, trials=tuple(trials), provenance=dict(recording.provenance) | told
+    )
 
 
 def _first_seen(recording: Recording) -> np.ndarray:

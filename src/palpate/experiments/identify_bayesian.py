@@ -99,11 +99,27 @@ def probabilities(
     """
     if len(hypotheses) == 1:
         return dict.fromkeys(hypotheses, 1.0)
+    return shares({name: of for name, (of, _) in best(hypotheses, aligned, seed).items()})
+
+
+def best(
+    hypotheses: Mapping[str, Model], aligned: Aligned, seed: int = 0
+) -> dict[str, tuple[float, Model]]:
+    """Of each hypothesis the logarithm of its evidence, and its most probable model."""
     key = jax.random.fold_in(jax.random.key(seed), 1)
-    found = [settle(posterior_of(model, aligned), key)[1] for model in hypotheses.values()]
-    evidence = np.array([float(np.max(np.asarray(modes.evidence))) for modes in found])
-    shares = np.exp(evidence - evidence.max())
-    return dict(zip(hypotheses, map(float, shares / shares.sum()), strict=True))
+    found = {}
+    for name, model in hypotheses.items():
+        target, modes = settle(posterior_of(model, aligned), key)
+        evidence = float(np.max(np.asarray(modes.evidence)))
+        found[name] = evidence, target.model(modes.position[0])
+    return found
+
+
+def shares(evidence: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities, all alike before, of logarithms of evidence."""
+    most = max(evidence.values())
+    weights = {name: float(np.exp(value - most)) for name, value in evidence.items()}
+    return {name: weight / sum(weights.values()) for name, weight in weights.items()}
 
 
 def posterior_of(model: Model, aligned: Aligned) -> MotionPosterior:

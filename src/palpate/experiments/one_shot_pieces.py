@@ -5,7 +5,6 @@ is predicted.
 """
 
 import dataclasses
-import json
 import time
 from typing import Any
 
@@ -16,10 +15,11 @@ import numpy as np
 from palpate.experiments.furniture_recording import (
     POSE,
     WRENCH,
+    alone,
     names_of,
     starting_furniture,
-    structures,
 )
+from palpate.experiments.furniture_structures import structures
 from palpate.experiments.identify_bayesian import LEVEL, PIECE, Found, identify, posterior_of
 from palpate.identification.bayesian import Posterior, sample
 from palpate.identification.laplace import settle
@@ -101,8 +101,8 @@ def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
     together = starting_furniture(handled, PERIOD)
     values = []
     for body in range(len(names_of(handled))):
-        alone = _alone(handled, body)
-        target = posterior_of(starting_furniture(alone, PERIOD), alone.align(PERIOD, POSE, WRENCH))
+        piece = alone(handled, body)
+        target = posterior_of(starting_furniture(piece, PERIOD), piece.align(PERIOD, POSE, WRENCH))
         target, modes = settle(target, jax.random.fold_in(jax.random.key(seed), body))
         found = target.model(modes.position[0])
         values.append({path: value_of(found, path) for path in target.coordinates.declarations})
@@ -110,26 +110,6 @@ def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
     apart = dataclasses.replace(together, pairs=together.pairs[:0])
     target = posterior_of(with_values(apart, joined), handled.align(PERIOD, POSE, WRENCH))
     return sample(target, draws=draws, seed=seed)
-
-
-def _alone(recording: Recording, body: int) -> Recording:
-    """A recording as if one of its bodies had been alone."""
-    name = names_of(recording)[body]
-    outline = json.loads(str(recording.provenance["outlines"]))[name]
-    trials = [
-        dataclasses.replace(
-            trial,
-            channels={
-                of: dataclasses.replace(trial[of], values=trial[of].values[:, body : body + 1])
-                for of in (POSE, WRENCH)
-            },
-        )
-        for trial in recording.trials
-    ]
-    told = {"bodies": json.dumps([name]), "outlines": json.dumps({name: outline})}
-    return dataclasses.replace(
-        recording, trials=tuple(trials), provenance=dict(recording.provenance) | told
-    )
 
 
 def judged(model: Model, predicted: Predicted, pieces: Segments) -> Pushes:

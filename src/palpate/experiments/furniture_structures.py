@@ -1,0 +1,199 @@
+"""What furniture may be, as models to be compared: on wheels, on feet, hinged, bolted, joined.
+
+Several bodies are taken one by one first, as if nothing but the measured wrench moved them. Which
+of them are joined is then a question about the whole: a pivot is a candidate where one point of
+the one body stays at one point of the other, and evidence decides.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from palpate.experiments.furniture_recording import (
+    POSE,
+    WRENCH,
+    alone,
+    names_of,
+    starting_furniture,
+)
+from palpate.experiments.identify_bayesian import best, shares
+from palpate.models.model import Model
+from palpate.models.planar import Planar
+from palpate.parameters import parameters_of, value_of, with_values
+from palpate.recording import Recording
+
+Law = Literal["coulomb", "viscous"]
+Pair = tuple[int, int]
+
+SLACK = 0.02  # m by which the two points of a joint may part (root mean square)
+MOVED = 0.05  # m or rad: who moves less tells nothing of joints
+JOINTS = 3  # candidates at most, the tightest: every set of them is a hypothesis
+
+
+def structures(
+    recording: Recording,
+    period: float,
+    size: tuple[float, float] | None = None,
+    wheels: int = 1,
+    law: Law = "coulomb",
+) -> dict[str, Planar]:
+    """What each body may be, as models of one shape: on wheels, on feet, hinged, or bolted down.
+
+    What is on feet or on a hinge has no wheels that resist; free casters are small friction of the
+    floor. Arguments as of `starting_furniture` and `furniture`.
+    """
+    bodies = range(len(names_of(recording)))
+    model = starting_furniture(
+        recording, period, size, wheels=wheels, law=law, pivots=dict.fromkeys(bodies)
+    )
+    return {
+        name: _masked(model, dict.fromkeys(bodies, name))
+        for name in ("wheels", "feet", "hinge", "bolted")
+    }
+
+
+def hypotheses(
+    recording: Recording,
+    period: float,
+    size: tuple[float, float] | None = None,
+    wheels: int = 1,
+    law: Law = "coulomb",
+    seed: int = 0,
+) -> dict[str, Planar]:
+    """What the bodies of a recording may be together, by a name that says it.
+
+    Of one body, its `structures`. Of several, each is what it most probably is by itself, which is
+    printed, and any of the `joints` may be there: what is joined is taken to be on wheels, as
+    nobody knows what its wheels did before the joint is known. Arguments as of `structures`.
+    """
+    names = names_of(recording)
+    if len(names) == 1:
+        return structures(recording, period, size, wheels, law)
+    kinds, pieces = {}, []
+    for body, name in enumerate(names):
+        piece = alone(recording, body)
+        found = best(
+            structures(piece, period, size, wheels, law), piece.align(period, POSE, WRENCH), seed
+        )
+        probability = shares({kind: evidence for kind, (evidence, _) in found.items()})
+        kinds[body] = max(probability, key=probability.__getitem__)
+        pieces.append({kind: model for kind, (_, model) in found.items()})
+        told = ", ".join(f"{kind} {share:.2g}" for kind, share in probability.items())
+        print(f"{name} by itself: {kinds[body]} (probability of each: {told})", flush=True)
+    likely = joints(recording)
+    models = {}
+    for chosen in _sets(likely):
+        joined = {body for pair in chosen for body in pair}
+        being = {body: "wheels" if body in joined else kind for body, kind in kinds.items()}
+        where = {pair: likely[pair] for pair in chosen}
+        model = _together(recording, period, size, wheels, law, being, where)
+        begun = [pieces[body][kind] for body, kind in being.items()]
+        models[_named(names, being, chosen)] = _begun(model, begun)
+    return models
+
+
+def joints(recording: Recording) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
+    """Pairs of bodies that a pivot may join, the tightest first, and where.
+
+    By pair (i, j), i < j, the point of each body (2,), m in its frame, that stays at that of the
+    other in all frames in which both are seen: least squares over R_i a_i + p_i = R_j a_j + p_j.
+    Pairs that part by more than `SLACK`, or of which one hardly moves, are left out.
+    """
+    poses = [np.asarray(trial[POSE].values, float) for trial in recording.trials]
+    found = {}
+    for pair in itertools.combinations(range(poses[0].shape[1]), 2):
+        of = [trial[:, pair][np.isfinite(trial[:, pair]).all(axis=(1, 2))] for trial in poses]
+        of = [seen for seen in of if len(seen)]
+        if not of or not all(
+            max(np.ptp(seen[:, body], axis=0).max() for seen in of) > MOVED for body in range(2)
+        ):
+            continue
+        place, parting = _common_point(np.concatenate(of))
+        if parting <= SLACK:
+            found[pair] = parting, place
+    tightest = sorted(found, key=lambda pair: found[pair][0])[:JOINTS]
+    return {pair: found[pair][1] for pair in tightest}
+
+
+def _common_point(
+    poses: Float[np.ndarray, "frames 2 3"],
+) -> tuple[tuple[np.ndarray, np.ndarray], float]:
+    """The points of two bodies that stay closest together, and how far they part, m."""
+    cosine, sine = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    turn = np.stack([np.stack([cosine, -sine], -1), np.stack([sine, cosine], -1)], -2)
+    design = np.concatenate([turn[:, 0], -turn[:, 1]], axis=2).reshape(-1, 4)
+    between = (poses[:, 1, :2] - poses[:, 0, :2]).reshape(-1)
+    # The shortest where the turn between them never changes: any point would do.
+    anchors, *_ = np.linalg.lstsq(design, between, rcond=1e-3)
+    off = (design @ anchors - between).reshape(-1, 2)
+    return (anchors[:2], anchors[2:]), float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def _sets(likely: Iterable[Pair]) -> list[tuple[Pair, ...]]:
+    """All sets of candidate joints, the empty one first."""
+    pairs = list(likely)
+    return [chosen for n in range(len(pairs) + 1) for chosen in itertools.combinations(pairs, n)]
+
+
+def _together(
+    recording: Recording,
+    period: float,
+    size: tuple[float, float] | None,
+    wheels: int,
+    law: Law,
+    being: Mapping[int, str],
+    chosen: Mapping[Pair, tuple[np.ndarray, np.ndarray]],
+) -> Planar:
+    """All bodies as one model, with the `chosen` joints."""
+    pivots: dict[int, int | None] = {b: None for b, kind in being.items() if kind == "hinge"}
+    where = {}
+    # A body has one pivot of its own: as few joints as there are can be shared out so.
+    owners = next(of for of in itertools.product(*chosen) if len(set(of)) == len(of))
+    for owner, pair in zip(owners, chosen, strict=True):
+        pivots[owner] = sum(pair) - owner
+        where[owner] = chosen[pair][pair.index(owner)]
+    model = starting_furniture(recording, period, size, wheels=wheels, law=law, pivots=pivots)
+    anchor = np.array(model.link_anchor)
+    for body, place in where.items():
+        anchor[body, 0] = place / np.asarray(model.half_extent[body])
+    model = dataclasses.replace(model, link_anchor=jnp.asarray(anchor))
+    return _masked(model, being, set(where))
+
+
+def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:
+    """The model with the values that its bodies have by themselves, but for its joints."""
+    values = {
+        path: jnp.concatenate([value_of(piece, path) for piece in pieces])
+        for path in parameters_of(model)
+        if value_of(model, path).size
+    }
+    anchor = values.pop("link_anchor", model.link_anchor)
+    to_world = (model.link_to < 0)[..., None]
+    values["link_anchor"] = jnp.where(to_world, anchor, model.link_anchor)
+    return with_values(model, values)
+
+
+def _masked(model: Planar, being: Mapping[int, str], joined: Iterable[int] = ()) -> Planar:
+    """The model with the wheels, hinges and bolts of what its bodies are, and their joints."""
+    rows = range(len(being))
+    rolls = jnp.asarray([[being[b] == "wheels"] for b in rows])
+    held = jnp.asarray([[being[b] == "hinge" or b in joined] for b in rows])
+    bolted = jnp.asarray([being[b] == "bolted" for b in rows])
+    return dataclasses.replace(
+        model,
+        wheel=jnp.where(rolls, jnp.ones_like(model.wheel), 0.0),
+        pivot=jnp.where(held, jnp.ones_like(model.pivot), 0.0),
+        bolted=jnp.where(bolted, jnp.ones_like(model.bolted), 0.0),
+    )
+
+
+def _named(names: tuple[str, ...], being: Mapping[int, str], chosen: Iterable[Pair]) -> str:
+    """Such as "cart: wheels, table: wheels, cart joined to table"."""
+    parts = [f"{names[body]}: {kind}" for body, kind in being.items()]
+    parts += [f"{names[first]} joined to {names[second]}" for first, second in chosen]
+    return ", ".join(parts)

@@ -1,0 +1,160 @@
+"""Which bodies are joined: candidates from how they move, and the verdict of the evidence."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.experiments import furniture_structures
+from palpate.experiments.furniture_recording import POSE, WRENCH, alone
+from palpate.experiments.furniture_structures import hypotheses, joints
+from palpate.experiments.identify_bayesian import posterior_of
+from palpate.identification.laplace import CLIMBING, climb
+from palpate.identification.likelihood import initial_position
+from palpate.models.model import rollout
+from palpate.models.planar_shapes import furniture, rectangle
+from palpate.recording import Channel, Recording, Role, Trial
+
+PERIOD = 0.02
+NOISE = np.array([5e-4, 5e-4, 1e-3])
+BOX = rectangle(1.0, 0.6)
+START = np.array([[0.0, 0.0, 0.3], [1.1, 0.3, 0.2]])
+PLACE = np.array([0.55, 0.1])  # m, of the joint in the first body's frame
+
+
+def pulled(joined: bool, seconds: float = 6.0) -> Recording:
+    """The first of two boxes wiggled, the second with it or standing; then the second."""
+    model = furniture(
+        [BOX, BOX],
+        wheels=0,
+        pivots={0: 1} if joined else None,
+        poses=START,
+        link_anchor=PLACE / (0.5, 0.3) if joined else 0.0,
+        mass=[12.0, 8.0],
+        control_period=PERIOD,
+    )
+    time = PERIOD * np.arange(round(seconds / PERIOD))
+    wave = np.stack([np.sin(2.1 * time), np.sin(1.3 * time), 0.4 * np.sin(1.7 * time)], axis=-1)
+    random, trials = np.random.default_rng(0), []
+    for held in range(2):
+        wrench = np.zeros((len(time), 2, 3))
+        wrench[:, held] = 40.0 * wave
+        state = model.initial_state(jnp.asarray(np.stack([START, START])))
+        poses = np.asarray(rollout(model, state, jnp.asarray(wrench)).pose)
+        poses = np.concatenate([START[None], poses])
+        poses += NOISE * random.standard_normal(poses.shape)
+        stamps = PERIOD * np.arange(len(poses))
+        channels = {
+            POSE: Channel(POSE, Role.OBSERVATION, stamps, poses, "m, m, rad"),
+            WRENCH: Channel(WRENCH, Role.COMMAND, stamps[:-1], wrench, "N, N, N m"),
+        }
+        trials.append(Trial(f"held {held}", channels))
+    outlines = {"cart": BOX.tolist(), "trailer": BOX.tolist()}
+    told = {"bodies": json.dumps(list(outlines)), "outlines": json.dumps(outlines)}
+    return Recording(tuple(trials), told)
+
+
+@pytest.fixture(scope="module")
+def joined():
+    return pulled(True)
+
+
+def test_a_joint_is_where_one_point_of_both_stays_together(joined):
+    ((pair, (on_first, on_second)),) = joints(joined).items()
+    assert pair == (0, 1)
+    np.testing.assert_allclose(on_first, PLACE, atol=5e-3)
+    place = START[0, :2] + turned(PLACE, START[0, 2])
+    np.testing.assert_allclose(on_second, turned(place - START[1, :2], -START[1, 2]), atol=5e-3)
+
+
+def turned(point, angle):
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([cosine * point[0] - sine * point[1], sine * point[0] + cosine * point[1]])
+
+
+def test_what_moves_apart_or_not_at_all_is_no_candidate(joined):
+    assert not joints(pulled(False))
+    one = alone(joined, 0).trials[0]
+    still = np.concatenate([one[POSE].values, 0.0 * one[POSE].values], axis=1)
+    channels = {POSE: Channel(POSE, Role.OBSERVATION, one[POSE].time, still, "m, m, rad")}
+    assert not joints(Recording((Trial("one", channels),), {}))
+
+
+def alone_is(first, second, monkeypatch):
+    """Stand in for the verdict on each body; the models weigh 10 and 20 kg. What was looked at."""
+    seen = []
+
+    def best(models, aligned, seed):
+        seen.append(aligned.observation.shape)
+        kind, mass = ((first, 10.0), (second, 20.0))[len(seen) - 1]
+        found = {n: dataclasses.replace(m, mass=jnp.array([mass])) for n, m in models.items()}
+        return {name: (0.0 if name == kind else -1e3, model) for name, model in found.items()}
+
+    monkeypatch.setattr(furniture_structures, "best", best)
+    return seen
+
+
+def test_every_set_of_candidates_is_a_hypothesis_about_the_whole(joined, monkeypatch):
+    seen = alone_is("feet", "bolted", monkeypatch)
+    models = hypotheses(joined, PERIOD)
+    assert seen == [(2, 301, 1, 3)] * 2
+    apart, together = models.values()
+    assert list(models) == [
+        "cart: feet, trailer: bolted",
+        "cart: wheels, trailer: wheels, cart joined to trailer",
+    ]
+    assert not apart.pivot.size
+    np.testing.assert_array_equal(apart.mass, [10, 20])
+    np.testing.assert_array_equal(together.mass, [10, 20])
+    np.testing.assert_array_equal(apart.bolted, [0, 1])
+    assert not apart.wheel.any()
+    np.testing.assert_array_equal(together.pivot, [[1], [0]])
+    np.testing.assert_array_equal(together.link_to, [[1], [-1]])
+    assert together.wheel.all()
+    np.testing.assert_allclose(
+        together.link_anchor[0, 0] * together.half_extent[0], joints(joined)[0, 1][0], rtol=1e-5
+    )
+
+
+def test_a_hinge_gives_way_to_a_joint(joined, monkeypatch):
+    alone_is("hinge", "hinge", monkeypatch)
+    apart, together = hypotheses(joined, PERIOD).values()
+    np.testing.assert_array_equal(apart.pivot, [[1], [1]])
+    np.testing.assert_array_equal(apart.link_to, [[-1], [-1]])
+    np.testing.assert_array_equal(together.pivot, [[1], [0]])
+
+
+def test_three_bodies_joined_all_round_share_out_their_pivots(joined):
+    one = joined.trials[0]
+    poses = np.concatenate([one[POSE].values, one[POSE].values[:, :1] + 2.0], axis=1)
+    channels = {POSE: Channel(POSE, Role.OBSERVATION, one[POSE].time, poses, "m, m, rad")}
+    three = Recording((Trial("one", channels),), {})
+    round_about = {pair: (PLACE, PLACE) for pair in ((0, 2), (1, 2), (0, 1))}
+    model = furniture_structures._together(
+        three, PERIOD, (1.0, 0.6), 1, "coulomb", dict.fromkeys(range(3), "wheels"), round_about,
+    )  # fmt: skip
+    assert model.pivot.sum() == 3
+    pairs = {frozenset((body, int(to))) for body, to in enumerate(model.link_to[:, 0])}
+    assert pairs == set(map(frozenset, round_about))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("are_joined", [True, False])
+def test_evidence_tells_what_is_joined_from_what_only_may_be(are_joined, monkeypatch):
+    seen = pulled(are_joined, 4.0)
+    alone_is("feet", "feet", monkeypatch)
+    where = (PLACE, np.array([-0.55, -0.1]))
+    monkeypatch.setattr(furniture_structures, "joints", lambda recording: {(0, 1): where})
+    models = hypotheses(seen, PERIOD)
+    apart, together = (evidence(model, seen) for model in models.values())
+    assert (together > apart) == are_joined
+    assert abs(together - apart) > 100.0
+
+
+def evidence(model, recording):
+    """At the top of one climb: the search from many starts is tested elsewhere, and takes long."""
+    target = posterior_of(model, recording.align(PERIOD, POSE, WRENCH))
+    start = initial_position(target)[None]
+    return float(climb(target, start, CLIMBING).evidence[0])

@@ -123,11 +123,11 @@ def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatc
         given.append(aligned.observation)
         return call(aligned, *arguments, **options)
 
-    def stop(target, **options):
+    def stop(targets, draws, seed):
         raise StopIteration
 
     monkeypatch.setattr(one_shot_regression, "cut", noting)
-    monkeypatch.setattr(one_shot_regression, "sample", stop)
+    monkeypatch.setattr(one_shot_regression, "identify", stop)
     with pytest.raises(StopIteration):
         one_shot_regression._ours(first, aligned, first, 3, 10, 0)
     transitions(aligned, starting_furniture(first, PERIOD), 3)

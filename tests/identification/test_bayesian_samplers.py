@@ -61,6 +61,21 @@ def test_a_climb_of_some_coordinates_ends_where_the_others_leave_them_most_proba
     np.testing.assert_allclose(found.position[:, 1:], conditional, atol=5e-3)
 
 
+def test_data_that_say_all_of_one_direction_and_nothing_of_the_others_are_climbed():
+    """A wheel without friction in a start far out: information of 1e22 beside the prior's."""
+
+    def curvature(position):
+        both = jnp.sum(position, axis=-1)
+        value = -0.5e22 * both**2 - 0.5 * jnp.sum(position**2, axis=-1)
+        slope = -1e22 * both[..., None] - position
+        matrix = np.full((len(position), 3, 3), 1e22) + np.eye(3)
+        return value, slope, matrix
+
+    found = climb_each(curvature, np.zeros((2, 3)), 5)
+    unknown = np.linalg.eigvalsh(np.asarray(found.covariance, float))
+    np.testing.assert_allclose(unknown, np.tile([0.0, 1.0, 1.0], (2, 1)), atol=0.02)
+
+
 def test_one_mode_of_a_normal_posterior_is_the_posterior():
     target = linear()
     mean, covariance = target.moments()

@@ -21,7 +21,7 @@ from palpate.experiments.furniture_recording import (
     names_of,
     starting_furniture,
 )
-from palpate.experiments.identify_bayesian import best, shares
+from palpate.experiments.identify_bayesian import evidence, explore, posterior_of, shares
 from palpate.models.model import Model
 from palpate.models.planar import Planar
 from palpate.parameters import parameters_of, value_of, with_values
@@ -77,12 +77,14 @@ def hypotheses(
     kinds, pieces = {}, []
     for body, name in enumerate(names):
         piece = alone(recording, body)
-        found = best(
-            structures(piece, period, size, wheels, law), piece.align(period, POSE, WRENCH), seed
+        aligned = piece.align(period, POSE, WRENCH)
+        models = structures(piece, period, size, wheels, law)
+        found = explore(
+            {kind: posterior_of(model, aligned) for kind, model in models.items()}, seed
         )
-        probability = shares({kind: evidence for kind, (evidence, _) in found.items()})
+        probability = shares({kind: evidence(modes) for kind, (_, modes) in found.items()})
         kinds[body] = max(probability, key=probability.__getitem__)
-        pieces.append({kind: model for kind, (_, model) in found.items()})
+        pieces.append({k: target.model(modes.position[0]) for k, (target, modes) in found.items()})
         told = ", ".join(f"{kind} {share:.2g}" for kind, share in probability.items())
         print(f"{name} by itself: {kinds[body]} (probability of each: {told})", flush=True)
     likely = joints(recording)

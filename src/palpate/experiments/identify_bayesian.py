@@ -14,8 +14,8 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.experiments import folders
 from palpate.experiments.options import IdentifyBayesian
-from palpate.identification.bayesian import Posterior, sample
-from palpate.identification.laplace import settle
+from palpate.identification.bayesian import Posterior, draw
+from palpate.identification.laplace import Modes, settle
 from palpate.identification.likelihood import (
     MotionPosterior,
     inferred_scales,
@@ -64,7 +64,8 @@ def run(options: IdentifyBayesian) -> Path:
         if not run.finished:
             hypotheses = options.hypotheses(fitted, period)
             aligned = fitted.align(period, options.observation, options.action)
-            found = identify(hypotheses, aligned, options.draws, options.chains, options.seed)
+            targets = {name: posterior_of(model, aligned) for name, model in hypotheses.items()}
+            found = identify(targets, options.draws, options.chains, options.seed)
             _write(run, name, options, fitted, scored, found)
         result = read_result(run.path / RESULT)
         _print(result)
@@ -74,51 +75,38 @@ def run(options: IdentifyBayesian) -> Path:
 
 
 def identify(
-    hypotheses: Mapping[str, Model],
-    aligned: Aligned,
-    draws: int = 300,
-    chains: int = 4,
-    seed: int = 0,
+    targets: Mapping[str, MotionPosterior], draws: int = 300, chains: int = 4, seed: int = 0
 ) -> Found:
-    """Compare the hypotheses by their evidence and sample the posterior of the most probable."""
-    probability = probabilities(hypotheses, aligned, seed)
+    """Compare hypotheses by their evidence and sample the posterior of the most probable.
+
+    All of them are alike before. The evidence is Laplace's at the best mode of each: tempered
+    particles (`tempered.compare`) give it without the assumption of a normal posterior, and take
+    many times as long.
+    """
+    explored = explore(targets, seed)
+    probability = shares({name: evidence(modes) for name, (_, modes) in explored.items()})
     structure = max(probability, key=probability.__getitem__)
-    posterior = sample(
-        posterior_of(hypotheses[structure], aligned), chains=chains, draws=draws, seed=seed
-    )
+    posterior = draw(*explored[structure], chains=chains, draws=draws, seed=seed)
     return Found(posterior, structure, probability)
 
 
-def probabilities(
-    hypotheses: Mapping[str, Model], aligned: Aligned, seed: int = 0
-) -> dict[str, float]:
-    """How probable each hypothesis is given the trials, all of them alike before.
-
-    By Laplace's evidence at the best mode of each: tempered particles (`tempered.compare`) give it
-    without the assumption of a normal posterior, and take many times as long.
-    """
-    if len(hypotheses) == 1:
-        return dict.fromkeys(hypotheses, 1.0)
-    return shares({name: of for name, (of, _) in best(hypotheses, aligned, seed).items()})
-
-
-def best(
-    hypotheses: Mapping[str, Model], aligned: Aligned, seed: int = 0
-) -> dict[str, tuple[float, Model]]:
-    """Of each hypothesis the logarithm of its evidence, and its most probable model."""
+def explore(
+    targets: Mapping[str, MotionPosterior], seed: int = 0
+) -> dict[str, tuple[MotionPosterior, Modes]]:
+    """The modes of each, and the target settled about them."""
     key = jax.random.fold_in(jax.random.key(seed), 1)
-    found = {}
-    for name, model in hypotheses.items():
-        target, modes = settle(posterior_of(model, aligned), key)
-        evidence = float(np.max(np.asarray(modes.evidence)))
-        found[name] = evidence, target.model(modes.position[0])
-    return found
+    return {name: settle(target, key) for name, target in targets.items()}
 
 
-def shares(evidence: Mapping[str, float]) -> dict[str, float]:
-    """Probabilities, all alike before, of logarithms of evidence."""
-    most = max(evidence.values())
-    weights = {name: float(np.exp(value - most)) for name, value in evidence.items()}
+def evidence(modes: Modes) -> float:
+    """Laplace's logarithm of the density of the data, at the mode that gives most."""
+    return float(np.max(np.asarray(modes.evidence)))
+
+
+def shares(logarithms: Mapping[str, float]) -> dict[str, float]:
+    """How probable each is given the logarithms of their evidence, all alike before."""
+    most = max(logarithms.values())
+    weights = {name: float(np.exp(value - most)) for name, value in logarithms.items()}
     return {name: weight / sum(weights.values()) for name, weight in weights.items()}
 
 

@@ -87,8 +87,10 @@ def scene(seed: int, pushes: int) -> tuple[Recording, Recording]:
 def fit(handled: Recording, draws: int, seed: int) -> tuple[Found, float]:
     """What a piece most probably is, on wheels or not, its posterior, and the seconds it took."""
     began = time.monotonic()
+    aligned = handled.align(PERIOD, POSE, WRENCH)
     models = structures(handled, PERIOD)
-    found = identify(models, handled.align(PERIOD, POSE, WRENCH), draws, seed=seed)
+    targets = {name: posterior_of(model, aligned) for name, model in models.items()}
+    found = identify(targets, draws, seed=seed)
     return found, time.monotonic() - began
 
 

@@ -20,6 +20,8 @@ from palpate.experiments.furniture_recording import (
     names_of,
     starting_furniture,
 )
+from palpate.experiments.furniture_structures import structures
+from palpate.experiments.identify_bayesian import identify
 from palpate.experiments.one_shot_pieces import (
     PERIOD,
     error_share,
@@ -27,7 +29,6 @@ from palpate.experiments.one_shot_pieces import (
     pushes_of,
 )
 from palpate.experiments.planar_features import body_features, raw_features
-from palpate.identification.bayesian import sample
 from palpate.identification.likelihood import inferred_scales, motion_posterior
 from palpate.identification.regression_model import RegressedModel, regressed
 from palpate.identification.segments import Segments, cut, noise_scale
@@ -79,14 +80,18 @@ def _ours(
     draws: int,
     seed: int,
 ) -> float:
-    """Of the posterior given the same frames; padded, so that all sizes compile once."""
-    model = starting_furniture(handled, PERIOD)
-    seconds = PIECE * SAMPLE
+    """Of the posterior given the same frames, of what the piece then most probably is.
+
+    Padded, so that all sizes compile once.
+    """
+    models = structures(handled, PERIOD)
+    model, seconds = models["wheels"], PIECE * SAMPLE
     pieces = cut(
         first_samples(aligned, size + 1), model, seconds, at_rest=True, count=max(SIZES) // PIECE
     )
     scales = inferred_scales(model, noise_scale(aligned, model))
-    posterior = sample(motion_posterior(model, pieces, scales), draws=draws, seed=seed)
+    targets = {name: motion_posterior(of, pieces, scales) for name, of in models.items()}
+    posterior = identify(targets, draws, seed=seed).posterior
     asked = pushes_of(pushes, model)
     result = judged(model, posterior.predict(asked), asked)
     return error_share(result.error, result.displacement)

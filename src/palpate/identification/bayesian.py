@@ -252,8 +252,23 @@ def sample(
     tell: Callable[[int, int], None] = lambda done, blocks: None,
 ) -> Posterior:
     """As `identify`, for a target that was made apart."""
-    climbing, sampling = jax.random.split(jax.random.key(seed))
-    target, modes = settle(target, climbing)
+    climbing, _ = jax.random.split(jax.random.key(seed))
+    settled = settle(target, climbing)
+    return draw(*settled, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+
+
+def draw(
+    target: MotionPosterior,
+    modes: Modes,
+    *,
+    chains: int = 4,
+    draws: int = 300,
+    seed: int = 0,
+    probes: Segments | None = None,
+    tell: Callable[[int, int], None] = lambda done, blocks: None,
+) -> Posterior:
+    """As `sample`, for a target that has been settled (`laplace.settle`) about its modes."""
+    _, sampling = jax.random.split(jax.random.key(seed))
     found = no_u_turn(target, modes, sampling, chains, draws, tell)
     return Posterior(target, found, modes, target.segments if probes is None else probes)
 

@@ -20,6 +20,8 @@ from palpate.identification.target import Target
 LONGEST = 1.5  # prior standard deviations that a step may have
 DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
 SETTLED = 0.1  # gain of the density's logarithm in a few steps below which a climb has arrived
+MOST = 1e13  # information in one direction; the prior's is one
+ROUNDING = 1e-14  # of an eigenvalue by the size of the greatest
 ROUNDS = 3  # in which the start's errors are propagated anew
 WIDE = 2.0  # prior standard deviations: scales while starts are screened
 STARTS, SCREENING = 24, 25  # of a search, and the steps of each
@@ -152,9 +154,12 @@ def _finite(
     finite &= np.isfinite(information).all((-2, -1))
     value[~finite], slope[~finite] = -np.inf, 0.0
     information[~finite] = np.eye(position.shape[-1])
-    # At least the prior's, which rounding may take away where the data say a million times more.
+    # At least the prior's, which rounding may take away where the data say a million times more;
+    # what is rounding itself beside the most is not known either; and never so much that adding
+    # the prior's is lost and the matrix has no inverse.
     values, vectors = np.linalg.eigh(information)
-    scaled = vectors * np.maximum(values, 1.0)[..., None, :]
+    values[values < ROUNDING * values[..., -1:]] = 1.0
+    scaled = vectors * np.clip(values, 1.0, MOST)[..., None, :]
     return value, slope, scaled @ np.swapaxes(vectors, -1, -2)
 
 

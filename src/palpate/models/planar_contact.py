@@ -15,14 +15,14 @@ from jaxtyping import Array, Float
 
 from palpate.models.planar_geometry import Shapes, nearest, pick
 
-SLOWEST = 5e-4  # m/s: friction of a contact that slides more slowly is viscous
+SLOWEST = 1e-4  # m/s: friction of a contact that slides more slowly is viscous
 STIFFNESS = 3e3  # of a contact, in the mass it feels
 SLOTS = 3  # pairs of parts that a step looks at for each body
 SOFT_APPROACH = 0.02  # m/s: slower impacts do not bounce, twice as fast ones in full
 RECOVERY = 0.2  # share of an overlap that is made up for in one step
 SLOP = 2e-4  # m: overlap that is left alone
 AT_REST = 1e-7  # m/s: a sliding speed has a slope down to here
-SLOWEST = 1e-4  # m/s: keeps the slope of the time of impact finite
+GRAZING = 1e-4  # m/s: keeps the slope of the time of impact finite
 FASTEST_RECOVERY = 0.3  # m/s
 
 
@@ -135,7 +135,7 @@ def _course(
     open_gap = jnp.maximum(gap, 0.0)
     squared = jnp.square(was) - 2.0 * pull * open_gap
     reaches = squared > 0.0
-    root = jnp.sqrt(jnp.where(reaches, squared, 0.0) + SLOWEST**2)
+    root = jnp.sqrt(jnp.where(reaches, squared, 0.0) + GRAZING**2)
     nearing = root - was
     closes = reaches & (nearing > 1e-9)
     moment = 2.0 * open_gap / jnp.where(closes, nearing, 1.0)

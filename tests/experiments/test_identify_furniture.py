@@ -11,7 +11,9 @@ from palpate.errors import PalpateError
 from palpate.experiments.furniture_recording import (
     POSE,
     WRENCH,
+    check_alike,
     checked,
+    meeting,
     names_of,
     record_pieces,
     starting_furniture,
@@ -110,6 +112,54 @@ def test_rest_is_told_from_motion():
     assert begins_at_rest(aligned, model)
     moving = pose + 0.5 * np.arange(len(pose))[:, None, None] / RATE
     assert not begins_at_rest(dataclasses.replace(aligned, observation=moving[None]), model)
+
+
+def two_boxes(apart: np.ndarray, seen: np.ndarray | bool = True) -> Recording:
+    """Two boxes of 1 m whose sides are so far `apart`, m; only the second is not always `seen`."""
+    pose = np.zeros((len(apart), 2, 3))
+    pose[:, 1, 0] = np.where(seen, 1.0 + apart, np.nan)
+    corners = [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]
+    walls = [[[-9.0, -9.0], [9.0, -9.0], [0.0, -8.0]]]
+    return recording(
+        pose, np.zeros((len(apart) - 1, 2, 3)), bodies='["a", "b"]',
+        outlines=json.dumps({"a": corners, "b": corners}), walls=json.dumps(walls),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("nearest", "touch"), [(0.2, True), (0.4, False)])
+def test_only_what_comes_near_may_touch(nearest, touch):
+    found = two_boxes(nearest + 0.1 * np.abs(np.arange(20.0) - 10.0))
+    model = starting_furniture(found, 1 / RATE)
+    assert len(model.pairs) == 3  # each with the other and with the wall
+    assert meeting(model, found).pairs.tolist() == ([[0, 0, 1, 0]] if touch else [])
+
+
+def test_between_frames_a_body_is_on_a_straight_way():
+    frames = np.arange(20)
+    passing = two_boxes(np.linspace(-4.0, 2.0, 20), (frames < 3) | (frames > 16))
+    back = two_boxes(np.linspace(-4.0, 2.0, 20), frames < 3)
+    model = starting_furniture(passing, 1 / RATE)
+    assert len(meeting(model, passing).pairs) == 1
+    assert len(meeting(model, back).pairs) == 0
+
+
+def test_what_meets_in_any_recording_may_touch():
+    far, near = two_boxes(np.full(20, 2.0)), two_boxes(np.full(20, 0.1))
+    model = starting_furniture(far, 1 / RATE)
+    assert len(meeting(model, far).pairs) == 0
+    assert len(meeting(model, far, near).pairs) == 1
+    nowhere = two_boxes(np.full(20, 2.0), False)
+    assert len(meeting(model, far, nowhere).pairs) == 3
+
+
+def test_recordings_of_other_bodies_are_not_scored():
+    pose, wrench = still(2)
+    two = checked(recording(pose, wrench, bodies='["a", "b"]'))
+    check_alike(two, checked(recording(pose, wrench)))
+    with pytest.raises(PalpateError, match="of a, b and of body 1: expected the same bodies"):
+        check_alike(two, checked(recording(pose[:, :1], wrench[:, :1])))
+    with pytest.raises(PalpateError, match="of a, b and of b, a"):
+        check_alike(two, checked(recording(pose, wrench, bodies='["b", "a"]')))
 
 
 def test_recorded_pieces_bring_what_identification_needs():

@@ -90,17 +90,23 @@ class IdentifyFurniture(IdentifyBayesian):
 
         return checked(recording)
 
-    def hypotheses(self, recording: Recording, period: float) -> Mapping[str, Model]:
+    def hypotheses(
+        self, recording: Recording, period: float, scored: Recording | None
+    ) -> Mapping[str, Model]:
         """Models to be compared, by name: see `furniture_structures`."""
         from palpate.experiments import furniture_structures
-        from palpate.experiments.furniture_recording import starting_furniture
+        from palpate.experiments.furniture_recording import check_alike, meeting, starting_furniture
 
         if self.wheels < 1:
             raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
+        shown = (recording,) if scored is None else (recording, scored)
+        check_alike(*shown)
+        about = recording, period, self.size, self.wheels, self.law
         if self.structure == "wheels":  # without the links that only a hinge needs
             like = {"wheels": self.wheels, "law": self.law}
-            return {"wheels": starting_furniture(recording, period, self.size, **like)}
-        about = recording, period, self.size, self.wheels, self.law
-        if self.structure == "compare":
-            return furniture_structures.hypotheses(*about, seed=self.seed)
-        return {self.structure: furniture_structures.structures(*about)[self.structure]}
+            models = {"wheels": starting_furniture(recording, period, self.size, **like)}
+        elif self.structure == "compare":
+            models = furniture_structures.hypotheses(*about, seed=self.seed)
+        else:
+            models = {self.structure: furniture_structures.structures(*about)[self.structure]}
+        return {name: meeting(model, *shown) for name, model in models.items()}

@@ -18,6 +18,7 @@ from palpate.experiments.furniture_recording import (
     POSE,
     WRENCH,
     alone,
+    meeting,
     names_of,
     starting_furniture,
 )
@@ -80,7 +81,8 @@ def hypotheses(
         aligned = piece.align(period, POSE, WRENCH)
         models = structures(piece, period, size, wheels, law)
         found = explore(
-            {kind: posterior_of(model, aligned) for kind, model in models.items()}, seed
+            {kind: posterior_of(meeting(model, piece), aligned) for kind, model in models.items()},
+            seed,
         )
         probability = shares({kind: evidence(modes) for kind, (_, modes) in found.items()})
         kinds[body] = max(probability, key=probability.__getitem__)

@@ -62,7 +62,7 @@ def run(options: IdentifyBayesian) -> Path:
     }
     with folders.open_run(options, name, configuration, DRAWS) as run:
         if not run.finished:
-            hypotheses = options.hypotheses(fitted, period)
+            hypotheses = options.hypotheses(fitted, period, scored)
             aligned = fitted.align(period, options.observation, options.action)
             targets = {name: posterior_of(model, aligned) for name, model in hypotheses.items()}
             found = identify(targets, options.draws, options.chains, options.seed)

@@ -16,6 +16,7 @@ from palpate.experiments.furniture_recording import (
     POSE,
     WRENCH,
     alone,
+    meeting,
     names_of,
     starting_furniture,
 )
@@ -95,12 +96,12 @@ def fit(handled: Recording, draws: int, seed: int) -> tuple[Found, float]:
 
 
 def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
-    """The posterior of all pieces of a scene, who stand too far apart to touch.
+    """The posterior of all pieces of a scene.
 
     The search begins where those for each piece alone ended: among seventy parameters together it
     would have to be lucky with every piece at once.
     """
-    together = starting_furniture(handled, PERIOD)
+    together = meeting(starting_furniture(handled, PERIOD), handled)
     values = []
     for body in range(len(names_of(handled))):
         piece = alone(handled, body)
@@ -109,8 +110,7 @@ def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
         found = target.model(modes.position[0])
         values.append({path: value_of(found, path) for path in target.coordinates.declarations})
     joined = {path: jnp.concatenate([each[path] for each in values]) for path in values[0]}
-    apart = dataclasses.replace(together, pairs=together.pairs[:0])
-    target = posterior_of(with_values(apart, joined), handled.align(PERIOD, POSE, WRENCH))
+    target = posterior_of(with_values(together, joined), handled.align(PERIOD, POSE, WRENCH))
     return sample(target, draws=draws, seed=seed)
 
 

@@ -158,8 +158,13 @@ class IdentifyBayesian(Reading, ABC):
         """The recording with the channels that the models need."""
 
     @abstractmethod
-    def hypotheses(self, recording: Recording, period: float) -> Mapping[str, Model]:
-        """The models to compare by name, of one shape; one is fitted without comparison."""
+    def hypotheses(
+        self, recording: Recording, period: float, scored: Recording | None
+    ) -> Mapping[str, Model]:
+        """The models to compare by name; one is fitted without comparison.
+
+        They have to be able to do what is seen in the recording and in what they are `scored` on.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

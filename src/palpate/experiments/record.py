@@ -9,7 +9,8 @@ from palpate.experiments import folders
 from palpate.experiments.options import Record
 from palpate.recording import Recording
 from palpate.recording_files import read_recording, write_recording
-from palpate.result import Result
+from palpate.result import Result, read_result
+from palpate.runs import RESULT
 
 
 def run(options: Record) -> Path:
@@ -32,8 +33,10 @@ def run(options: Record) -> Path:
             recording = dataclasses.replace(recording, provenance=provenance)
             write_recording(run.path / folders.RECORDING, recording)
             run.finish(_result(name, options, recording, run.elapsed).to_dict())
+        count = len(read_result(run.path / RESULT).settings["trial_names"])
         path = folders.deliver(options, run, folders.RECORDING)
-    print(f"recording: {path} ({options.trials} trials of {options.duration:g} s)")
+    trials = "1 trial" if count == 1 else f"{count} trials"
+    print(f"recording: {path} ({trials} of {options.duration:g} s)")
     return path
 
 

@@ -2,6 +2,7 @@
 
 import builtins
 
+import jax
 import numpy as np
 import pytest
 
@@ -9,11 +10,13 @@ from bayesian_toys import Sled, pushes
 from palpate.errors import PalpateError
 from palpate.identification.bayesian import identify
 from palpate.identification.posterior_files import (
+    read_models,
     read_posterior,
     to_arviz,
     write_netcdf,
     write_posterior,
 )
+from palpate.models.files import MODELS
 from palpate.storage import DamagedFileError
 
 
@@ -32,6 +35,33 @@ def test_what_was_written_is_read_back(posterior, tmp_path):
     assert about["names"] == list(posterior.target.names)
     assert [row["name"] for row in about["table"]] == about["names"]
     assert about["warnings"] == list(posterior.warnings)
+
+
+def test_models_come_back_and_predict_the_same(posterior, tmp_path, monkeypatch):
+    monkeypatch.setitem(MODELS, "sled", Sled)
+    path = write_posterior(tmp_path / "posterior.npz", posterior)
+    for count in (None, 7):
+        ours, written = read_models(path, count), posterior.models(count)
+        assert jax.tree.structure(ours) == jax.tree.structure(written)
+        for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(written), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_draws_of_a_model_without_a_name_or_of_another_are_refused(
+    posterior, tmp_path, monkeypatch
+):
+    with pytest.raises(PalpateError, match="does not hold the model of its draws"):
+        read_models(write_posterior(tmp_path / "posterior.npz", posterior))
+    monkeypatch.setitem(MODELS, "sled", Sled)
+    path = write_posterior(tmp_path / "posterior.npz", posterior)
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **{name: value for name, value in arrays.items() if name != "value.mass"})
+    with pytest.raises(DamagedFileError, match="missing \\['mass'\\]"):
+        read_models(path)
+    np.savez(path, **arrays | {"value.mass": arrays["value.mass"][:1]})
+    with pytest.raises(DamagedFileError, match="not of one length"):
+        read_models(path)
 
 
 def test_other_files_are_refused(posterior, tmp_path):

@@ -3,11 +3,13 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
 from palpate.models.files import load_model, save_model
+from palpate.models.planar_shapes import furniture, rectangle
 from palpate.models.rope import Rope
 from palpate.parameters import declare, parameters_of, value_of
 from toys import Cart
@@ -62,10 +64,41 @@ def test_an_undamped_model_comes_back_and_what_was_declared_differently_does_not
     assert loaded.overrides == ()
 
 
+def test_furniture_comes_back_with_its_structure(tmp_path):
+    box = rectangle(1.0, 0.5)
+    poses = np.array([[0.0, 0.0, 0.3], [2.0, 0.0, 0.0]])
+    for model in (
+        furniture([box, box], [box + 5.0], pivots={0: 1}, bolted=[1], mass=[3.0, 4.0], poses=poses),
+        furniture([box], law="viscous", control_period=0.01, substeps=2),  # no walls, no links
+    ):
+        save_model(tmp_path / "model.json", model)
+        loaded, _ = load_model(tmp_path / "model.json")
+        assert jax.tree.structure(loaded) == jax.tree.structure(model)
+        state = model.initial_state(jnp.asarray(poses[None, : model.bodies]))
+        push = jnp.full(model.action_shape, 20.0)
+        np.testing.assert_array_equal(
+            loaded.step(state, push).velocity, model.step(state, push).velocity
+        )
+        for ours, saved in zip(jax.tree.leaves(loaded), jax.tree.leaves(model), strict=True):
+            assert ours.dtype == saved.dtype
+            assert ours.size == saved.size
+
+
+def test_furniture_that_does_not_fit_itself_is_refused(tmp_path):
+    path = tmp_path / "model.json"
+    save_model(path, furniture([rectangle(1.0, 0.5)] * 2))
+    assert refusal(changed(path, "structure", "bolted", to=[0, 0, 1])) == (
+        "bolted must have the axes (bodies) of {'bodies': 2, 'wheels': 1, 'links': 0}, got (3,)"
+    )
+    assert refusal(changed(path, "structure", "bolted", to="no")) == (
+        "'bolted' in FILE is not numbers: 'no'"
+    )
+
+
 def test_a_model_that_nobody_could_read_again_is_not_saved(tmp_path):
     with pytest.raises(PalpateError) as error:
         save_model(tmp_path / "model.json", Cart(1.0, 0.5))
-    assert str(error.value) == "a model of type Cart cannot be saved; known: rope"
+    assert str(error.value) == "a model of type Cart cannot be saved; known: rope, planar"
     assert not (tmp_path / "model.json").exists()
 
 
@@ -120,9 +153,9 @@ def test_other_json_is_no_model(file, text):
         (("version",), [1], "FILE has version [1]; this palpate reads versions 1 and 2"),
         (("version",), True, "FILE has version True; this palpate reads versions 1 and 2"),
         (("version",), REMOVED, "FILE has version None; this palpate reads versions 1 and 2"),
-        (("model",), "string", "FILE holds the unknown model 'string'; there are: rope"),
-        (("model",), ["rope"], "FILE holds the unknown model '['rope']'; there are: rope"),
-        (("model",), REMOVED, "FILE holds the unknown model 'None'; there are: rope"),
+        (("model",), "string", "FILE holds the unknown model 'string'; there are: rope, planar"),
+        (("model",), ["rope"], "FILE holds the unknown model '['rope']'; there are: rope, planar"),
+        (("model",), REMOVED, "FILE holds the unknown model 'None'; there are: rope, planar"),
         (
             ("value", "node_mass"),
             [-0.01, *[0.01] * 5],

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from palpate.identification import predictive
 from palpate.identification.diagnostics import bulk_size, rhat, tail_size
@@ -87,8 +87,7 @@ class Posterior:
 
     def thinned(self, count: int) -> Float[np.ndarray, "count free"]:
         """About evenly spaced draws over all chains."""
-        rows = np.linspace(0, len(self.flat) - 1, min(count, len(self.flat))).round()
-        return self.flat[rows.astype(int)]
+        return self.flat[spread_out(len(self.flat), count)]
 
     def models(self, count: int | None = None) -> Model:
         """Legal models as one, all draws or about `count` evenly spaced; free parameters lead.
@@ -215,6 +214,12 @@ class Posterior:
                 about = "sensor noise" if kind == "noise" else "what the model does not explain"
                 found[label] = unit, about, values[:, of.index(group)]
         return found
+
+
+def spread_out(size: int, count: int | None = None) -> Int[np.ndarray, " count"]:
+    """Indices of about `count` of `size` draws, evenly spaced; of all where no count is given."""
+    count = size if count is None else min(count, size)
+    return np.linspace(0, size - 1, count).round().astype(int)
 
 
 def identify(

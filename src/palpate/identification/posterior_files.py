@@ -6,11 +6,15 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from palpate.errors import PalpateError
-from palpate.identification.bayesian import Posterior
+from palpate.identification.bayesian import Posterior, spread_out
+from palpate.models.files import MODELS, built, registered, structure_of
+from palpate.models.model import Model
+from palpate.parameters import parameters_of
 from palpate.storage import DamagedFileError, parse_json, plain, write_bytes
 
 FORMAT = "palpate-posterior-1"
@@ -20,14 +24,24 @@ _ABOUT = "about"  # the entry that holds JSON as text
 def write_posterior(path: str | Path, posterior: Posterior) -> Path:
     """Write draws in whitened coordinates and in units, with what they are, as one NPZ file.
 
-    Arrays: `position` (chains, draws, free), `density` (chains, draws), and `value.PATH` (chains,
-    draws, ...) for each free parameter. `about`: JSON with names, the table, warnings and cost.
+    Arrays: `position` (chains, draws, free), `density` (chains, draws), `value.PATH` (chains,
+    draws, ...) for each free parameter, and `model.FIELD` for all else that the model is made of.
+    `about`: JSON with names, the table, warnings and cost.
     """
     draws = posterior.draws
     arrays: dict[str, np.ndarray] = {"position": draws.position, "density": draws.density}
     arrays |= {f"value.{path}": value for path, value in posterior.values.items()}
+    model = posterior.target.coordinates.reference
+    kind, settings = registered(model), {}
+    if kind is not None:
+        fields = {*parameters_of(model), *structure_of(type(model))} - set(posterior.values)
+        of = {name: getattr(model, name) for name in fields}
+        settings = {name: value for name, value in of.items() if not isinstance(value, jax.Array)}
+        arrays |= {f"model.{name}": np.asarray(of[name]) for name in fields - set(settings)}
     about = {
         "format": FORMAT,
+        "model": kind,
+        "settings": settings,
         "names": list(posterior.target.names),
         "table": [vars(row) for row in posterior.table],
         "warnings": list(posterior.warnings),
@@ -65,6 +79,36 @@ def read_posterior(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "..."]
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise PalpateError(f"{path} is no posterior of the format {FORMAT}")
     return arrays, about
+
+
+def read_models(path: str | Path, count: int | None = None) -> Model:
+    """The models that `write_posterior` wrote, as one whose free parameters lead with the draws.
+
+    All draws of all chains, or about `count` evenly spaced ones. What was never near enough to
+    touch in the recordings that were fitted may have no contacts in them.
+
+    Raises `PalpateError` when the file is missing, no posterior, or of a model that has no name in
+    files, `DamagedFileError` when something of the model is missing or does not fit.
+    """
+    arrays, about = read_posterior(path)
+    kind = MODELS.get(str(about.get("model")))
+    if kind is None:
+        raise PalpateError(
+            f"{path} does not hold the model of its draws: expected one of {', '.join(MODELS)}"
+        )
+    fields = {name[6:]: value for name, value in arrays.items() if name.startswith("model.")}
+    values = {name[6:]: value for name, value in arrays.items() if name.startswith("value.")}
+    lead = arrays["position"].shape[:2] if "position" in arrays else ()
+    settings = about.get("settings")
+    if not isinstance(settings, dict) or any(v.shape[:2] != lead for v in values.values()):
+        raise DamagedFileError(f"{path} is damaged: its draws are not of one length")
+    chosen = spread_out(int(np.prod(lead)), count)
+    drawn = {name: v.reshape(-1, *v.shape[2:])[chosen] for name, v in values.items()}
+    settings = {name: tuple(v) if isinstance(v, list) else v for name, v in settings.items()}
+    try:
+        return built(path, kind, fields | drawn, settings)
+    except PalpateError as error:
+        raise DamagedFileError(str(error)) from error
 
 
 def to_arviz(posterior: Posterior) -> Any:

@@ -11,12 +11,13 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.models.model import Model
+from palpate.models.planar import Planar
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.models.rope import Rope
 from palpate.parameters import LogNormal, describe, parameters_of
 from palpate.storage import read_json, write_json
 
-MODELS: dict[str, type[Model]] = {"rope": Rope}
+MODELS: dict[str, type[Model]] = {"rope": Rope, "planar": Planar}
 _FORMAT = "palpate.model"
 _VERSIONS = {1: False, 2: True}  # whether it has a correction, which version 1 had no place for
 
@@ -30,8 +31,8 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
     """
     network = model.network if isinstance(model, Residual) else None
     physics = model.physics if isinstance(model, Residual) else model
-    names = [name for name, kind in MODELS.items() if type(physics) is kind]
-    if not names:
+    name = registered(physics)
+    if name is None:
         raise PalpateError(
             f"a model of type {type(physics).__name__} cannot be saved; known: {', '.join(MODELS)}"
         )
@@ -40,8 +41,8 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
         {
             "format": _FORMAT,
             "version": 1 if network is None else 2,
-            "model": names[0],
-            "structure": {name: getattr(physics, name) for name in _structure(type(physics))},
+            "model": name,
+            "structure": {name: getattr(physics, name) for name in structure_of(type(physics))},
             "parameters": describe(physics),
             **({} if network is None else {"correction": _arrays(network)}),
             "about": dict(about or {}),
@@ -82,25 +83,63 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
         raise PalpateError(f"{path} is damaged: its parameters or structure are missing") from error
     declared = parameters_of(kind)
     _check_names(path, "parameters", rows, declared)
-    _check_names(path, "structure", structure, _structure(kind))
-    for name, default in _structure(kind).items():
-        value = structure[name]
-        if not _alike(value, default):
-            raise PalpateError(f"'{name}' in {path} must be such as {default!r}, got {value!r}")
-        if isinstance(default, float):
-            structure[name] = float(value)
-    values = {name: _numbers(path, name, value) for name, value in rows.items()}
-    for name, value in values.items():
+    _check_names(path, "structure", structure, structure_of(kind))
+    arrays = {
+        name: _whole(_numbers(path, name, value), _axes(kind, name))
+        for name, value in (rows | structure).items()
+        if _axes(kind, name) is not None
+    }
+    for name, value in arrays.items():
         _check_axes(path, name, value, kind)
-        if isinstance(declared[name].prior, LogNormal) and np.any(value < 0):
-            raise PalpateError(f"'{name}' in {path} must not be negative, got {np.min(value):g}")
-    try:
-        model = kind(**values, **structure)
-    except (TypeError, IndexError) as error:
-        raise PalpateError(f"{path} is damaged: {error}") from error
+    settings = {name: value for name, value in structure.items() if name not in arrays}
+    model = built(path, kind, arrays, settings)
     if _VERSIONS[version]:
         model = _corrected(path, model, content.get("correction"))
     return model, about
+
+
+def registered(model: Model) -> str | None:
+    """The name of the model's kind in files, None for one that has none."""
+    return next((name for name, kind in MODELS.items() if type(model) is kind), None)
+
+
+def structure_of(kind: type[Model]) -> dict[str, Any]:
+    """The fields of a model that are no parameters, and their defaults."""
+    declared = parameters_of(kind)
+    return {
+        field.name: field.default
+        for field in dataclasses.fields(kind)
+        if field.name not in declared and field.name != "overrides"
+    }
+
+
+def built(
+    path: str | Path,
+    kind: type[Model],
+    arrays: Mapping[str, np.ndarray],
+    settings: Mapping[str, Any],
+) -> Model:
+    """The model of these parameters, structure as `arrays`, and `settings`, the rest of it.
+
+    Raises `PalpateError` that names the file where something is missing or of another kind.
+    """
+    declared, structure = parameters_of(kind), structure_of(kind)
+    _check_names(path, "fields", {*arrays, *settings}, {*declared, *structure})
+    settings = dict(settings)
+    for name, value in settings.items():
+        default = structure[name]
+        if not _alike(value, default):
+            raise PalpateError(f"'{name}' in {path} must be such as {default!r}, got {value!r}")
+        if isinstance(default, float):
+            settings[name] = float(value)
+    for name, value in arrays.items():
+        lognormal = name in declared and isinstance(declared[name].prior, LogNormal)
+        if lognormal and np.any(value < 0):
+            raise PalpateError(f"'{name}' in {path} must not be negative, got {np.min(value):g}")
+    try:
+        return kind(**arrays, **settings)
+    except (TypeError, IndexError) as error:
+        raise PalpateError(f"{path} is damaged: {error}") from error
 
 
 def _arrays(network: SiteNetwork) -> dict[str, Any]:
@@ -143,14 +182,20 @@ def _corrected(path: str | Path, physics: Model, content: Any) -> Residual:
         raise PalpateError(f"{path} is damaged: {error}") from error
 
 
-def _structure(kind: type[Model]) -> dict[str, Any]:
-    """The fields of a model that are no parameters, and their defaults."""
-    declared = parameters_of(kind)
-    return {
-        field.name: field.default
-        for field in dataclasses.fields(kind)
-        if field.name not in declared and field.name != "overrides"
-    }
+def _axes(kind: type[Model], name: str) -> list[str] | None:
+    """The axes of an array field as annotated, without the batch's; None of another field."""
+    annotation: Any = next(field.type for field in dataclasses.fields(kind) if field.name == name)
+    if not hasattr(annotation, "dim_str"):
+        return None
+    return [axis for axis in annotation.dim_str.split() if not axis.startswith("*")]
+
+
+def _whole(value: np.ndarray, axes: list[str] | None) -> np.ndarray:
+    """An array without elements as its list was, with the axes that a list cannot tell."""
+    if value.size or axes is None:
+        return value
+    lacking = axes[value.ndim :]
+    return value.reshape(*value.shape, *(int(axis) if axis.isdigit() else 0 for axis in lacking))
 
 
 def _check_names(path: str | Path, what: str, came: Any, expected: Any) -> None:
@@ -174,9 +219,8 @@ def _alike(value: Any, default: Any) -> bool:
 
 def _check_axes(path: str | Path, name: str, value: np.ndarray, kind: type[Model]) -> None:
     """A file holds one model: a parameter has the axes of its annotation, without the batch's."""
-    annotations: dict[str, Any] = {field.name: field.type for field in dataclasses.fields(kind)}
-    axes = [axis for axis in annotations[name].dim_str.split() if not axis.startswith("*")]
-    if value.ndim != len(axes):
+    axes = _axes(kind, name)
+    if axes is not None and value.ndim != len(axes):
         expected = f"the axes ({', '.join(axes)})" if axes else "one number"
         raise PalpateError(f"'{name}' in {path} must be {expected}, got shape {value.shape}")
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from palpate.errors import PalpateError
 from palpate.models import planar_step
 from palpate.models.model import Model
 from palpate.models.planar_friction import Rolling, Tensor, Wheel
@@ -161,6 +162,17 @@ class Planar(Model):
     substeps: int = eqx.field(static=True, default=1)
     iterations: int = eqx.field(static=True, default=5)
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        wheels, links = self.wheel.shape[-1], self.pivot.shape[-1]
+        sizes = {"bodies": self.bodies, "wheels": wheels, "links": links}
+        for name, axes in _NAMED_AXES.items():
+            shape = getattr(self, name).shape
+            last = shape[max(len(shape) - len(axes), 0) :]
+            if [sizes.get(axis, size) for axis, size in zip(axes, last, strict=False)] != [*last]:
+                raise PalpateError(
+                    f"{name} must have the axes ({', '.join(axes)}) of {sizes}, got {shape}"
+                )
 
     @property
     def bodies(self) -> int:
@@ -375,14 +387,15 @@ def turned_wheel(
     }
 
 
-def _axes_of(kind: type) -> list[int]:
-    """How many axes the array fields of a module have without a batch's."""
-    annotations: list[Any] = [field.type for field in dataclasses.fields(kind)]
-    return [
-        sum(not axis.startswith("*") for axis in annotation.dim_str.split())
-        for annotation in annotations
+def _axes_of(kind: type) -> dict[str, list[str]]:
+    """The axes of the array fields of a module, without a batch's."""
+    annotations: dict[str, Any] = {field.name: field.type for field in dataclasses.fields(kind)}
+    return {
+        name: [axis for axis in annotation.dim_str.split() if not axis.startswith("*")]
+        for name, annotation in annotations.items()
         if hasattr(annotation, "dim_str")
-    ]
+    }
 
 
-_AXES = (*_axes_of(Planar), *_axes_of(PlanarState), 2)
+_NAMED_AXES = _axes_of(Planar)
+_AXES = [*map(len, (*_NAMED_AXES.values(), *_axes_of(PlanarState).values())), 2]

@@ -150,6 +150,16 @@ def as_floating(value: Any) -> Array:
     return jnp.asarray(value, dtype=value.dtype if kept else jnp.asarray(0.0).dtype)
 
 
+def axes_of(kind: type) -> dict[str, list[str]]:
+    """The axes of a module's array fields as they are annotated, without a batch's."""
+    annotations: dict[str, Any] = {field.name: field.type for field in dataclasses.fields(kind)}
+    return {
+        name: [axis for axis in annotation.dim_str.split() if not axis.startswith("*")]
+        for name, annotation in annotations.items()
+        if hasattr(annotation, "dim_str")
+    }
+
+
 def parameter(
     unit: str,
     *,

@@ -8,6 +8,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import PalpateError
+from palpate.experiments.furniture_options import IdentifyFurniture
 from palpate.experiments.furniture_recording import (
     POSE,
     WRENCH,
@@ -18,7 +19,7 @@ from palpate.experiments.furniture_recording import (
     record_pieces,
     starting_furniture,
 )
-from palpate.experiments.furniture_structures import structures
+from palpate.experiments.furniture_structures import joints, structures
 from palpate.experiments.identify_bayesian import begins_at_rest
 from palpate.recording import Channel, Recording, Role, Trial
 
@@ -103,6 +104,38 @@ def test_hypotheses_differ_in_nothing_but_their_data():
     assert len(shapes) == 1
     assert float(models["hinge"].pivot.sum()) == 1.0
     assert float(models["feet"].wheel.sum()) == 0.0
+
+
+def test_angles_may_be_wrapped():
+    pose, wrench = still(2)
+    pose[..., 2] += np.pi
+    pose[14:17, 1] = np.nan
+    wrapped = pose.copy()
+    wrapped[..., 2] = (wrapped[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    assert np.nanmax(np.abs(np.diff(wrapped[..., 2], axis=0))) > 6
+    found = checked(recording(wrapped, wrench))
+    turned = (found.trials[0][POSE].values - pose)[..., 2]
+    np.testing.assert_allclose(np.nanmax(turned, axis=0), np.nanmin(turned, axis=0), atol=1e-9)
+    assert not joints(found)  # nothing has moved
+    model = starting_furniture(found, 0.02, (1.0, 0.5))
+    assert begins_at_rest(found.align(0.02), model)
+
+
+def test_bodies_of_one_name_are_refused():
+    pose, wrench = still(2)
+    with pytest.raises(PalpateError, match="expected a name for each"):
+        names_of(checked(recording(pose, wrench, bodies='["chair", "chair"]')))
+
+
+def test_what_may_be_is_asked_of_recordings_of_the_same_bodies():
+    far, near = two_boxes(np.full(20, 2.0)), two_boxes(np.full(20, 0.1))
+    options = IdentifyFurniture(recordings=(), structure="feet")
+    (model,) = options.hypotheses([far, near], 1 / RATE).models.values()
+    assert len(model.pairs) == 3
+    assert len(options.sufficient(model, [far]).pairs) == 0
+    assert len(options.sufficient(model, [far, near]).pairs) == 1
+    with pytest.raises(PalpateError, match="expected the same bodies"):
+        options.hypotheses([far, checked(recording(*still()))], 1 / RATE)
 
 
 def test_rest_is_told_from_motion():

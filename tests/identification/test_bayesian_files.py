@@ -1,6 +1,8 @@
 """A posterior is read back as it was written, and ArviZ gets what it needs."""
 
 import builtins
+import contextlib
+import dataclasses
 
 import jax
 import numpy as np
@@ -47,6 +49,16 @@ def test_models_come_back_and_predict_the_same(posterior, tmp_path, monkeypatch)
             np.testing.assert_array_equal(one, other)
 
 
+def test_a_more_complete_model_may_be_kept(posterior, tmp_path, monkeypatch):
+    monkeypatch.setitem(MODELS, "sled", Sled)
+    reference = posterior.target.coordinates.reference
+    other = dataclasses.replace(reference, control_period=2 * reference.control_period)
+    path = write_posterior(tmp_path / "posterior.npz", posterior, other)
+    models = read_models(path)
+    assert models.control_period == other.control_period
+    np.testing.assert_array_equal(models.mass, posterior.models().mass)
+
+
 def test_draws_of_a_model_without_a_name_or_of_another_are_refused(
     posterior, tmp_path, monkeypatch
 ):
@@ -59,6 +71,11 @@ def test_draws_of_a_model_without_a_name_or_of_another_are_refused(
     np.savez(path, **{name: value for name, value in arrays.items() if name != "value.mass"})
     with pytest.raises(DamagedFileError, match="missing \\['mass'\\]"):
         read_models(path)
+    np.savez(path, **arrays | {"value.mass": np.full_like(arrays["value.mass"], np.nan)})
+    with pytest.raises(DamagedFileError, match=r"'mass' in .* is not finite"):
+        read_models(path)
+    with pytest.raises(PalpateError, match="at least one draw"):
+        read_models(path, 0)
     np.savez(path, **arrays | {"value.mass": arrays["value.mass"][:1]})
     with pytest.raises(DamagedFileError, match="not of one length"):
         read_models(path)
@@ -71,7 +88,16 @@ def test_other_files_are_refused(posterior, tmp_path):
     with pytest.raises(PalpateError, match="is no posterior"):
         read_posterior(tmp_path / "other.npz")
     path = write_posterior(tmp_path / "cut.npz", posterior)
-    path.write_bytes(path.read_bytes()[:200])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:200])
+    with pytest.raises(DamagedFileError):
+        read_posterior(path)
+    for place in range(60, 400, 20):  # a flipped byte: zlib's complaint, or the archive's
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        with contextlib.suppress(DamagedFileError, PalpateError):
+            read_posterior(path)
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
     with pytest.raises(DamagedFileError):
         read_posterior(path)
 

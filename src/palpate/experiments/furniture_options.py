@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from tyro.conf import arg
 
 from palpate.errors import PalpateError
-from palpate.experiments.options import IdentifyBayesian, Record
+from palpate.experiments.options import Hypotheses, IdentifyBayesian, Record
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Sequence
 
     from palpate.models.model import Model
     from palpate.recording import Recording
@@ -90,23 +90,28 @@ class IdentifyFurniture(IdentifyBayesian):
 
         return checked(recording)
 
-    def hypotheses(
-        self, recording: Recording, period: float, scored: Recording | None
-    ) -> Mapping[str, Model]:
+    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
         """Models to be compared, by name: see `furniture_structures`."""
         from palpate.experiments import furniture_structures
-        from palpate.experiments.furniture_recording import check_alike, meeting, starting_furniture
+        from palpate.experiments.furniture_recording import check_alike, starting_furniture
 
         if self.wheels < 1:
             raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
-        shown = (recording,) if scored is None else (recording, scored)
-        check_alike(*shown)
-        about = recording, period, self.size, self.wheels, self.law
+        check_alike(*recordings)
+        about = recordings[0], period, self.size, self.wheels, self.law
         if self.structure == "wheels":  # without the links that only a hinge needs
             like = {"wheels": self.wheels, "law": self.law}
-            models = {"wheels": starting_furniture(recording, period, self.size, **like)}
-        elif self.structure == "compare":
-            models = furniture_structures.hypotheses(*about, seed=self.seed)
-        else:
-            models = {self.structure: furniture_structures.structures(*about)[self.structure]}
-        return {name: meeting(model, *shown) for name, model in models.items()}
+            return Hypotheses({"wheels": starting_furniture(*about[:3], **like)})
+        if self.structure == "compare":
+            return furniture_structures.hypotheses(*about, seed=self.seed)
+        return Hypotheses({
+            self.structure: furniture_structures.structures(*about)[self.structure]
+        })  # fmt: skip
+
+    def sufficient(self, model: Model, recordings: Sequence[Recording]) -> Model:
+        """The model without contacts of what never meets."""
+        from palpate.experiments.furniture_recording import meeting
+        from palpate.models.planar import Planar
+
+        assert isinstance(model, Planar)  # by `hypotheses`
+        return meeting(model, *recordings)

@@ -20,6 +20,7 @@ from palpate.worlds.furniture_handling import record_handling, record_pushes
 from palpate.worlds.furniture_pieces import Piece
 
 POSE, WRENCH = "pose", "wrench"
+FRAMES = 256  # looked at together
 NEAR = 0.3  # m between outlines, beyond which nothing touches before it is seen again
 APART = 2.5  # m between pieces that are handled, so that they do not meet
 UNITS = {POSE: "m, m, rad", WRENCH: "N, N, N m"}
@@ -27,6 +28,9 @@ UNITS = {POSE: "m, m, rad", WRENCH: "N, N, N m"}
 
 def checked(recording: Recording) -> Recording:
     """The recording, with both channels of the shape that `Planar` needs; one body gets an axis.
+
+    Angles are unwrapped over the frames that a body is seen in, so that what lies between two
+    frames is between them.
 
     Raises `PalpateError` where the channel "pose" (frames, bodies, 3) or "wrench" of that shape is
     missing, or their numbers of bodies differ.
@@ -44,6 +48,8 @@ def checked(recording: Recording) -> Recording:
                 )
             bodies.add(shape[0] if len(shape) == 2 else 1)
             values = channel.values.reshape(len(channel.values), -1, 3)
+            if name == POSE:
+                values = _unwrapped(values)
             channels[name] = dataclasses.replace(channel, values=values, notes=())
         trials.append(dataclasses.replace(trial, channels=channels))
     if len(bodies) > 1:
@@ -64,6 +70,8 @@ def names_of(recording: Recording) -> tuple[str, ...]:
         raise PalpateError(
             f'the recording\'s "bodies" are {told!r}: expected names of its {count} bodies'
         )
+    if len(set(told)) < count:
+        raise PalpateError(f'the recording\'s "bodies" are {told!r}: expected a name for each')
     return tuple(told)
 
 
@@ -119,13 +127,18 @@ def meeting(model: Planar, *recordings: Recording) -> Planar:
     """The model without contacts of what never comes within `NEAR` of each other.
 
     A step with contacts takes ten times as long to differentiate as one without, whether they
-    happen or not. A body counts as on a straight way between the frames that it is seen in.
+    happen or not. A body counts as on a straight way between the frames that it is seen in, and as
+    where it is seen next before the first and after the last of them.
     """
     near = np.zeros(len(model.pairs), bool)
     if not len(near):
         return model
     shapes = Shapes(model.outline, model.walls, model.pairs)
-    gaps = jax.jit(jax.vmap(lambda pose: nearest(shapes, pose).gap.min(axis=1)))
+    gaps = jax.jit(
+        lambda poses: jax.lax.map(
+            lambda pose: nearest(shapes, pose).gap.min(axis=1), poses, batch_size=FRAMES
+        )
+    )
     for trial in (trial for recording in recordings for trial in recording.trials):
         poses = np.array(trial[POSE].values, float)
         seen = np.asarray(np.isfinite(poses).all(axis=2))
@@ -191,6 +204,15 @@ def _first_seen(recording: Recording) -> np.ndarray:
     if not complete.any(axis=0).all():
         raise PalpateError("a body is never seen in the first trial: expected some of its poses")
     return poses[complete.argmax(axis=0), np.arange(poses.shape[1])]
+
+
+def _unwrapped(poses: np.ndarray) -> np.ndarray:
+    """Poses (frames, bodies, 3) without jumps of the angle by a whole turn."""
+    poses = np.array(poses, float)
+    for body in range(poses.shape[1]):
+        seen = np.isfinite(poses[:, body, 2])
+        poses[seen, body, 2] = np.unwrap(poses[seen, body, 2])
+    return poses
 
 
 def _told(recording: Recording, key: str) -> Any:

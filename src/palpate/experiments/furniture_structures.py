@@ -23,10 +23,12 @@ from palpate.experiments.furniture_recording import (
     starting_furniture,
 )
 from palpate.experiments.identify_bayesian import evidence, explore, posterior_of, shares
+from palpate.experiments.options import Hypotheses
 from palpate.models.model import Model
 from palpate.models.planar import Planar
 from palpate.parameters import parameters_of, value_of, with_values
 from palpate.recording import Recording
+from palpate.runs import progress
 
 Law = Literal["coulomb", "viscous"]
 Pair = tuple[int, int]
@@ -65,18 +67,18 @@ def hypotheses(
     wheels: int = 1,
     law: Law = "coulomb",
     seed: int = 0,
-) -> dict[str, Planar]:
+) -> Hypotheses:
     """What the bodies of a recording may be together, by a name that says it.
 
-    Of one body, its `structures`. Of several, each is what it most probably is by itself, which is
-    printed, and any of the `joints` may be there: what is joined is taken to be on wheels, as
-    nobody knows what its wheels did before the joint is known. Arguments as of `structures`.
+    Of one body, its `structures`. Of several, each is what it most probably is by itself, and any
+    of the `joints` may be there: what is joined is taken to be on wheels, as nobody knows what its
+    wheels did before the joint is known. Arguments as of `structures`.
     """
     names = names_of(recording)
     if len(names) == 1:
-        return structures(recording, period, size, wheels, law)
-    kinds, pieces = {}, []
-    for body, name in enumerate(names):
+        return Hypotheses(structures(recording, period, size, wheels, law))
+    kinds, pieces, by_itself = {}, [], {}
+    for body, name in progress(list(enumerate(names)), "each body by itself"):
         piece = alone(recording, body)
         aligned = piece.align(period, POSE, WRENCH)
         models = structures(piece, period, size, wheels, law)
@@ -87,8 +89,7 @@ def hypotheses(
         probability = shares({kind: evidence(modes) for kind, (_, modes) in found.items()})
         kinds[body] = max(probability, key=probability.__getitem__)
         pieces.append({k: target.model(modes.position[0]) for k, (target, modes) in found.items()})
-        told = ", ".join(f"{kind} {share:.2g}" for kind, share in probability.items())
-        print(f"{name} by itself: {kinds[body]} (probability of each: {told})", flush=True)
+        by_itself[name] = probability
     likely = joints(recording)
     models = {}
     for chosen in _sets(likely):
@@ -98,7 +99,7 @@ def hypotheses(
         model = _together(recording, period, size, wheels, law, being, where)
         begun = [pieces[body][kind] for body, kind in being.items()]
         models[_named(names, being, chosen)] = _begun(model, begun)
-    return models
+    return Hypotheses(models, by_itself)
 
 
 def joints(recording: Recording) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
@@ -155,18 +156,29 @@ def _together(
 ) -> Planar:
     """All bodies as one model, with the `chosen` joints."""
     pivots: dict[int, int | None] = {b: None for b, kind in being.items() if kind == "hinge"}
-    where = {}
     # A body has one pivot of its own: as few joints as there are can be shared out so.
     owners = next(of for of in itertools.product(*chosen) if len(set(of)) == len(of))
-    for owner, pair in zip(owners, chosen, strict=True):
-        pivots[owner] = sum(pair) - owner
-        where[owner] = chosen[pair][pair.index(owner)]
+    others = {owner: sum(pair) - owner for owner, pair in zip(owners, chosen, strict=True)}
+    pivots |= others
     model = starting_furniture(recording, period, size, wheels=wheels, law=law, pivots=pivots)
-    anchor = np.array(model.link_anchor)
-    for body, place in where.items():
-        anchor[body, 0] = place / np.asarray(model.half_extent[body])
-    model = dataclasses.replace(model, link_anchor=jnp.asarray(anchor))
-    return _masked(model, being, set(where))
+    anchor, pose = np.array(model.link_anchor), np.array(model.link_pose)
+    for (owner, other), pair in zip(others.items(), chosen, strict=True):
+        own, place = (chosen[pair][pair.index(body)] for body in (owner, other))
+        anchor[owner, 0] = own / np.asarray(model.half_extent[owner])
+        # Where both were seen, not where each was seen first: the one may have moved before.
+        angle = _angle_between(recording, owner, other)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        pose[owner, 0] = (*(place - turn @ own), angle)
+    model = dataclasses.replace(model, link_anchor=jnp.asarray(anchor), link_pose=jnp.asarray(pose))
+    return _masked(model, being, set(others))
+
+
+def _angle_between(recording: Recording, body: int, other: int) -> float:
+    """The angle of a body in the other's axes, rad, in the first frame that shows both."""
+    poses = np.concatenate([np.asarray(trial[POSE].values, float) for trial in recording.trials])
+    both = np.isfinite(poses[:, [body, other]]).all(axis=(1, 2))
+    first = poses[both.argmax()]
+    return float(first[body, 2] - first[other, 2])
 
 
 def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:

@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.experiments import folders
-from palpate.experiments.options import IdentifyBayesian
+from palpate.experiments.options import Hypotheses, IdentifyBayesian
 from palpate.identification.bayesian import Posterior, draw
 from palpate.identification.laplace import Modes, settle
 from palpate.identification.likelihood import (
@@ -62,11 +62,15 @@ def run(options: IdentifyBayesian) -> Path:
     }
     with folders.open_run(options, name, configuration, DRAWS) as run:
         if not run.finished:
-            hypotheses = options.hypotheses(fitted, period, scored)
+            shown = [fitted] if scored is None else [fitted, scored]
+            hypotheses = options.hypotheses(shown, period)
             aligned = fitted.align(period, options.observation, options.action)
-            targets = {name: posterior_of(model, aligned) for name, model in hypotheses.items()}
+            targets = {
+                name: posterior_of(options.sufficient(model, shown), aligned)
+                for name, model in hypotheses.models.items()
+            }
             found = identify(targets, options.draws, options.chains, options.seed)
-            _write(run, name, options, fitted, scored, found)
+            _write(run, name, options, fitted, scored, hypotheses, found)
         result = read_result(run.path / RESULT)
         _print(result)
         title = f"What was found out about the {options.family}"
@@ -185,11 +189,12 @@ def _write(
     options: IdentifyBayesian,
     fitted: Recording,
     scored: Recording | None,
+    hypotheses: Hypotheses,
     found: Found,
 ) -> None:
     """Draws, evidence and result into the run's folder; the result last."""
     posterior = found.posterior
-    write_posterior(run.path / DRAWS, posterior)
+    write_posterior(run.path / DRAWS, posterior, hypotheses.models[found.structure])
     model = posterior.target.coordinates.reference
     which = scored or fitted
     aligned = which.align(model.control_period, options.observation, options.action)
@@ -200,6 +205,7 @@ def _write(
     settings = run.configuration | {
         "structure": found.structure,
         "probability": found.probability,
+        "by_itself": hypotheses.by_itself,
         "pieces": pieces.count,
         "scored_on": "recordings that were not fitted" if scored else "what was fitted",
         "observation_unit": model.observation_units[0],
@@ -263,9 +269,13 @@ def _horizon(predicted: Predicted, pieces: Segments, model: Model) -> dict[str, 
 def _print(result: Result) -> None:
     """Structure, parameters, what the data cannot tell, and how predictions fared."""
     settings = result.settings
-    if len(settings["probability"]) > 1:
-        told = ", ".join(f"{name} {share:.2g}" for name, share in settings["probability"].items())
-        print(f"structure: {settings['structure']} (probability of each: {told})")
+    compared = {**settings.get("by_itself", {}), "structure": settings["probability"]}
+    for what, probability in compared.items():
+        if len(probability) > 1 or len(compared) > 1:
+            told = ", ".join(f"{name} {share:.2g}" for name, share in probability.items())
+            most = max(probability, key=probability.__getitem__)
+            alone = "" if what == "structure" else " by itself"
+            print(f"{what}{alone}: {most} (probability of each: {told})")
     width = max(len(row["name"]) for row in result.parameters)
     for row in result.parameters:
         several = len(row["value"]) > 1

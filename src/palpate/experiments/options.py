@@ -6,7 +6,7 @@ Nothing here imports what computes, so that help is instant.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 from palpate.errors import PalpateError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from palpate.models.model import Model
     from palpate.networks import CommandPolicy
@@ -131,6 +131,18 @@ class Identify(Reading, ABC):
         """The model an identification starts from."""
 
 
+@dataclass(frozen=True)
+class Hypotheses:
+    """Models to be compared, by name.
+
+    `by_itself`: for each part of what was recorded, how probable each is that it may be by itself,
+    where the models take it to be the most probable.
+    """
+
+    models: Mapping[str, Model]
+    by_itself: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, kw_only=True)
 class IdentifyBayesian(Reading, ABC):
     """Identification with a posterior; each family says which models are compared."""
@@ -158,13 +170,15 @@ class IdentifyBayesian(Reading, ABC):
         """The recording with the channels that the models need."""
 
     @abstractmethod
-    def hypotheses(
-        self, recording: Recording, period: float, scored: Recording | None
-    ) -> Mapping[str, Model]:
-        """The models to compare by name; one is fitted without comparison.
+    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
+        """The models to compare; one is fitted without comparison.
 
-        They have to be able to do what is seen in the recording and in what they are `scored` on.
+        The first recording is to be fitted, what follows only to be scored on.
         """
+
+    def sufficient(self, model: Model, recordings: Sequence[Recording]) -> Model:
+        """The model without what cannot show in these recordings, for less work."""
+        return model
 
 
 @dataclass(frozen=True, kw_only=True)

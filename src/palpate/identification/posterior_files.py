@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -21,21 +22,22 @@ FORMAT = "palpate-posterior-1"
 _ABOUT = "about"  # the entry that holds JSON as text
 
 
-def write_posterior(path: str | Path, posterior: Posterior) -> Path:
+def write_posterior(path: str | Path, posterior: Posterior, model: Model | None = None) -> Path:
     """Write draws in whitened coordinates and in units, with what they are, as one NPZ file.
 
     Arrays: `position` (chains, draws, free), `density` (chains, draws), `value.PATH` (chains,
-    draws, ...) for each free parameter, and `model.FIELD` for all else that the model is made of.
-    `about`: JSON with names, the table, warnings and cost.
+    draws, ...) for each free parameter, and `model.FIELD` for the arrays that the model is made of
+    besides: of `model`, if one is given that is more complete than what was fitted. `about`: JSON
+    with names, the table, warnings and cost, what the model is called, and its other settings.
     """
     draws = posterior.draws
     arrays: dict[str, np.ndarray] = {"position": draws.position, "density": draws.density}
     arrays |= {f"value.{path}": value for path, value in posterior.values.items()}
-    model = posterior.target.coordinates.reference
-    kind, settings = registered(model), {}
+    whole: Model = posterior.target.coordinates.reference if model is None else model
+    kind, settings = registered(whole), {}
     if kind is not None:
-        fields = {*parameters_of(model), *structure_of(type(model))} - set(posterior.values)
-        of = {name: getattr(model, name) for name in fields}
+        fields = {*parameters_of(whole), *structure_of(type(whole))} - set(posterior.values)
+        of = {name: getattr(whole, name) for name in fields}
         settings = {name: value for name, value in of.items() if not isinstance(value, jax.Array)}
         arrays |= {f"model.{name}": np.asarray(of[name]) for name in fields - set(settings)}
     about = {
@@ -74,7 +76,7 @@ def read_posterior(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "..."]
         raise PalpateError(f"there is no file {path}") from error
     except KeyError as error:
         raise PalpateError(f"{path} is no posterior: expected that of write_posterior") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, TypeError, zlib.error, zipfile.BadZipFile) as error:
         raise DamagedFileError(f"{path} is damaged or no NPZ file ({error})") from error
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise PalpateError(f"{path} is no posterior of the format {FORMAT}")
@@ -84,12 +86,13 @@ def read_posterior(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "..."]
 def read_models(path: str | Path, count: int | None = None) -> Model:
     """The models that `write_posterior` wrote, as one whose free parameters lead with the draws.
 
-    All draws of all chains, or about `count` evenly spaced ones. What was never near enough to
-    touch in the recordings that were fitted may have no contacts in them.
+    All draws of all chains, or about `count` (at least one) evenly spaced ones.
 
     Raises `PalpateError` when the file is missing, no posterior, or of a model that has no name in
     files, `DamagedFileError` when something of the model is missing or does not fit.
     """
+    if count is not None and count < 1:
+        raise PalpateError(f"at least one draw is needed, not {count}")
     arrays, about = read_posterior(path)
     kind = MODELS.get(str(about.get("model")))
     if kind is None:

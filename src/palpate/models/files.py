@@ -14,7 +14,7 @@ from palpate.models.model import Model
 from palpate.models.planar import Planar
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.models.rope import Rope
-from palpate.parameters import LogNormal, describe, parameters_of
+from palpate.parameters import LogNormal, axes_of, describe, parameters_of
 from palpate.storage import read_json, write_json
 
 MODELS: dict[str, type[Model]] = {"rope": Rope, "planar": Planar}
@@ -27,10 +27,17 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
 
     Of a `Residual`, the physics as any other, and the arrays of its network beside the parameters.
     What this instance declares differently (fixed, shared, other priors) is not kept: it belongs
-    to the identification that used it. Raises `PalpateError` for a model that is not registered.
+    to the identification that used it. Raises `PalpateError` for a model that is not registered,
+    and for a batch of models.
     """
     network = model.network if isinstance(model, Residual) else None
     physics = model.physics if isinstance(model, Residual) else model
+    for field, axes in axes_of(type(physics)).items():
+        if registered(physics) and getattr(physics, field).ndim != len(axes):
+            raise PalpateError(
+                f"a file holds one model, not a batch of them: {field} has the shape "
+                f"{getattr(physics, field).shape}, expected the axes ({', '.join(axes)})"
+            )
     name = registered(physics)
     if name is None:
         raise PalpateError(
@@ -84,13 +91,10 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
     declared = parameters_of(kind)
     _check_names(path, "parameters", rows, declared)
     _check_names(path, "structure", structure, structure_of(kind))
-    arrays = {
-        name: _whole(_numbers(path, name, value), _axes(kind, name))
-        for name, value in (rows | structure).items()
-        if _axes(kind, name) is not None
-    }
+    axes, given = axes_of(kind), rows | structure
+    arrays = {name: _whole(_numbers(path, name, given[name]), of) for name, of in axes.items()}
     for name, value in arrays.items():
-        _check_axes(path, name, value, kind)
+        _check_axes(path, name, value, axes[name])
     settings = {name: value for name, value in structure.items() if name not in arrays}
     model = built(path, kind, arrays, settings)
     if _VERSIONS[version]:
@@ -133,12 +137,13 @@ def built(
         if isinstance(default, float):
             settings[name] = float(value)
     for name, value in arrays.items():
+        _check_finite(path, name, value)
         lognormal = name in declared and isinstance(declared[name].prior, LogNormal)
         if lognormal and np.any(value < 0):
             raise PalpateError(f"'{name}' in {path} must not be negative, got {np.min(value):g}")
     try:
         return kind(**arrays, **settings)
-    except (TypeError, IndexError) as error:
+    except (PalpateError, TypeError, IndexError) as error:
         raise PalpateError(f"{path} is damaged: {error}") from error
 
 
@@ -182,17 +187,9 @@ def _corrected(path: str | Path, physics: Model, content: Any) -> Residual:
         raise PalpateError(f"{path} is damaged: {error}") from error
 
 
-def _axes(kind: type[Model], name: str) -> list[str] | None:
-    """The axes of an array field as annotated, without the batch's; None of another field."""
-    annotation: Any = next(field.type for field in dataclasses.fields(kind) if field.name == name)
-    if not hasattr(annotation, "dim_str"):
-        return None
-    return [axis for axis in annotation.dim_str.split() if not axis.startswith("*")]
-
-
-def _whole(value: np.ndarray, axes: list[str] | None) -> np.ndarray:
+def _whole(value: np.ndarray, axes: list[str]) -> np.ndarray:
     """An array without elements as its list was, with the axes that a list cannot tell."""
-    if value.size or axes is None:
+    if value.size:
         return value
     lacking = axes[value.ndim :]
     return value.reshape(*value.shape, *(int(axis) if axis.isdigit() else 0 for axis in lacking))
@@ -217,10 +214,9 @@ def _alike(value: Any, default: Any) -> bool:
     return type(value) is type(default) or (type(default), type(value)) == (float, int)
 
 
-def _check_axes(path: str | Path, name: str, value: np.ndarray, kind: type[Model]) -> None:
-    """A file holds one model: a parameter has the axes of its annotation, without the batch's."""
-    axes = _axes(kind, name)
-    if axes is not None and value.ndim != len(axes):
+def _check_axes(path: str | Path, name: str, value: np.ndarray, axes: list[str]) -> None:
+    """A file holds one model: an array has the axes of its annotation, without the batch's."""
+    if value.ndim != len(axes):
         expected = f"the axes ({', '.join(axes)})" if axes else "one number"
         raise PalpateError(f"'{name}' in {path} must be {expected}, got shape {value.shape}")
 
@@ -230,6 +226,12 @@ def _numbers(path: str | Path, name: str, value: Any) -> np.ndarray:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
         raise PalpateError(f"'{name}' in {path} is not numbers: {value!r}") from error
+    _check_finite(path, name, array)
+    return array
+
+
+def _check_finite(path: str | Path, name: str, array: np.ndarray) -> None:
+    if array.dtype.kind not in "fi":
+        raise PalpateError(f"'{name}' in {path} is not numbers: they are of type {array.dtype}")
     if not (np.abs(array) <= np.finfo(np.float32).max).all():
         raise PalpateError(f"'{name}' in {path} is not finite")
-    return array

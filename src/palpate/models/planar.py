@@ -8,13 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from palpate.errors import PalpateError
 from palpate.models import planar_step
 from palpate.models.model import Model
+from palpate.models.planar_checks import check_axes, check_indices
 from palpate.models.planar_friction import Rolling, Tensor, Wheel
 from palpate.models.planar_geometry import Shapes
 from palpate.models.planar_links import COINCIDENT, Links, turn
-from palpate.parameters import LogNormal, Normal, Parameter, Uniform, as_floating, parameter
+from palpate.parameters import (
+    LogNormal,
+    Normal,
+    Parameter,
+    Uniform,
+    as_floating,
+    axes_of,
+    parameter,
+)
 
 WEAKEST = 1e-6  # N: what is less counts as this, as a logarithm needs it
 TIPPING = 0.95  # of the way to the feet on one side: where the centre of mass is at most
@@ -67,6 +75,9 @@ class Planar(Model):
     Which wheels and links there are, their law, what a link leads to (-1: the world) and which
     bodies are bolted down is data: hypotheses about it are a batch axis. Batch axes of parameters
     and structure lead, as those of states and actions do.
+
+    Raises `PalpateError` for arrays that do not fit each other, and links or contacts of bodies,
+    parts or walls that do not exist.
     """
 
     mass: Float[Array, "*batch bodies"] = parameter(
@@ -164,15 +175,8 @@ class Planar(Model):
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
-        wheels, links = self.wheel.shape[-1], self.pivot.shape[-1]
-        sizes = {"bodies": self.bodies, "wheels": wheels, "links": links}
-        for name, axes in _NAMED_AXES.items():
-            shape = getattr(self, name).shape
-            last = shape[max(len(shape) - len(axes), 0) :]
-            if [sizes.get(axis, size) for axis, size in zip(axes, last, strict=False)] != [*last]:
-                raise PalpateError(
-                    f"{name} must have the axes ({', '.join(axes)}) of {sizes}, got {shape}"
-                )
+        check_axes(self)
+        check_indices(self)
 
     @property
     def bodies(self) -> int:
@@ -387,15 +391,4 @@ def turned_wheel(
     }
 
 
-def _axes_of(kind: type) -> dict[str, list[str]]:
-    """The axes of the array fields of a module, without a batch's."""
-    annotations: dict[str, Any] = {field.name: field.type for field in dataclasses.fields(kind)}
-    return {
-        name: [axis for axis in annotation.dim_str.split() if not axis.startswith("*")]
-        for name, annotation in annotations.items()
-        if hasattr(annotation, "dim_str")
-    }
-
-
-_NAMED_AXES = _axes_of(Planar)
-_AXES = [*map(len, (*_NAMED_AXES.values(), *_axes_of(PlanarState).values())), 2]
+_AXES = [*(len(axes) for kind in (Planar, PlanarState) for axes in axes_of(kind).values()), 2]

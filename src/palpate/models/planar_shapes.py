@@ -11,7 +11,7 @@ from shapely.geometry.polygon import orient
 
 from palpate.errors import PalpateError
 from palpate.models.planar import Planar
-from palpate.parameters import as_floating, parameters_of
+from palpate.parameters import as_floating, axes_of, parameters_of
 
 LAWS = {"coulomb": 1.0, "viscous": 0.0}
 OFF_CENTRE = 1e-3  # of a body's extent: how far its centroid may lie from its frame's origin
@@ -239,11 +239,5 @@ def _links(
 
 def _parameter_shapes(sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
     """Shape of every parameter of a planar model of these sizes."""
-    return {
-        name: tuple(
-            sizes.get(axis, 2)
-            for axis in Planar.__annotations__[name].dim_str.split()
-            if not axis.startswith("*")
-        )
-        for name in parameters_of(Planar)
-    }
+    declared, axes = parameters_of(Planar), axes_of(Planar)
+    return {name: tuple(sizes.get(axis, 2) for axis in axes[name]) for name in declared}

@@ -61,6 +61,10 @@ MEASURED = "pose and deviation"
 THREADS = os.cpu_count() or 1
 
 
+class CastersUnknownError(PalpateError):
+    """A recording in which no free caster rolls far enough to show where it points."""
+
+
 @dataclasses.dataclass(frozen=True)
 class ToldScene:
     """A piece whose structure is known, standing at `pose` (3,) m, m, rad where it is hinged.
@@ -184,7 +188,8 @@ def fit_scene(
         seed: draws these constants.
 
     Raises `PalpateError` when the extra is missing, the piece is bolted down, the recording has
-    gaps or another number of bodies, or is too short to tell where casters point.
+    gaps or another number of bodies; `CastersUnknownError` when it does not tell where casters
+    point.
     """
     sysid = mujoco_sysid()
     if kind.bolted:
@@ -351,7 +356,9 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int
     """The pieces of a recording as mujoco.sysid takes them, and how many they are.
 
     Measured is at each frame the pose and the standard deviation of what a perfect model's would
-    differ by: the noise, and the start's deviation with that of its velocity, as it grows.
+    differ by: the noise, and the start's deviation with that of its velocity, as it grows. Pieces
+    begin where it is known of all free casters where they point, or of as many as there ever are:
+    one beside a hinge may never roll, and then hardly matters.
     """
     planar = furniture([np.asarray(scene.kind.outline)], control_period=CONTROL_PERIOD)
     noise = noise_scale(aligned, planar)
@@ -362,6 +369,7 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int
     after = CONTROL_PERIOD * np.arange(1, horizon + 1)[:, None]
     mapping = {MEASURED: (sysid.SignalType.CustomObs, np.arange(6))}
     names, states, controls, measured = [], [], [], []
+    least = max(1, _told_at_best(scene, aligned, horizon)) if scene.free else 0
     for trial, length in enumerate(aligned.length):
         one = Aligned(
             aligned.period,
@@ -373,7 +381,7 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int
         tracks = _tracks(scene, one.observation[0, :, 0])
         for piece in range(pieces.count):
             frame = piece * horizon
-            if not all(known[frame] >= KNOWN for _, known in tracks):
+            if sum(known[frame] >= KNOWN for _, known in tracks) < least:
                 continue
             angles = np.array([angle[frame] for angle, _ in tracks])
             pose, rate = pieces.pose[piece, 0], pieces.rate[piece, 0]
@@ -391,12 +399,21 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int
             measured.append(sysid.TimeSeries(after[:, 0], values, mapping))
             names.append(f"trial {trial} frame {frame}")
     if not names:
-        raise PalpateError(
+        raise CastersUnknownError(
             f"the {scene.kind.name} is nowhere moved far enough to tell where its casters point: "
             "expected a recording of 10 s or so in which it is"
         )
     sequences = sysid.ModelSequences("furniture", spec, names, states, controls, measured)
     return sequences, len(names)
+
+
+def _told_at_best(scene: ToldScene, aligned: Aligned, horizon: int) -> int:
+    """Of how many free casters it is known where they point, at the best start of a piece."""
+    known = [
+        np.array([known[: length - 1 : horizon] for _, known in _tracks(scene, poses[:length, 0])])
+        for poses, length in zip(aligned.observation, aligned.length, strict=True)
+    ]
+    return int(max((each >= KNOWN).sum(axis=0).max() for each in known))
 
 
 def _tracks(scene: ToldScene, poses: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -49,6 +49,19 @@ def test_the_mass_is_found_from_a_few_seconds_without_noise():
     assert fit.wall_time_s > 0
 
 
+def test_a_caster_beside_a_hinge_need_not_show_where_it_points():
+    world = world_of("hinged")
+    recording = record_handling(world, seed=30, duration=6.0)
+    true = world.truth().parameters[0]
+    scene = ToldScene(KINDS["hinged"], true.locked, true.anchor, (0.0, 0.0, 0.0))
+    aligned = recording.align(CONTROL_PERIOD)
+    known = [known for _, known in one_shot_sysid._tracks(scene, aligned.observation[0, :, 0])]
+    assert max(known[2]) < one_shot_sysid.KNOWN
+    fit = fit_scene(recording, KINDS["hinged"], true.locked, true.anchor)
+    assert fit.pieces > 0
+    assert fit.parameters.mass == pytest.approx(true.mass, rel=0.1)
+
+
 def predicted_pushes(kind, draws):
     """With the true constants, from the exact start; and the pieces."""
     world = world_of(kind)

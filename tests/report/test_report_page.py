@@ -227,6 +227,16 @@ def test_pictures_of_the_run_that_the_page_is_about_are_embedded(tmp_path):
     assert page.loads == ["data:image/png;base64,b25l"]
 
 
+@pytest.mark.parametrize(
+    ("count", "words"), [(5, "run 0 → run 1 → run 2 → run 3 → run 4"), (7, "run 4 and 2 more")]
+)
+def test_many_stages_are_counted(tmp_path, count, words):
+    runs = [write_run(tmp_path / f"{n}", f"run {n}") for n in range(count)]
+    page = page_of(build_report(runs, tmp_path / "page.html", "Many"))
+    assert words in page.text
+    assert "→ run 5" not in page.text
+
+
 def test_no_run_is_refused(tmp_path):
     with pytest.raises(PalpateError, match="at least one run"):
         build_report([], tmp_path / "page.html", "None")

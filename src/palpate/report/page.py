@@ -33,6 +33,7 @@ from palpate.result import Figure
 from palpate.storage import write_text
 
 Section = tuple[str, str]  # title, HTML
+NAMED = 5  # stages that a page names; more are counted
 _OBSERVED = "observed"  # the label that predictions are held against
 
 
@@ -94,7 +95,8 @@ def _labels(evidence: Evidence) -> Iterator[str]:
 
 
 def _header(found: Sequence[Evidence], title: str, notes: Sequence[str]) -> Iterator[str]:
-    names = " → ".join(_text(evidence.name) for evidence in found)
+    names = " → ".join(_text(evidence.name) for evidence in found[:NAMED])
+    names += f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     dates = sorted(str(e.environment["date"])[:10] for e in found if "date" in e.environment)
     when = f", {_text(dates[-1])}" if dates else ""
     yield f"<header><h1>{_text(title)}</h1><p>{names}{when}</p>"

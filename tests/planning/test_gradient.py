@@ -117,14 +117,15 @@ def test_goes_where_it_is_told_within_limits(rate) -> None:
 
 
 def test_takes_the_swing_out_of_a_pendulum() -> None:
+    # From 1.5 rad an iteration a decision does not settle, and rounding says where it ends.
     planner = pendulum_planner()
-    start = PendulumState(jnp.full(1, 1.5), jnp.zeros(1))
+    start = PendulumState(jnp.full(1, 1.0), jnp.zeros(1))
     state, left, plan = start, start, first_plan(planner)
     for _ in range(100):
         plan, command = planner(plan, state, None)
         state, left = PENDULUM.step(state, command), PENDULUM.step(left, jnp.zeros(1))
     share = PENDULUM.energy(state) / PENDULUM.energy(start)
-    assert float(share) < 0.05
+    assert float(share) < 0.01
     assert float(PENDULUM.energy(left) / PENDULUM.energy(start)) > 0.5
 
 

@@ -32,17 +32,18 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
     """
     network = model.network if isinstance(model, Residual) else None
     physics = model.physics if isinstance(model, Residual) else model
-    for field, axes in axes_of(type(physics)).items():
-        if registered(physics) and getattr(physics, field).ndim != len(axes):
-            raise PalpateError(
-                f"a file holds one model, not a batch of them: {field} has the shape "
-                f"{getattr(physics, field).shape}, expected the axes ({', '.join(axes)})"
-            )
     name = registered(physics)
     if name is None:
         raise PalpateError(
             f"a model of type {type(physics).__name__} cannot be saved; known: {', '.join(MODELS)}"
         )
+    for field, axes in axes_of(type(physics)).items():
+        shape = getattr(physics, field).shape
+        if len(shape) != len(axes):
+            raise PalpateError(
+                f"a file holds one model, not a batch of them: {field} has the shape {shape}, "
+                f"expected the axes ({', '.join(axes)})"
+            )
     write_json(
         path,
         {

@@ -18,6 +18,7 @@ from blackjax.mcmc.hmc import HMCState
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
+from palpate.devices import compiled_sooner
 from palpate.identification.draws import Draws, check_start
 from palpate.identification.laplace import Modes, look
 from palpate.identification.target import Target
@@ -26,7 +27,8 @@ from palpate.small_systems import solve_lower, solve_upper
 BLOCK = 50  # draws between two looks at the chains: one compiled piece of work
 WARM_UP = 4  # blocks
 LEARNED = 2  # from this block of the warm-up on the metric is learnt from the draws of the last
-ACCEPTANCE = 0.8
+ACCEPTANCE = 0.9  # high: the longer steps of .8 diverge where a posterior narrows, and chains stick
+ACCEPTANCE_FIXED = 0.8  # of trajectories of fixed length
 DOUBLINGS = 6
 GAIN = 0.15  # of the step size's logarithm per draw, at first; falls as the root of the draws
 
@@ -60,9 +62,9 @@ def no_u_turn(
     began = time.monotonic()
     begin, *keys = jax.random.split(key, 1 + WARM_UP + -(-draws // BLOCK))
     position = np.array(modes.draw(begin, chains))
-    lost = ~np.isfinite(look(target, position)[0])
+    lost = ~np.isfinite(_look(target, modes, position)[0])
     position[lost] = modes.position[0]
-    value, slope, _ = look(target, position)
+    value, slope = _look(target, modes, position)
     check_start(target, position, value)
     state = position, value.astype(position.dtype), slope.astype(position.dtype)
     covariance = np.asarray(modes.covariance[0], np.float64)
@@ -99,6 +101,17 @@ def no_u_turn(
     )
 
 
+def _look(target: Target, modes: Modes, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Density and slope at a few positions, in float64.
+
+    With as many of the modes beside them as there are, for which it has been compiled already.
+    """
+    wanted = len(position)
+    rest = np.asarray(modes.position, position.dtype)[wanted:]
+    value, slope, _ = look(target, np.concatenate([position, rest]))
+    return value[:wanted], slope[:wanted]
+
+
 def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Covariance of the draws of all chains, with the earlier one worth a few draws.
 
@@ -110,7 +123,7 @@ def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
     return (scatter + weight * prior) / (len(flat) + weight)
 
 
-@eqx.filter_jit
+@compiled_sooner
 def _block(
     target: Target,
     state: State,
@@ -124,20 +137,25 @@ def _block(
 
     def part(arrays, state, root, step, keys, gain) -> tuple[State, _Block]:
         whole = eqx.combine(arrays, static)
-        return jax.vmap(lambda s, e, k: chain(whole, s, root, e, k, gain))(state, step, keys)
+        # One after another: side by side each would wait for the longest trajectory.
+        return jax.lax.map(
+            lambda c: chain(whole, c[0], root, c[1], c[2], gain), (state, step, keys)
+        )
 
-    devices = jax.devices()
-    if len(step) % len(devices):
-        return part(arrays, state, root, step, keys, gain)
     each, shared = PartitionSpec("chains"), PartitionSpec()
     divided = jax.shard_map(
         part,
-        mesh=Mesh(devices, ("chains",)),
+        mesh=Mesh(jax.devices()[: _most_even(len(step))], ("chains",)),
         in_specs=(shared, each, shared, each, each, shared),
         out_specs=each,
         check_vma=False,
     )
     return divided(arrays, state, root, step, keys, gain)
+
+
+def _most_even(chains: int) -> int:
+    """On how many devices each has the same number of chains: the most that there are."""
+    return max(n for n in range(1, len(jax.devices()) + 1) if chains % n == 0)
 
 
 def chain(
@@ -159,6 +177,7 @@ def chain(
     would compile the model's derivatives twice.
     """
     turning, fixed = blackjax.nuts.build_kernel(), blackjax.hmc.build_kernel()
+    acceptance = ACCEPTANCE if leaps is None else ACCEPTANCE_FIXED
     position, value, slope = state
     unit = jnp.ones_like(position)
 
@@ -174,7 +193,7 @@ def chain(
             moving, varying = jax.random.split(key)
             varied = jnp.exp(step) * jax.random.uniform(varying, (), step.dtype, 0.8, 1.2)
             state, info = fixed(moving, state, density, varied, unit, leaps)
-        step += gain / jnp.sqrt(1.0 + index / 5.0) * (info.acceptance_rate - ACCEPTANCE)
+        step += gain / jnp.sqrt(1.0 + index / 5.0) * (info.acceptance_rate - acceptance)
         out = _Block(
             position=root @ state.position,
             density=state.logdensity,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from palpate.devices import compiled_sooner
 from palpate.errors import PalpateError
 from palpate.identification.likelihood import MotionPosterior, initial_position
 from palpate.identification.target import Target
@@ -163,7 +164,7 @@ def _finite(
     return value, slope, scaled @ np.swapaxes(vectors, -1, -2)
 
 
-@eqx.filter_jit
+@compiled_sooner
 def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
     return jax.vmap(target.curvature)(position)
 

@@ -61,6 +61,18 @@ def test_a_climb_of_some_coordinates_ends_where_the_others_leave_them_most_proba
     np.testing.assert_allclose(found.position[:, 1:], conditional, atol=5e-3)
 
 
+def test_a_climb_ends_when_it_has_arrived():
+    target, looks = linear(), []
+
+    def curvature(position):
+        looks.append(len(position))
+        return jax.vmap(target.curvature)(position)
+
+    found = climb_each(curvature, np.asarray(jax.random.normal(KEY, (5, target.dimension))), 200)
+    np.testing.assert_allclose(found.position[0], target.moments()[0], atol=5e-3)
+    assert len(looks) < 40
+
+
 def test_data_that_say_all_of_one_direction_and_nothing_of_the_others_are_climbed():
     """A wheel without friction in a start far out: information of 1e22 beside the prior's."""
 

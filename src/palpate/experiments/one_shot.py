@@ -47,7 +47,7 @@ from palpate.worlds.furniture_pieces import KINDS, Piece
 
 NAME = "one-shot"
 FIGURE = "shares.png"
-SEEDS = 918_000  # of hidden constants, handling and pushes, used by nothing else
+SEEDS = 920_000  # of hidden constants, handling and pushes, used by nothing else
 RACED = "couch"  # whose posterior the samplers race on
 
 

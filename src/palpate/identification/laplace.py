@@ -20,7 +20,8 @@ from palpate.identification.target import Target
 
 LONGEST = 1.5  # prior standard deviations that a step may have
 DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
-SETTLED = 0.1  # gain of the density's logarithm in a few steps below which a climb has arrived
+SETTLED = 0.01  # gain of the density's logarithm in a few steps below which a climb has arrived
+HOPED = 1e3  # gain before the first step: nine refusals in a row do not end a climb
 MOST = 1e13  # information in one direction; the prior's is one
 ROUNDING = 1e-14  # of an eigenvalue by the size of the greatest
 ROUNDS = 3  # in which the start's errors are propagated anew
@@ -88,7 +89,7 @@ def climb_each(
     moves = np.ones(here.shape[-1]) if moving is None else np.asarray(moving, float)
     value, slope, information = _finite(curvature, here)
     damping = np.full(value.shape, DAMPING[0])
-    gained = np.full(value.shape, np.inf)
+    gained = np.full(value.shape, HOPED)
     for _ in range(steps):
         if np.all(gained < SETTLED):
             break

@@ -1,4 +1,4 @@
-"""Sphinx configuration: Markdown through MyST, examples executed while building."""
+"""Sphinx configuration: Markdown through MyST."""
 
 import json
 from importlib.metadata import version as installed_version

@@ -102,6 +102,34 @@ def data_parallel(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], A
     return call
 
 
+def over_devices(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Divide what is independent over the devices: chains of a sampler, starts of a search.
+
+    `function(shared, each)` takes and gives batches: the leading axis of every leaf of `each`, of
+    the same length in all, and of what it returns. The result takes the same and runs `function` on
+    an equal part of the batch on each of as many devices as there are such parts for; none waits
+    for another before its end. `shared` may hold what is no array.
+    """
+    import equinox as eqx
+    import jax
+    from jax.sharding import Mesh, PartitionSpec
+
+    def call(shared: Any, each: Any) -> Any:
+        arrays, static = eqx.partition(shared, eqx.is_array)
+        count, devices = jax.tree.leaves(each)[0].shape[0], jax.devices()
+        used = max(n for n in range(1, len(devices) + 1) if count % n == 0)
+        divided = jax.shard_map(
+            lambda arrays, part: function(eqx.combine(arrays, static), part),
+            mesh=Mesh(devices[:used], ("each",)),
+            in_specs=(PartitionSpec(), PartitionSpec("each")),
+            out_specs=PartitionSpec("each"),
+            check_vma=False,
+        )
+        return divided(arrays, each)
+
+    return call
+
+
 def everywhere(tree: Any) -> Any:
     """The arrays on all devices, as a computation by `data_parallel` leaves what it returns.
 

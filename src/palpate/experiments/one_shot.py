@@ -10,6 +10,7 @@ Each stage is a run in a folder below `out`, and resumes there.
 """
 
 import dataclasses
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -193,16 +194,22 @@ def _told(out: Path, kind: str, seed: int, size: Size) -> dict[str, Any]:
 
 
 def _raced(out: Path, seed: int, size: Size) -> dict[str, Any]:
-    """The samplers on the posterior of a couch."""
+    """The samplers on the posterior of a couch.
+
+    Ours is timed as a user waits for it: search for modes, compiling, warm-up and draws.
+    """
 
     def work() -> dict[str, Any]:
         handled, _ = recordings(RACED, seed, 1)
         model = starting_furniture(handled, PERIOD)
         target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
+        began = time.monotonic()
         posterior = sample(target, draws=size.raced_draws, seed=seed)
+        spent = time.monotonic() - began
         paces = race(posterior, seed, size.budget)
         return {
             "free_parameters": posterior.target.parameters,
+            "posterior_s": spent,
             "compiling_s": posterior.draws.compiling,
             "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
         }
@@ -256,7 +263,7 @@ def _figures(
         Figure("wins_against_regression", wins / cells, "", bar=0.9, better="higher"),
         Figure("rhat_max_predictions", paces[NUTS].rhat, "", bar=1.01),
         Figure("ess_min", paces[NUTS].size, "", bar=400, better="higher"),
-        Figure("sampling_s", paces[NUTS].seconds + raced["compiling_s"], "s", bar=60),
+        Figure("sampling_s", raced["posterior_s"], "s", bar=60),
         Figure("ess_per_s_over_metropolis", paces[NUTS].rate / paces["metropolis"].rate, "",
                bar=20, better="higher"),
         Figure("ess_per_s_over_adapted", paces[NUTS].rate / paces["adapted"].rate, "", bar=1,
@@ -290,12 +297,16 @@ def pooled(stages: list[dict[str, Any]]) -> float:
 
 
 def victories(compared: dict[str, dict[str, Any]]) -> tuple[int, int]:
-    """In how many cells of kind and number of samples no regression has a smaller error share."""
+    """In how many cells of kind and number of samples no regression has a smaller error share.
+
+    One that diverged has none.
+    """
     wins = cells = 0
     for stage in compared.values():
         for size, ours in stage["shares"][OURS].items():
+            theirs = (stage["shares"][rival][size] for rival in RIVALS)
             cells += 1
-            wins += ours < min(stage["shares"][rival][size] for rival in RIVALS)
+            wins += all(share is None or ours < share for share in theirs)
     return wins, cells
 
 

@@ -46,14 +46,15 @@ OURS = "posterior"
 
 def shares(
     handled: Recording, pushes: Recording, draws: int, seed: int
-) -> dict[str, dict[int, float]]:
-    """Error share on the pushes by method and number of samples."""
+) -> dict[str, dict[int, float | None]]:
+    """Error share on the pushes by method and number of samples; None of one that diverged."""
     aligned = handled.align(PERIOD, POSE, WRENCH)
-    found: dict[str, dict[int, float]] = {name: {} for name in (OURS, *RIVALS)}
+    found: dict[str, dict[int, float | None]] = {name: {} for name in (OURS, *RIVALS)}
     for size in SIZES:
         found[OURS][size] = _ours(handled, aligned, pushes, size, draws, seed)
         for rival in RIVALS:
-            found[rival][size] = _theirs(handled, aligned, pushes, rival, size)
+            share = _theirs(handled, aligned, pushes, rival, size)
+            found[rival][size] = share if np.isfinite(share) else None
     return found
 
 
@@ -86,10 +87,9 @@ def _ours(
     """
     models = structures(handled, PERIOD)
     model, seconds = models["wheels"], PIECE * SAMPLE
-    pieces = cut(
-        first_samples(aligned, size + 1), model, seconds, at_rest=True, count=max(SIZES) // PIECE
-    )
-    scales = inferred_scales(model, noise_scale(aligned, model))
+    seen = first_samples(aligned, size + 1)
+    pieces = cut(seen, model, seconds, at_rest=True, count=max(SIZES) // PIECE)
+    scales = inferred_scales(model, noise_scale(seen, model))
     targets = {name: motion_posterior(of, pieces, scales) for name, of in models.items()}
     posterior = identify(targets, draws, seed=seed).posterior
     asked = pushes_of(pushes, model)
@@ -128,8 +128,9 @@ def _share(model: RegressedModel, pushes: Segments) -> float:
     every = round(SAMPLE / PERIOD)
     action = pushes.action.reshape(pushes.count, -1, every, *pushes.action.shape[2:]).mean(axis=2)
     states = rollout(model, PlanarState(pushes.pose, pushes.rate), action)
-    final, target = np.asarray(states.pose)[:, -1, 0, :2], np.asarray(pushes.target)[:, -1, 0, :2]
+    final = np.asarray(states.pose, np.float64)[:, -1, 0, :2]
     if not np.isfinite(final).all():
         return float("inf")
+    target = np.asarray(pushes.target)[:, -1, 0, :2]
     displacement = target - np.asarray(pushes.pose)[:, 0, :2]
     return error_share(np.linalg.norm(final - target, axis=1), np.linalg.norm(displacement, axis=1))

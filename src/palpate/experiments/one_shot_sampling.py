@@ -43,8 +43,9 @@ TRIED = 2000  # steps from which a sampler's pace is found
 def race(posterior: Posterior, seed: int, budget: float) -> dict[str, Pace]:
     """Our draws, and both kinds of Metropolis given about `budget` seconds each.
 
-    How many steps fit in is found from a short run of the same sampler. Compiling counts for none:
-    the rate is of a sampler that runs on.
+    How many steps fit in is found from a short run of the same sampler. Neither compiling counts
+    for any of them nor the search for the modes that all begin at: the rate is of a sampler that
+    runs on. All divide their chains over the cores.
     """
     paces = {OURS: _pace(posterior, posterior.draws)}
     target, chains = posterior.target, posterior.draws.position.shape[0]

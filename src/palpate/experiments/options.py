@@ -155,7 +155,7 @@ class IdentifyBayesian(Reading, ABC):
     recordings: Positional[
         Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
     ]
-    """What to fit: .npz of palpate, or a robot's log: .mcap, .db3, .bag, a folder of a rosbag2."""
+    """What to fit: .npz of palpate."""
     validate: Annotated[
         tuple[Path, ...], arg(metavar="FILE ...", help_behavior_hint="(default: none)")
     ] = ()
@@ -310,7 +310,7 @@ class Reproduce(Options):
     """
 
     quick: bool = False
-    """At a smaller size, within five minutes."""
+    """At a smaller size, in minutes."""
     weights: Annotated[
         Literal["trained", "shipped"] | None,
         arg(metavar="{trained,shipped}", help_behavior_hint="(default: trained)"),

@@ -305,7 +305,7 @@ def wall_time(run: Run) -> float:
 
 
 def announce(name: str, minutes: dict[str, int]) -> None:
-    """Say how long it will take: `minutes` on two cores, by stage."""
+    """Say how long it will take: `minutes` on two cores that do nothing else, by stage."""
     parts = ", ".join(f"{stage} {time}" for stage, time in minutes.items())
     total = sum(minutes.values())
-    print(f"{name}: about {total} minutes on two cores ({parts})", flush=True)
+    print(f"{name}: about {total} minutes on two idle cores ({parts})", flush=True)

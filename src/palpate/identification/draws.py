@@ -1,6 +1,7 @@
 """What every sampler returns."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,8 +19,7 @@ class Draws:
     `density` is the logarithm of the unnormalised posterior density; `acceptance` the share of
     proposals accepted (or its expectation) by chain; `divergences` how many trajectories broke
     off; `evaluations` how many densities (or gradients) were computed by all chains, warm-up
-    included; `seconds` the wall time of all, `compiling` what of it was spent before the first
-    draw was there.
+    included; `seconds` the wall time of all, `compiling` what of it compiling took.
     """
 
     position: Float[np.ndarray, "chains draws free"]
@@ -29,6 +29,20 @@ class Draws:
     evaluations: int
     seconds: float
     compiling: float
+
+
+def time_to_compile(
+    seconds: Sequence[float], evaluations: Sequence[float], first: Sequence[int]
+) -> float:
+    """Of so many seconds those that compiling took, s.
+
+    `seconds` and `evaluations` are of spans of work; `first` says in which of them something ran
+    for the first time. It is what these took beyond the pace of the others.
+    """
+    again = np.setdiff1d(np.arange(len(seconds)), first)
+    spent, done = np.asarray(seconds), np.asarray(evaluations)
+    pace = spent[again].sum() / done[again].sum()
+    return float(sum(max(0.0, spent[index] - pace * done[index]) for index in first))
 
 
 def check_start(

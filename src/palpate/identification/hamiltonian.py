@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from blackjax.mcmc.hmc import HMCState
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from palpate.devices import compiled_sooner
-from palpate.identification.draws import Draws, check_start
+from palpate.devices import compiled_sooner, over_devices
+from palpate.identification.draws import Draws, check_start, time_to_compile
 from palpate.identification.laplace import Modes, look
 from palpate.identification.target import Target
 from palpate.small_systems import solve_lower, solve_upper
@@ -62,17 +61,17 @@ def no_u_turn(
     began = time.monotonic()
     begin, *keys = jax.random.split(key, 1 + WARM_UP + -(-draws // BLOCK))
     position = np.array(modes.draw(begin, chains))
-    lost = ~np.isfinite(_look(target, modes, position)[0])
+    lost = ~np.isfinite(look(target, position)[0])
     position[lost] = modes.position[0]
-    value, slope = _look(target, modes, position)
+    value, slope, _ = look(target, position)
     check_start(target, position, value)
     state = position, value.astype(position.dtype), slope.astype(position.dtype)
     covariance = np.asarray(modes.covariance[0], np.float64)
     step = np.full(chains, np.log(1.2 * target.dimension**-0.25))
-    blocks, compiling, leaps = [], 0.0, 0.0
+    blocks, leaps, spent = [], [], []
     for index, block_key in enumerate(keys):
         gain = GAIN if index < WARM_UP else 0.0
-        root = jnp.asarray(np.linalg.cholesky(covariance), position.dtype)
+        root, now = jnp.asarray(np.linalg.cholesky(covariance), position.dtype), time.monotonic()
         # From the host each time: placed otherwise than before, it would be compiled anew.
         state, block = jax.device_get(
             _block(
@@ -80,8 +79,8 @@ def no_u_turn(
                 jax.random.split(block_key, chains), jnp.asarray(gain, position.dtype),
             )
         )  # fmt: skip
-        compiling = compiling or time.monotonic() - began
-        leaps += float(block.leaps.sum())
+        spent.append(time.monotonic() - now)
+        leaps.append(float(block.leaps.sum()))
         if index < WARM_UP:
             # One for all, from the half in which it has settled; a chain that is stuck is outvoted.
             step[:] = np.median(block.step[:, BLOCK // 2 :])
@@ -95,21 +94,10 @@ def no_u_turn(
         density=np.concatenate([b.density for b in blocks], axis=1)[:, :draws],
         acceptance=np.mean([b.acceptance.mean(axis=1) for b in blocks], axis=0),
         divergences=int(sum(b.divergent.sum() for b in blocks)),
-        evaluations=int(leaps),
+        evaluations=int(sum(leaps)),
         seconds=time.monotonic() - began,
-        compiling=compiling,
+        compiling=time_to_compile(spent, leaps, first=(0,)),
     )
-
-
-def _look(target: Target, modes: Modes, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Density and slope at a few positions, in float64.
-
-    With as many of the modes beside them as there are, for which it has been compiled already.
-    """
-    wanted = len(position)
-    rest = np.asarray(modes.position, position.dtype)[wanted:]
-    value, slope, _ = look(target, np.concatenate([position, rest]))
-    return value[:wanted], slope[:wanted]
 
 
 def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -132,30 +120,14 @@ def _block(
     keys: Array,
     gain: Float[Array, ""],
 ) -> tuple[State, _Block]:
-    """One block of every chain, chains divided over the devices; none waits for another device."""
-    arrays, static = eqx.partition(target, eqx.is_array)
+    """One block of every chain."""
 
-    def part(arrays, state, root, step, keys, gain) -> tuple[State, _Block]:
-        whole = eqx.combine(arrays, static)
+    def part(shared, each) -> tuple[State, _Block]:
+        target, root, gain = shared
         # One after another: side by side each would wait for the longest trajectory.
-        return jax.lax.map(
-            lambda c: chain(whole, c[0], root, c[1], c[2], gain), (state, step, keys)
-        )
+        return jax.lax.map(lambda c: chain(target, c[0], root, c[1], c[2], gain), each)
 
-    each, shared = PartitionSpec("chains"), PartitionSpec()
-    divided = jax.shard_map(
-        part,
-        mesh=Mesh(jax.devices()[: _most_even(len(step))], ("chains",)),
-        in_specs=(shared, each, shared, each, each, shared),
-        out_specs=each,
-        check_vma=False,
-    )
-    return divided(arrays, state, root, step, keys, gain)
-
-
-def _most_even(chains: int) -> int:
-    """On how many devices each has the same number of chains: the most that there are."""
-    return max(n for n in range(1, len(jax.devices()) + 1) if chains % n == 0)
+    return over_devices(part)((target, root, gain), (state, step, keys))
 
 
 def chain(

@@ -11,9 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from palpate.devices import compiled_sooner
+from palpate.devices import compiled_sooner, over_devices
 from palpate.errors import PalpateError
 from palpate.identification.likelihood import MotionPosterior, initial_position
 from palpate.identification.target import Target
@@ -63,7 +63,7 @@ def find_modes(target: Target, key: PRNGKeyArray, starts: int = 8, steps: int = 
 
 def climb(target: Target, position: Float[Array, "starts free"], steps: int = 40) -> Modes:
     """Climb from given positions; raises `PalpateError` when all of them fail."""
-    return _found(target, climb_each(functools.partial(_look, target), np.asarray(position), steps))
+    return _found(target, climb_each(functools.partial(_each, target), np.asarray(position), steps))
 
 
 def _found(target: Target, modes: Modes) -> Modes:
@@ -76,7 +76,7 @@ def _found(target: Target, modes: Modes) -> Modes:
 
 
 def climb_each(
-    curvature: Callable[[Array], tuple[Array, Array, Array]],
+    curvature: Callable[[Array], tuple[ArrayLike, ...]],
     position: Float[np.ndarray, "*batch starts free"],
     steps: int = 40,
     moving: Bool[np.ndarray, " free"] | None = None,
@@ -123,7 +123,7 @@ def climb_each(
 
 
 def search(
-    curvature: Callable[[Array], tuple[Array, Array, Array]],
+    curvature: Callable[[Array], tuple[ArrayLike, ...]],
     position: Float[np.ndarray, "*batch starts free"],
     moving: Bool[np.ndarray, " free"],
 ) -> Modes:
@@ -144,11 +144,11 @@ def look(
 
     A position where any of them is not finite has no density, no slope, and the prior's curvature.
     """
-    return _finite(functools.partial(_look, target), position)
+    return _finite(functools.partial(_each, target), position)
 
 
 def _finite(
-    curvature: Callable[[Array], tuple[Array, Array, Array]], position: np.ndarray
+    curvature: Callable[[Array], tuple[ArrayLike, ...]], position: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     here = jnp.asarray(position, jnp.zeros(()).dtype)
     value, slope, information = (np.array(x, np.float64) for x in curvature(here))
@@ -165,9 +165,18 @@ def _finite(
     return value, slope, scaled @ np.swapaxes(vectors, -1, -2)
 
 
+def _each(target: Target, position: ArrayLike) -> tuple[np.ndarray, ...]:
+    """Density, slope and curvature at positions, in parts of one size: it is compiled once."""
+    here = np.asarray(position)
+    count, more = len(here), -len(here) % FOLLOWED
+    parts = np.concatenate([here, *[here[-1:]] * more]).reshape(-1, FOLLOWED, here.shape[-1])
+    found = [_look(target, part) for part in parts]
+    return tuple(np.concatenate(of)[:count] for of in zip(*found, strict=True))
+
+
 @compiled_sooner
 def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
-    return jax.vmap(target.curvature)(position)
+    return over_devices(lambda target, part: jax.vmap(target.curvature)(part))(target, position)
 
 
 def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior, Modes]:
@@ -180,7 +189,7 @@ def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior,
     position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
     parameters = np.arange(target.dimension) < target.parameters
     position = np.where(parameters, position, WIDE)
-    modes = _found(target, search(functools.partial(_look, target), position, parameters))
+    modes = _found(target, search(functools.partial(_each, target), position, parameters))
     if target.sensitivity is None:
         return target, modes
     for _ in range(ROUNDS - 1):

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from palpate.identification.draws import Draws, check_start
+from palpate.devices import over_devices
+from palpate.identification.draws import Draws, check_start, time_to_compile
 from palpate.identification.target import Target
 
 ACCEPTANCE = 0.234
@@ -25,9 +26,9 @@ LOOKS = 20  # at the chains during the warm-up
 
 
 class _Walk(eqx.Module):
-    position: Float[Array, "chains draws free"]
-    density: Float[Array, "chains draws"]
-    accepted: Float[Array, "chains draws"]
+    position: Float[Array, "*batch free"]
+    density: Float[Array, "*batch"]
+    accepted: Float[Array, "*batch"]
 
 
 def prior_scaled(
@@ -64,26 +65,33 @@ def _sampled(target, start, key, draws: int, warm_up: int, thin: int, adapted: b
     chains, size = start.shape
     length = -(-warm_up // LOOKS)
     scale, position = 2.38 / np.sqrt(size), start
-    covariance, history, compiling = np.eye(size), [], 0.0
-    for index, look in enumerate(jax.random.split(key, LOOKS)):
+    covariance, history, spent = np.eye(size), [], []
+
+    def walked(key: PRNGKeyArray, draws: int, thin: int) -> _Walk:
+        now = time.monotonic()
         root = jnp.asarray(scale * np.linalg.cholesky(covariance), start.dtype)
-        walk = jax.device_get(_walk(target, position, root, look, length, 1))
-        compiling = compiling or time.monotonic() - began
-        position = jnp.asarray(walk.position[:, -1])
+        walk = _walk(target, position, root, jax.random.split(key, chains), draws, thin)
+        walk = jax.device_get(walk)
+        spent.append(time.monotonic() - now)
+        return walk
+
+    for index, look in enumerate(jax.random.split(key, LOOKS)):
+        walk = walked(look, length, 1)
+        position = walk.position[:, -1]
         scale *= np.exp((walk.accepted.mean() - ACCEPTANCE) * 4.0 / np.sqrt(index + 1.0))
         history.append(walk.position)
         if adapted:
             covariance = _learnt(history[len(history) // 2 :])
-    root = jnp.asarray(scale * np.linalg.cholesky(covariance), start.dtype)
-    walk = jax.device_get(_walk(target, position, root, jax.random.fold_in(key, 1), draws, thin))
+    walk = walked(jax.random.fold_in(key, 1), draws, thin)
+    steps = [length] * LOOKS + [draws * thin]
     return Draws(
         position=walk.position,
         density=walk.density,
         acceptance=walk.accepted.mean(axis=1),
         divergences=0,
-        evaluations=chains * (LOOKS * length + draws * thin),
+        evaluations=chains * sum(steps),
         seconds=time.monotonic() - began,
-        compiling=compiling,
+        compiling=time_to_compile(spent, steps, first=(0, LOOKS)),
     )
 
 
@@ -102,22 +110,27 @@ def _densities(target: Target, position: Array) -> Array:
 
 @eqx.filter_jit
 def _walk(
-    target: Target, start: Array, root: Array, key: PRNGKeyArray, draws: int, thin: int
+    target: Target, start: Array, root: Array, keys: PRNGKeyArray, draws: int, thin: int
 ) -> _Walk:
-    densities = jax.vmap(target.density)
+    def chain(target: Target, root: Array, start: Array, key: PRNGKeyArray) -> _Walk:
+        def step(carry, key):
+            here, value = carry
+            noise, coin = jax.random.split(key)
+            proposed = here + root @ jax.random.normal(noise, here.shape, here.dtype)
+            after = target.density(proposed)
+            accepted = jnp.log(jax.random.uniform(coin, (), value.dtype)) < after - value
+            here = jnp.where(accepted, proposed, here)
+            return (here, jnp.where(accepted, after, value)), accepted
 
-    def step(carry, key):
-        here, value = carry
-        noise, coin = jax.random.split(key)
-        proposed = here + jax.random.normal(noise, here.shape, here.dtype) @ root.T
-        after = densities(proposed)
-        accepted = jnp.log(jax.random.uniform(coin, value.shape, value.dtype)) < after - value
-        here = jnp.where(accepted[:, None], proposed, here)
-        return (here, jnp.where(accepted, after, value)), accepted
+        def kept(carry, key):
+            carry, accepted = jax.lax.scan(step, carry, jax.random.split(key, thin))
+            return carry, _Walk(*carry, jnp.mean(accepted.astype(start.dtype)))
 
-    def kept(carry, key):
-        carry, accepted = jax.lax.scan(step, carry, jax.random.split(key, thin))
-        return carry, (*carry, jnp.mean(accepted.astype(start.dtype), axis=0))
+        begin = start, target.density(start)
+        return jax.lax.scan(kept, begin, jax.random.split(key, draws))[1]
 
-    _, trace = jax.lax.scan(kept, (start, densities(start)), jax.random.split(key, draws))
-    return _Walk(*(jnp.swapaxes(part, 0, 1) for part in trace))
+    def part(shared, each) -> _Walk:
+        # Side by side: all take as many steps.
+        return jax.vmap(lambda start, key: chain(*shared, start, key))(*each)
+
+    return over_devices(part)((target, root), (start, keys))

@@ -90,8 +90,35 @@ def test_the_direct_way_is_that_without_movables():
     world = two_rooms({"a": IN_DOOR})
     plan = Planner().plan(world)
     assert study.direct_distance(world, plan) == pytest.approx(6.0, rel=0.02)
-    assert 0 < plan.interactive_score(study.direct_distance(world, plan)) < 1
-    assert np.isfinite(plan.distance)
+    assert 0 < plan.path_efficiency(study.direct_distance(world, plan)) < 1
+
+
+def test_the_direct_way_is_no_longer_than_straight_where_that_is_free():
+    world = dataclasses.replace(two_rooms({}), start=(0.5, 0.5, 0.0))
+    plan = dataclasses.replace(Planner().plan(world), goal=(2.5, 1.3, 0.0))
+    assert study.direct_distance(world, plan) == pytest.approx(np.hypot(2.0, 0.8), rel=1e-3)
+
+
+def test_maps_of_one_name_and_names_that_are_no_folders_are_kept_apart(tmp_path):
+    for site, name in (("a", "map"), ("b", "map"), ("c", "../../up")):
+        world = dataclasses.replace(two_rooms({}), name=name)
+        write_map(tmp_path / "maps" / site / "map.json", world)
+    (tmp_path / "maps" / "d").mkdir()
+    (tmp_path / "maps" / "d" / "map.svg").write_text("<svg/>")
+    result = study.reproduce(tmp_path / "out", quick=True, maps=tmp_path / "maps")
+    reached = {name for name in named(result) if name.endswith(".reached")}
+    assert len(reached) == 4
+    assert len(list((tmp_path / "out").rglob("plan.json"))) == 3
+    assert not list(tmp_path.glob("up*"))
+
+
+def test_a_map_of_namosims_that_is_not_reached_leaves_the_bars_standing(tmp_path):
+    world = dataclasses.replace(two_rooms({}, doors=()), name="obstacle_on_goal")
+    write_map(tmp_path / "obstacle_on_goal.json", world)
+    trial = study.tried(tmp_path / "obstacle_on_goal.json", tmp_path / "out", 1, 0)
+    rows = {figure.name: figure for figure in study.figures([trial])}
+    assert rows["speedup_min"].met is False
+    assert rows["distance_ratio_max"].met is False
 
 
 def test_without_a_folder_it_is_said_what_to_give(tmp_path):

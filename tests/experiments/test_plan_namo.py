@@ -2,10 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.errors import PalpateError
+from palpate.experiments import plan_namo
 from palpate.experiments.namo_options import PlanNamo
 from palpate.experiments.plan_namo import ANIMATION, PICTURE, run
 from palpate.planning.movable_obstacles.map_description import write_map
@@ -34,6 +37,29 @@ def test_a_plan_its_picture_and_its_animation_are_written(tmp_path, map_file, ca
     # asked again it tells the same plan
     written = path.read_text()
     assert run(PlanNamo(map=map_file, out=out)).read_text() == written
+
+
+def test_a_plan_that_does_not_hold_is_not_handed_over(tmp_path, map_file, monkeypatch):
+    monkeypatch.setattr(plan_namo, "faults_of", lambda plan, world: ["the robot flies"])
+    with pytest.raises(PalpateError, match="the robot flies"):
+        run(PlanNamo(map=map_file, out=tmp_path / "out"))
+    assert not (tmp_path / "out" / "plan.json").exists()
+
+
+def test_what_stands_beside_a_map_decides_whether_a_plan_is_another(tmp_path):
+    picture = np.full((60, 80), 255, np.uint8)
+    picture[[0, -1]] = picture[:, [0, -1]] = 0
+    Image.fromarray(picture).save(tmp_path / "room.png")
+    (tmp_path / "room.yaml").write_text("image: room.png\nresolution: 0.1\norigin: [0, 0, 0]\n")
+    beside = {"robot": {"radius": 0.25}, "start": [1, 1, 0], "goals": [[6, 4, 0]]}
+    for box in (3.0, 4.0):
+        corners = [[box, 2], [box + 0.5, 2], [box + 0.5, 2.5], [box, 2.5]]
+        text = json.dumps(beside | {"movables": {"box": corners}})
+        (tmp_path / "room.movables.json").write_text(text)
+        if box == 3.0:
+            run(PlanNamo(map=tmp_path / "room.yaml", out=tmp_path / "out"))
+    with pytest.raises(PalpateError, match="map"):
+        run(PlanNamo(map=tmp_path / "room.yaml", out=tmp_path / "out"))
 
 
 def test_another_goal_and_fixed_objects_are_heard(tmp_path, map_file):

@@ -20,7 +20,7 @@ from palpate.planning.movable_obstacles.map_files import read_map
 from palpate.planning.movable_obstacles.occupancy import Space
 from palpate.planning.movable_obstacles.openings import CARRYING, HANDLING, TURNING
 from palpate.planning.movable_obstacles.paths import distances
-from palpate.planning.movable_obstacles.plan import TRANSFER, read_plan, write_plan
+from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, Segment, read_plan, write_plan
 from palpate.planning.movable_obstacles.planner import NoWayError, Planner
 from palpate.planning.movable_obstacles.tree_search import Settings
 from palpate.planning.movable_obstacles.verification import faults_of
@@ -315,7 +315,8 @@ def test_replanning_keeps_what_still_holds_and_changes_what_does_not():
     assert planner.replan(plan, world, immovable=["near"]).moved == ["far"]
     # something else has come into the way
     moved = world.moved({"far": (6.0, 1.5, 0.0)})
-    assert planner.replan(plan, moved) is not plan
+    assert not plan.valid_on(moved)
+    assert faults_of(planner.replan(plan, moved), moved) == []
 
 
 # --- what a plan says -------------------------------------------------------------------------
@@ -334,6 +335,31 @@ def test_a_plan_notices_what_has_come_into_its_way():
     assert plan.valid_on(world.moved({"b": (1.0, 0.5, 1.0)}))
     # what lies behind does not matter any more
     assert plan.valid_on(world.moved({"b": (2.2, 1.5, 0.0), "a": in_carry}), begin=2)
+
+
+def carried_along(height, end=6.0, name="b"):
+    """A plan that carries an object from x = 1.25 m to `end` at a height."""
+    along = np.linspace(1.25, end, 96)
+    robot, body = (np.stack([along, np.full(96, y), np.zeros(96)], 1) for y in (1.5, height))
+    return Plan(
+        "two rooms", (6.0, 1.5, 0.0), (Segment(TRANSFER, robot, 1.0, name, None, body),), 0.0
+    )
+
+
+def test_what_leans_on_a_wall_is_not_carried_through_another():
+    plan = carried_along(0.35)
+    world = two_rooms({"b": (1.0, 0.1, 1.5, 0.6)}, start=(1.25, 1.5))
+    assert plan.conflict_on(world)[0] == 0
+    assert carried_along(0.35, end=3.6).valid_on(world)
+
+
+def test_what_stands_a_little_off_stays_off_on_the_way():
+    plan = carried_along(0.4)
+    boxes = {"b": (1.0, 0.2, 1.5, 0.6), "c": (3.0, 0.66, 3.3, 0.8)}
+    world = two_rooms(boxes, doors=((0.1, 2.9),))
+    assert plan.valid_on(world)
+    assert plan.valid_on(world.moved({"b": (1.25, 0.38, 0.0)}))
+    assert not plan.valid_on(world.moved({"b": (1.25, 0.45, 0.0)}))
 
 
 def test_validity_is_told_in_milliseconds():
@@ -397,11 +423,11 @@ def test_a_plan_is_written_and_read_back(tmp_path):
         read_plan(tmp_path / "plan.json")
 
 
-def test_the_interactive_score_mixes_path_and_effort():
+def test_a_path_is_efficient_by_the_shortest_way():
     plan = planned(two_rooms({}))
-    assert plan.interactive_score(plan.distance) == pytest.approx(1.0)
-    assert plan.interactive_score(plan.distance / 2) == pytest.approx(0.75)
-    assert plan.interactive_score(plan.distance, displaced=1.0) == pytest.approx(0.75)
+    assert plan.path_efficiency(plan.distance) == pytest.approx(1.0)
+    assert plan.path_efficiency(plan.distance / 2) == pytest.approx(0.5)
+    assert plan.path_efficiency(2 * plan.distance) == 1.0
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the scenarios are not in this checkout")

@@ -1,5 +1,6 @@
 """`palpate plan namo`: a map in; a plan among movable obstacles, its picture and animation out."""
 
+import hashlib
 import math
 from pathlib import Path
 
@@ -9,7 +10,8 @@ from palpate.experiments import folders
 from palpate.experiments.namo_options import PlanNamo
 from palpate.planning.movable_obstacles.map_files import read_map
 from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, read_plan, write_plan
-from palpate.planning.movable_obstacles.planner import Planner
+from palpate.planning.movable_obstacles.planner import NoWayError, Planner, unmoved
+from palpate.planning.movable_obstacles.verification import faults_of
 from palpate.report.namo_picture import plan_animation, plan_picture
 from palpate.result import Figure, Result
 
@@ -24,12 +26,21 @@ def run(options: PlanNamo) -> Path:
     """
     world = read_map(options.map)
     configuration = folders.told(options, "plan namo")
-    configuration["map"] = folders.fingerprint(options.map)
+    # A map may lie in several files; what was read from them decides.
+    objects = [(name, movable.pose) for name, movable in world.movables.items()]
+    content = repr((unmoved(world), objects, world.start, world.goals)).encode()
+    configuration["map"] = {"file": options.map.name, "sha256": hashlib.sha256(content).hexdigest()}
     with folders.open_run(options, "plan-namo", configuration, PLAN) as run:
         if run.finished:
             plan = read_plan(run.path / PLAN)
         else:
             plan = Planner(seed=options.seed).plan(world, options.goal, options.immovable)
+            if wrong := faults_of(plan, world):
+                raise NoWayError(
+                    f"the best plan found on map '{world.name}' does not hold against the exact "
+                    f"outlines ({wrong[0]}): expected one that does; smaller cells, a larger "
+                    "margin or another --seed may give one"
+                )
             write_plan(run.path / PLAN, plan)
             plan_picture(run.path / PICTURE, world, plan)
             plan_animation(run.path / ANIMATION, world, plan)

@@ -9,8 +9,8 @@ import shapely
 from palpate.planning.movable_obstacles.geometry import placed, polygons
 from palpate.planning.movable_obstacles.occupancy import Space
 
-_TOUCHING = 1e-3  # m: what is nearer at the start touches, and may slide along
-_SHRUNK = 2e-3  # m: by which a touching object has to come nearer to count as hitting
+TOUCHING = 1e-3  # m: what is nearer at the start touches, and may slide along
+SHRUNK = 2e-3  # m: by which a touching object has to come nearer to count as hitting
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ class Clearance:
             close = np.flatnonzero(gaps < math.inf)
             if len(close):
                 near, obstacles = bodies[which[close]], tree.geometries[others[close]]
-                touching = gaps[close] < _TOUCHING
+                touching = gaps[close] < TOUCHING
                 nearer = shapely.distance(near, obstacles) < gaps[close] - 1e-6
                 if touching.any():
-                    shrunk = shapely.buffer(near[touching], -_SHRUNK)
+                    shrunk = shapely.buffer(near[touching], -SHRUNK)
                     nearer[touching] = shapely.intersects(shrunk, obstacles[touching])
                 hit[which[close][nearer]] = True
         return hit

@@ -5,7 +5,7 @@ by a model of manipulation until the way is open or something is in the way.
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -193,10 +193,11 @@ class OpeningSearch:
     def _grasp_bounds(self) -> dict[int, float]:
         """The least cost with each grasp that is free and that the robot may get to."""
         poses = self._robot_at
-        back = poses[:, :2] - self.space.cell * 1.5 * np.stack(
-            [np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1
-        )
-        to = self._reached.at(back) - 1.5 * self.space.cell
+        # As far behind the grasp as a cell may be free, where a hand reaches less than the margin.
+        world = self.space.map
+        behind = 1.5 * self.space.cell + max(0.0, world.margin - world.reach)
+        back = poses[:, :2] - behind * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+        to = self._reached.at(back) - behind
         beyond = self._passage.beyond(poses)
         bounds = {}
         for index, pose in enumerate(poses):
@@ -292,7 +293,7 @@ class OpeningSearch:
     ) -> Step | None:
         """The end of a rollout; None unless the robot gets away, at less than the best."""
         part = self._part(state, primitive, motion, index)
-        if not self._keeps_clear(part):
+        if not self.keep_clear((*state.parts, part)):
             return None
         left = self._exit(motion.object_poses[index], motion.robot_poses[index], spent)
         if left == math.inf:
@@ -309,15 +310,17 @@ class OpeningSearch:
         limit = min(_BETTER * self._best - spent, direct + _DETOUR * self.scale)
         return self._passage.onward(object_pose, robot_pose, limit)
 
-    def _keeps_clear(self, part: Carry) -> bool:
+    def keep_clear(self, parts: Iterable[Carry]) -> bool:
         """Whether the steps in between do as well, as if each were a rigid carry."""
         shares = np.arange(1, _FINE + 1) / _FINE
-        robots, objects = part.robot_poses, part.object_poses
-        fine = [
-            (pair[:-1, None] + shares[:, None] * (pair[1:] - pair[:-1])[:, None]).reshape(-1, 3)
-            for pair in (objects, robots)
-        ]
-        return self._fine.steps(*fine) == len(fine[0])
+        for part in parts:
+            objects, robots = (
+                (pair[:-1, None] + shares[:, None] * (pair[1:] - pair[:-1])[:, None]).reshape(-1, 3)
+                for pair in (part.object_poses, part.robot_poses)
+            )
+            if self._fine.steps(objects, robots) < len(objects):
+                return False
+        return True
 
     def _part(self, state: State, primitive: Primitive, motion: Motion, last: int) -> Carry:
         return Carry(

@@ -11,7 +11,14 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.geometry import length_of, lines, placed, polygons
+from palpate.planning.movable_obstacles.collisions import SHRUNK, TOUCHING
+from palpate.planning.movable_obstacles.geometry import (
+    corners_of,
+    length_of,
+    lines,
+    placed,
+    polygons,
+)
 from palpate.planning.movable_obstacles.manipulation import Grasp
 from palpate.planning.movable_obstacles.map import Map, Pose
 from palpate.storage import read_json, write_json
@@ -106,16 +113,12 @@ class Plan:
         x, y, theta = (float(value) for value in self.segments[-1].poses[-1])
         return world.moved(last, (x, y, theta))
 
-    def interactive_score(
-        self, direct: float, displaced: float = 0.0, weight: float = 0.5
-    ) -> float:
-        """Interactive Gibson's score (Xia et al. 2020): path and effort efficiency mixed, 0 to 1.
+    def path_efficiency(self, direct: float) -> float:
+        """Interactive Gibson's (Xia et al. 2020), 0 to 1: the shortest way over the one taken.
 
-        `direct` (m) is the shortest way with no movable there, for the path's efficiency; the
-        effort's is robot / (robot + displaced), with `displaced` the mass moved over the robot's.
+        `direct` (m) is the shortest way with no movable there.
         """
-        path = min(1.0, direct / self.distance) if self.distance > 0 else 1.0
-        return weight * path + (1 - weight) / (1 + displaced)
+        return min(1.0, direct / self.distance) if self.distance > 0 else 1.0
 
     # --- validity -----------------------------------------------------------------------------
 
@@ -142,13 +145,16 @@ class Plan:
             hit = _way_hit(segment, world, standing, touched, held)
             if hit is None and held is not None:
                 assert segment.object_poses is not None
-                movable = world.movables[held]
-                apart = movable.polygon_at(segment.object_poses[0]).distance(standing[held])
-                off = movable.polygon_at(segment.object_poses[0]).hausdorff_distance(standing[held])
-                if apart > 0 or off > world.cell_size:
+                expected = world.movables[held].polygon_at(segment.object_poses[0])
+                off = expected.hausdorff_distance(standing[held])
+                if not expected.intersects(standing[held]) or off > world.cell_size:
                     return index, f"'{held}' is not where it would be taken up"
-                hit = _body_hit(segment, world, obstacles)
-                standing[held] = movable.polygon_at(segment.object_poses[-1])
+                # Held where it stands, it stays as far off on the way as it is.
+                x, y, theta = segment.object_poses[0]
+                outline = placed(corners_of(standing[held]) - (x, y), (0.0, 0.0, -theta))
+                bodies = polygons(placed(outline, segment.object_poses))
+                hit = _body_hit(bodies, world, obstacles)
+                standing[held] = bodies[-1]
             if hit is not None:
                 return index, hit
         return None
@@ -279,16 +285,16 @@ def _way_hit(
     return None
 
 
-def _body_hit(segment: Segment, world: Map, obstacles: Sequence[BaseGeometry]) -> str | None:
-    """What the carried object comes too near to on a segment."""
-    assert segment.name is not None
-    assert segment.object_poses is not None
-    outline = world.movables[segment.name].outline
-    bodies = polygons(placed(outline, segment.object_poses))
-    for shape in [world.walls, *obstacles]:
-        if shapely.is_empty(shape):
-            continue
-        gaps = np.asarray(shapely.distance(bodies, shape))
-        if gaps.min() < min(world.margin, gaps[0]) - _TOLERANCE:
-            return "something that stands nearer than the margin to where it would be carried"
+def _body_hit(bodies: np.ndarray, world: Map, obstacles: Sequence[BaseGeometry]) -> str | None:
+    """What the carried object, a polygon at every step, comes too near to."""
+    tree = shapely.STRtree([*world.wall_edges, *obstacles])
+    step, which = tree.query(bodies, predicate="dwithin", distance=world.margin)
+    near = tree.geometries[which]
+    began, now = shapely.distance(bodies[0], near), shapely.distance(bodies[step], near)
+    hit = now < np.minimum(world.margin, began) - _TOLERANCE
+    touching = began < TOUCHING  # it may slide along, but not enter
+    inner = shapely.buffer(bodies, -SHRUNK)
+    entered = shapely.intersects(inner[step], near) & ~shapely.intersects(inner[0], near)
+    if (hit | (touching & entered)).any():
+        return "something that stands nearer than the margin to where it would be carried"
     return None

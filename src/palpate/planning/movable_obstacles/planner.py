@@ -89,7 +89,7 @@ class Planner:
             raise PalpateError(f"map '{world.name}' has no movable '{unknown[0]}'")
         if len(self._known) > _MOST_KNOWN:
             self._known.clear()
-        self._world = _fingerprint(world)
+        self._world = unmoved(world)
         sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
         begin = Situation(Space(world, fixed), np.array(world.start))
         try:
@@ -337,7 +337,7 @@ def window_of(space: Space, robot: np.ndarray, move: Move) -> Window:
     return space.window_of(left, bottom, right, top)
 
 
-def _fingerprint(world: Map) -> Hashable:
+def unmoved(world: Map) -> Hashable:
     """All of a map that stays as it is while objects are moved."""
     robot = world.robot
     outlines = tuple((name, one.outline.tobytes()) for name, one in world.movables.items())

@@ -52,7 +52,7 @@ def _stop(search_of: OpeningSearch, actions: tuple, state: State) -> Opening | N
     grasp, motion = actions
     held = search_of.grasps[grasp]
     way = search_of.approach_path(held)
-    if way is None:
+    if way is None or not search_of.keep_clear(state.parts):
         return None
     alike = 0
     for draw in range(search_of.draws):

@@ -337,6 +337,14 @@ def test_a_plan_notices_what_has_come_into_its_way():
     assert plan.valid_on(world.moved({"b": (2.2, 1.5, 0.0), "a": in_carry}), begin=2)
 
 
+def test_what_overlaps_its_neighbour_is_named():
+    with pytest.raises(NoWayError, match="'a' overlap what stands beside"):
+        planned(two_rooms({"a": (3.7, 0.9, 4.5, 1.9)}))  # 10 cm in the wall below the door
+    with pytest.raises(NoWayError, match="past 'a'") as told:
+        planned(two_rooms({"a": (2.0, 0.11, 2.5, 2.89)}, wall=(2.5, 2.7)))  # beside the wall
+    assert "overlap" not in str(told.value)
+
+
 def carried_along(height, end=6.0, name="b"):
     """A plan that carries an object from x = 1.25 m to `end` at a height."""
     along = np.linspace(1.25, end, 96)

@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.abstract import Actions, iterate
+from palpate.planning.movable_obstacles.collisions import SHRUNK
 from palpate.planning.movable_obstacles.map import Pose
 from palpate.planning.movable_obstacles.occupancy import Space
 from palpate.planning.movable_obstacles.openings import HANDLING
@@ -82,9 +84,12 @@ class PolicyGraph:
                 group.append(-1)
                 self.needed.append(())
         self._points = points
-        self._straight = np.array(cost) - handling * np.array([len(n) for n in self.needed])
         self._cheapest = math.inf
-        self._known: set[int] = set()
+        self._known = np.zeros(len(source), bool)
+        self._count = np.array([len(names) for names in self.needed], int)
+        self._straight = np.array(cost, float) - handling * self._count
+        kinds: dict[tuple[str, ...], int] = {}
+        self._kind = np.array([kinds.setdefault(names, len(kinds)) for names in self.needed], int)
         self.actions = Actions(
             np.array(source, int),
             np.array(target, int),
@@ -160,24 +165,22 @@ class PolicyGraph:
         """
         action, costs = move.action, self.actions.cost
         old = float(costs[action]), float(self.actions.probability[action])
-        costs[action] = max(cost - move.beyond, old[0] if action in self._known else 0.0)
+        costs[action] = max(cost - move.beyond, old[0] if self._known[action] else 0.0)
         self.actions.probability[action] = min(probability, old[1])
-        self._known.add(action)
+        self._known[action] = True
         above = float(costs[action] - self._straight[action])
-        self._cheapest = min(self._cheapest, above / len(self.needed[action]))
+        self._cheapest = min(self._cheapest, above / self._count[action])
         border = self.actions.target[action]
-        for other, needed in enumerate(self.needed):
-            if not needed or other in self._known:
-                continue
-            alike = self.actions.target[other] == border and needed == self.needed[action]
-            hoped = above if alike else self._cheapest * len(needed)
-            costs[other] = max(costs[other], self._straight[other] + _HOPE * hoped)
+        alike = (self.actions.target == border) & (self._kind == self._kind[action])
+        hoped = np.where(alike, above, self._cheapest * self._count)
+        others = (self._count > 0) & ~self._known
+        costs[others] = np.maximum(costs, self._straight + _HOPE * hoped)[others]
         return bool(abs(costs[action] - old[0]) > 1e-6 or probability < old[1])
 
     def good_enough(self, moves: list[Move]) -> bool:
         """Whether the policy that led to `moves` is nearly as good as any is hoped to be."""
-        taken = {move.action for move in moves}
-        return taken <= self._known and self._cost_of(self._taken) <= _ENOUGH * self.hoped
+        known = all(self._known[move.action] for move in moves)
+        return known and self._cost_of(self._taken) <= _ENOUGH * self.hoped
 
     def _cost_of(self, taken: list[int]) -> float:
         """The expected cost of a sequence of actions if a failure ends it, m."""
@@ -203,14 +206,23 @@ class PolicyGraph:
         if not self.tried:
             return (
                 f"no way to the goal on map '{name}': walls alone close the robot's {size} "
-                "off from the goal, so that nothing movable could open it"
+                "off from the goal, so that nothing movable could open it (seen in cells of "
+                f"{self.space.cell:.3g} m, which may miss a narrow way)"
             )
         kept = ", ".join(f"'{name}'" for name in list(self.tried)[:6])
+        stuck = [f"'{name}'" for name in self.tried if self._overlaps(name)][:6]
+        held = f"; {', '.join(stuck)} overlap what stands beside, and cannot be moved so"
         return (
             f"no way to the goal on map '{name}': the robot's {size} stays closed, because no "
-            f"grasp and motion was found that opens a way past {kept}; a smaller cell size or "
-            "margin, or more iterations, may find one"
+            f"grasp and motion was found that opens a way past {kept}{held if stuck else ''}; a "
+            "smaller cell size or margin, or more iterations, may find one"
         )
+
+    def _overlaps(self, name: str) -> bool:
+        """Whether an object stands in a wall or in another one: it hits it wherever it goes."""
+        inner = self.space.movables[name].polygon.buffer(-SHRUNK)
+        others = [one.polygon for other, one in self.space.map.movables.items() if other != name]
+        return any(shapely.intersects([self.space.map.walls, *others], inner))
 
 
 def _node(space: Space, regions: Regions, point: np.ndarray, what: str) -> int:

@@ -42,6 +42,7 @@ MOVED = 0.02  # m: beyond any noise
 PIECE = 10  # samples: longest piece of the handling that the posterior is asked to explain
 RIVALS = ("lwr", "oo-lwr", "gp")
 OURS = "posterior"
+CHAINS = 2  # their draws are predicted with, and not compared
 
 
 def shares(
@@ -91,7 +92,7 @@ def _ours(
     pieces = cut(seen, model, seconds, at_rest=True, count=max(SIZES) // PIECE)
     scales = inferred_scales(model, noise_scale(seen, model))
     targets = {name: motion_posterior(of, pieces, scales) for name, of in models.items()}
-    posterior = identify(targets, draws, seed=seed).posterior
+    posterior = identify(targets, draws, CHAINS, seed).posterior
     asked = pushes_of(pushes, model)
     result = judged(model, posterior.predict(asked), asked)
     return error_share(result.error, result.displacement)

@@ -93,7 +93,7 @@ def plan_picture(
                 label="goal",
             )
         _legend(figure, axes)
-        _write(figure, out, world.name)
+        _write(figure, out)
     return out
 
 
@@ -238,10 +238,8 @@ def _draw_regions(axes: "Axes", world: Map) -> None:
 
     space = Space(world)
     node = regions_of(space).node
-    image = np.zeros((*node.shape, 4))
-    free = space.free
-    for region in np.unique(node[free]):
-        image[(node == region) & free] = to_rgba(_TINTS[int(region) % len(_TINTS)])
+    tints = np.array([to_rgba(tint) for tint in _TINTS])
+    image = np.where(space.free[..., None], tints[node % len(tints)], 0.0)
     left, bottom = world.bounds[:2]
     right, top = (np.array([left, bottom]) + np.array(node.shape[::-1]) * space.cell).tolist()
     axes.imshow(
@@ -332,7 +330,7 @@ def _legend(figure: "Figure", axes: "Axes") -> None:
     )
 
 
-def _write(figure: "Figure", out: Path, title: str) -> None:
+def _write(figure: "Figure", out: Path) -> None:
     buffer = io.BytesIO()
     stamp = {"Date": None} if out.suffix == ".svg" else {"Software": None}
     figure.savefig(buffer, format=out.suffix[1:], metadata=stamp)

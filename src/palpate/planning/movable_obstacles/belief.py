@@ -273,7 +273,7 @@ def cut(poses: np.ndarray, wrenches: np.ndarray, alone: np.ndarray) -> Pieces:
     for begin in begins:
         if not kept or begin >= kept[-1] + length:
             kept.append(begin)
-    # What was pulled hardest or moved farthest says most, the beginning included.
+    # Evenly over the whole pull, the beginning included.
     if len(kept) > PIECES:
         kept = [kept[k] for k in np.linspace(0, len(kept) - 1, PIECES).round().astype(int)]
     empty = np.zeros((PIECES, 3))

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import json
+import math
 import subprocess
 import sys
 
@@ -133,6 +134,12 @@ def test_missing_and_damaged_files_are_named(tmp_path):
     (tmp_path / "result.json").write_text('{"name": NaN}')
     with pytest.raises(PalpateError, match=r"result\.json is not valid JSON: JSON has no NaN"):
         read_result(tmp_path / "result.json")
+
+
+def test_two_standard_errors_are_of_the_deviation_of_a_sample():
+    assert module.two_standard_errors([1.0, 2.0, 3.0, 6.0]) == pytest.approx(math.sqrt(14 / 3))
+    assert module.two_standard_errors(iter([1.0, 3.0])) == pytest.approx(2.0)
+    assert module.two_standard_errors([1.0]) is None  # not zero
 
 
 def test_the_machine_is_described_without_naming_it():

@@ -10,11 +10,13 @@ import math
 import os
 import platform
 import re
+import statistics
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 from palpate.errors import PalpateError
 from palpate.storage import plain, read_json
@@ -68,6 +70,14 @@ class Figure:
         fields = [item.name for item in dataclasses.fields(self)]
         fields.insert(fields.index("better") + 1, "met")
         return {name: plain(getattr(self, name), f"{self.name}.{name}") for name in fields}
+
+
+def two_standard_errors(values: Iterable[SupportsFloat]) -> float | None:
+    """Of the mean of independent values, for a `spread`; None of one, which says nothing of it."""
+    numbers = [float(value) for value in values]
+    if len(numbers) < 2:
+        return None
+    return 2.0 * statistics.stdev(numbers) / math.sqrt(len(numbers))
 
 
 def machine() -> dict[str, Any]:

@@ -388,6 +388,8 @@ def test_regret_is_a_share_of_what_there_is_to_learn():
     assert figures["cart.regret.doing_nothing"].value == pytest.approx(0.5, abs=0.01)
     assert cart_online.regret(rewards, "random", slice(None)).mean() == pytest.approx(1.0)
     assert cart_online.regret(rewards, "TRUE", slice(None)).tolist() == [0.0] * 5
+    assert figures["cart.regret"].spread > 0.0
+    assert cart_online.figures("cart", earned(1, 200))[0].spread is None
 
 
 def test_what_was_earned_is_kept_and_only_what_was_cut_off_begins_anew(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from palpate.experiments.identify_bayesian import posterior_of
 from palpate.experiments.one_shot_figure import shares_figure
 from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
 from palpate.experiments.one_shot_regression import OURS, RIVALS, first_samples, transitions
+from palpate.experiments.one_shot_sampling import OURS as NUTS
 from palpate.identification.laplace import settle
 from palpate.identification.predictive import Predicted
 from palpate.worlds.furniture import FurnitureWorld, Piece
@@ -65,14 +66,48 @@ def test_shares_are_pooled_over_pushes_and_not_averaged():
     assert error_share(np.array([0.3, 0.4]), np.array([0.0, 5.0])) == pytest.approx(0.01)
 
 
+def stage(error, **more):
+    return {"error_m": [error], "displacement_m": [1.0], "inside": 0.9, "drift_m": 0.0, **more}
+
+
+def test_mujoco_sysid_is_held_against_ours_on_the_same_pieces():
+    judged_by = {"rhat": 1.0, "ess": 1000.0}
+    first = 920_000
+    pieces = {
+        "cart": [stage(0.1, **judged_by), stage(0.2, **judged_by)],
+        "couch": [stage(0.3, **judged_by), stage(0.4, **judged_by)],
+        "chair": [stage(0.5, **judged_by), stage(0.6, **judged_by)],
+        "bolted": [stage(0.0, **judged_by)],
+    }
+    told = {
+        "cart": stage(0.7, piece=first + 1),
+        "couch": stage(0.8, piece=first),
+        "chair": {"error_m": [], "displacement_m": []},
+    }
+    pace = {"rhat": 1.0, "size": 1.0, "seconds": 1.0, "evaluations": 1}
+    raced = {"paces": dict.fromkeys((NUTS, "metropolis", "adapted"), pace), "posterior_s": 1.0}
+    compared = {"cart": {"shares": {name: {"1": 0.1} for name in (OURS, *RIVALS)}}}
+
+    def value_of(told):
+        found = one_shot._figures(pieces, compared, told, raced, None, first)
+        return {figure.name: figure.value for figure in found}
+
+    found = value_of(told)
+    assert found["error_share_of_sysid"] == pytest.approx((0.7**2 + 0.8**2) / 2)
+    assert found["error_share_of_the_same_pieces"] == pytest.approx((0.2**2 + 0.3**2) / 2)
+    assert found["error_share_of_sysid.chair"] is None
+    none = value_of({"chair": told["chair"]})
+    assert none["error_share_of_sysid"] is none["error_share_of_the_same_pieces"] is None
+
+
 def test_a_cell_is_won_against_the_best_regression():
     shares = {OURS: {"1": 0.2, "2": 0.1}, **{of: {"1": 0.3, "2": 0.3} for of in RIVALS}}
-    shares[RIVALS[1]] = {"1": 0.19, "2": float("inf")}
+    shares[RIVALS[1]] = {"1": 0.19, "2": None}
     assert one_shot.victories({"cart": {"shares": shares}}) == (1, 2)
 
 
 def test_the_figure_shows_every_kind_and_bears_what_diverged(tmp_path):
-    shares = {name: {"1": 0.5, "2": float("inf"), "5": 0.01} for name in (OURS, *RIVALS)}
+    shares = {name: {"1": 0.5, "2": None, "5": 0.01} for name in (OURS, *RIVALS)}
     shares_figure(tmp_path / "shares.png", {of: {"shares": shares} for of in "abcd"})
     assert (tmp_path / "shares.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -123,7 +158,7 @@ def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatc
         given.append(aligned.observation)
         return call(aligned, *arguments, **options)
 
-    def stop(targets, draws, seed):
+    def stop(*_, **__):
         raise StopIteration
 
     monkeypatch.setattr(one_shot_regression, "cut", noting)

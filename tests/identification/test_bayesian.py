@@ -1,22 +1,58 @@
 """Bayesian identification from end to end, on a sled seen by a noisy camera."""
 
+import contextlib
+import logging
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
-from palpate.identification.bayesian import identify
+from palpate.identification.bayesian import draw, identify, sample
+from palpate.identification.laplace import Modes
+from palpate.identification.likelihood import known_scales, motion_posterior
 from palpate.identification.segments import cut
 
 TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])
 
 
+COMPILED = {"_look", "_sensitivity", "_block"}  # what takes seconds to compile
+
+
+@contextlib.contextmanager
+def compiled():
+    """Those of `COMPILED` that are compiled meanwhile, in a set that fills."""
+    names, handler = set(), logging.Handler()
+
+    def emit(record):
+        message = record.getMessage()
+        if message.startswith("Compiling"):
+            names.update(name for name in COMPILED if f"jit({name})" in message)
+
+    handler.emit = emit
+    logging.getLogger("jax").addHandler(handler)
+    try:
+        with jax.log_compiles():
+            yield names
+    finally:
+        logging.getLogger("jax").removeHandler(handler)
+
+
 @pytest.fixture(scope="module")
-def posterior():
-    # Headed backwards: the camera's angle jumps by a turn within the pieces.
-    return identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True, draws=400)
+def first():
+    """A posterior, and what was compiled for it."""
+    with compiled() as names:
+        # Headed backwards: the camera's angle jumps by a turn within the pieces.
+        found = identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True, draws=400)
+    return found, names
+
+
+@pytest.fixture(scope="module")
+def posterior(first):
+    return first[0]
 
 
 def test_the_truth_lies_within_the_intervals(posterior):
@@ -57,19 +93,32 @@ def test_the_same_seed_gives_the_same_draws(posterior):
     np.testing.assert_array_equal(again.draws.position, posterior.draws.position)
 
 
-def test_another_recording_of_the_same_shape_compiles_nothing(posterior):
-    with jax.log_compiles(), pytest.MonkeyPatch.context():
-        import logging
+def test_another_recording_of_the_same_shape_compiles_nothing(first):
+    assert first[1] == COMPILED
+    with compiled() as names:
+        identify(MODEL, pushes(TRUE, 5, heading=3.1), at_rest=True, draws=50)
+    assert not names
 
-        records = []
-        handler = logging.Handler()
-        handler.emit = records.append
-        logging.getLogger("jax").addHandler(handler)
-        try:
-            identify(MODEL, pushes(TRUE, 5, heading=3.1), at_rest=True, draws=400)
-        finally:
-            logging.getLogger("jax").removeHandler(handler)
-    assert not [r for r in records if "_block" in r.getMessage() or "_climb" in r.getMessage()]
+
+def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
+    def searched(*_):
+        raise AssertionError("expected to be refused before the search for modes")
+
+    monkeypatch.setattr("palpate.identification.bayesian.settle", searched)
+    monkeypatch.setattr("palpate.identification.bayesian.no_u_turn", searched)
+    recording = pushes(TRUE, 3, trials=1, frames=61)
+    target = motion_posterior(
+        MODEL, cut(recording, MODEL, 1.0, at_rest=True), known_scales(MODEL, NOISE)
+    )
+    some = jnp.zeros((1, target.dimension))
+    modes = Modes(some, some[0, :1], some, np.eye(target.dimension)[None], some[0, :1])
+    for few in ({"draws": 3}, {"draws": -1}, {"chains": 0}, {"chains": -2}):
+        with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
+            identify(MODEL, recording, at_rest=True, **few)
+        with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
+            sample(target, **few)
+        with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
+            draw(target, modes, **few)
 
 
 def test_an_unmoved_sled_is_said_to_tell_nothing():

@@ -1,5 +1,6 @@
 """The likelihood of pieces of motion against dense normal distributions, and how they are cut."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,7 @@ from palpate.identification.likelihood import (
     motion_posterior,
     residuals,
 )
-from palpate.identification.predictive import predict, score
+from palpate.identification.predictive import Predicted, predict, score
 from palpate.identification.segments import Segments, cut, known_start, noise_scale
 from palpate.models.model import rollout
 from palpate.parameters import sample_prior
@@ -89,6 +90,37 @@ def test_curvature_is_that_of_the_expected_information():
     assert value == pytest.approx(float(target.density(position)))
     np.testing.assert_allclose(slope, jax.grad(target.density)(position), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(curvature, -jax.hessian(target.density)(position), rtol=1e-6)
+
+
+@pytest.mark.usefixtures("float64")
+def test_curvature_counts_what_an_unknown_start_explains_as_the_dense_covariance_does():
+    sled = Sled(mass=14.0, friction=[6.0, 40.0])
+    segments = cut(pushes(SLED, 1, trials=1, frames=31), sled, 0.4)
+    target = motion_posterior(sled, segments, known_scales(sled, NOISE))
+    position = initial_position(target) + 0.1
+    target = target.linearised(position)
+
+    def off(position, error, piece):
+        pose, rate = (VAGUE * part for part in jnp.split(error, 2))
+        start = Segments(
+            piece.pose + pose * piece.pose_deviation,
+            piece.rate + rate * piece.rate_deviation,
+            *(piece.pose_deviation, piece.rate_deviation),
+            *(piece.action, piece.target, piece.seen),
+        )
+        model = target.model(position)
+        return residuals(model, from_start(model, start), piece)[0].ravel()
+
+    slopes, expected = jax.jit(jax.jacfwd(off, argnums=(0, 1))), np.eye(3)
+    for index in range(segments.count):
+        piece = segments.take([index])
+        slope, starts = slopes(position, jnp.zeros(6), piece)
+        seen = np.asarray(piece.seen)[0].ravel()
+        slope, starts = np.asarray(slope)[seen], np.asarray(starts)[seen]
+        noise = np.tile(np.square(NOISE), 20)[seen]
+        expected += slope.T @ np.linalg.solve(starts @ starts.T + np.diag(noise), slope)
+    found = np.asarray(eqx.filter_jit(lambda t: t.curvature(position)[2])(target))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * expected.max())
 
 
 @pytest.mark.usefixtures("float64")
@@ -199,6 +231,26 @@ def test_predictions_cover_as_they_claim():
     assert np.all(lower < upper)
     sharper = score(target, predict(target, draws * 0.0, pieces, seed=0), pieces)
     assert sharper.log_score < found.log_score
+
+
+def test_the_error_of_what_is_never_seen_is_not_known():
+    """Of y a quarter of the frames, of the angle none."""
+    shape = 2, 8, 3
+    nothing, seen = jnp.zeros((2, 3)), np.ones(shape, bool)
+    seen[0, :, 1], seen[1, 4:, 1], seen[..., 2] = False, False, False
+    pieces = known_start(nothing, nothing, jnp.zeros(shape), jnp.zeros(shape), jnp.asarray(seen))
+    target = motion_posterior(SLED, pieces, known_scales(SLED, NOISE))
+    noise = np.random.default_rng(0).normal(size=(100, *shape))
+    motion = np.broadcast_to([3.0, 6.0, 1.0], noise.shape)
+    found = score(target, Predicted(motion, motion + noise, np.ones(noise.shape)), pieces)
+    np.testing.assert_array_equal(found.seen, [16, 4, 0])
+    np.testing.assert_allclose(found.error, [3.0, 6.0, np.nan])
+    assert np.isfinite(found.spread).tolist() == [True, True, False]
+    for share in found.coverage_by_channel.values():
+        assert np.isfinite(share).tolist() == [True, True, False]
+    metres = np.array([True, True, False])
+    assert found.pooled(metres) == pytest.approx(np.sqrt((16 * 3**2 + 4 * 6**2) / 20))
+    assert np.isnan(found.pooled(~metres))
 
 
 def test_unseen_pieces_cannot_be_scored():

@@ -1,5 +1,6 @@
 """A belief that follows the data as they arrive, and does not die of what it cannot explain."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -67,6 +68,21 @@ def test_particles_that_all_fail_begin_anew():
     belief, note = absorb(dead, data.take([2]), jax.random.key(3))
     assert "began anew from the prior" in note
     assert np.mean(models_of(belief, 256, jax.random.key(0)).mass) == pytest.approx(14.0, rel=0.05)
+
+
+def test_a_piece_that_no_model_explains_is_left_out():
+    data = pieces(TRUE, 1)
+    before, _ = followed(data, 2)
+    piece = data.take([2])
+    broken = eqx.tree_at(lambda piece: piece.action, piece, piece.action * np.inf)
+    belief, note = absorb(before, broken, jax.random.key(3))
+    assert "no particle explained" in note
+    assert "the piece was left out" in note
+    np.testing.assert_array_equal(belief.position, before.position)
+    np.testing.assert_array_equal(belief.log_weight, before.log_weight)
+    belief, note = absorb(belief, piece, jax.random.key(4))
+    assert note is None
+    assert np.mean(models_of(belief, 256, jax.random.key(0)).mass) == pytest.approx(14.0, rel=0.02)
 
 
 def test_pieces_of_another_length_are_refused():

@@ -1,18 +1,30 @@
 """Every sampler against posteriors and evidences known in closed form."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 
 from bayesian_toys import Linear, linear
 from palpate.errors import PalpateError
+from palpate.identification import metropolis
 from palpate.identification.diagnostics import bulk_size, rhat
+from palpate.identification.draws import time_to_compile
 from palpate.identification.hamiltonian import no_u_turn
 from palpate.identification.laplace import climb_each, find_modes
 from palpate.identification.metropolis import covariance_adapted, prior_scaled
 from palpate.identification.target import Target
-from palpate.identification.tempered import batch_of, compare, temper
+from palpate.identification.tempered import (
+    IMPOSSIBLE,
+    batch_of,
+    compare,
+    move,
+    systematic,
+    temper,
+)
 
 KEY = jax.random.key(7)
 
@@ -47,6 +59,76 @@ def test_draws_have_the_moments_of_the_normal_posterior(name):
 def test_the_same_key_gives_the_same_draws():
     first, second = (sampled("covariance adapted", linear()).position for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_what_compiling_took_is_what_is_beyond_the_pace_of_the_others():
+    spent, done = [5.0, 1.0, 2.0, 7.0], [10, 10, 20, 30]
+    assert time_to_compile(spent, done, first=(0, 3)) == pytest.approx((5 - 1) + (7 - 3))
+    assert time_to_compile([0.5, 1.0, 2.0, 7.0], done, first=(0, 3)) == pytest.approx(7 - 3)
+
+
+def test_metropolis_is_charged_with_nothing_that_it_compiles(monkeypatch):
+    """Densities where it begins, the first look at the chains, and the draws that are kept."""
+    seen = set()
+
+    def compiled(*shapes):
+        if shapes not in seen:
+            seen.add(shapes)
+            time.sleep(0.2)
+
+    def densities(target, position):
+        compiled("densities")
+        return jnp.zeros(len(position))
+
+    def walk(target, start, root, keys, draws, thin):
+        compiled(draws, thin)
+        some = jnp.zeros((len(keys), draws))
+        return metropolis._Walk(jnp.zeros((*some.shape, start.shape[1])), some, some)
+
+    monkeypatch.setattr(metropolis, "_densities", densities)
+    monkeypatch.setattr(metropolis, "_walk", walk)
+    for _ in range(2):  # the first time a few small things are truly compiled
+        seen.clear()
+        found = prior_scaled(linear(), jnp.zeros((2, 4)), KEY, draws=3, warm_up=100, thin=2)
+    assert len(seen) == 3
+    assert found.compiling == pytest.approx(0.6, abs=0.15)
+    assert found.seconds > found.compiling
+
+
+class Ridge(Target):
+    """Two parameters of which the data tell one sum alone, to 1e-5; exact in float32."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("x", "y")
+
+    def log_likelihood(self, position: Array) -> Array:
+        return -0.5 * 2.0**33 * jnp.square(position @ ACROSS - 1.0)
+
+    def curvature(self, position: Array) -> tuple[Array, Array, Array]:
+        value, slope = jax.value_and_grad(self.density)(position)
+        return value, slope, 2.0**33 * jnp.outer(ACROSS, ACROSS) + jnp.eye(2)
+
+
+ACROSS = np.array([1.0, 0.625], np.float32)
+ALONG = np.array([-0.625, 1.0]) / np.hypot(0.625, 1.0)
+
+
+def test_modes_on_a_narrow_ridge_have_draws_all_along_it():
+    modes = find_modes(Ridge(), KEY, starts=2)
+    np.linalg.cholesky(np.asarray(modes.covariance, np.float64))
+    draws = np.asarray(modes.draw(KEY, 2000), np.float64)
+    assert np.std(draws @ ACROSS) == pytest.approx(2.0**-16.5, rel=0.1)
+    assert np.std(draws @ ALONG) == pytest.approx(1.0, rel=0.1)
+
+
+def test_three_chains_begin_apart_on_a_narrow_ridge_and_stay_on_it():
+    found = no_u_turn(Ridge(), find_modes(Ridge(), KEY, starts=2), KEY, chains=3, draws=50)
+    assert found.position.shape == (3, 50, 2)
+    assert found.density.shape == (3, 50)
+    assert found.acceptance.shape == (3,)
+    assert np.max(np.abs(found.position @ ACROSS - 1.0)) < 1e-4
+    assert np.min(np.std(found.position @ ALONG, axis=1)) > 0.1
 
 
 def test_a_climb_of_some_coordinates_ends_where_the_others_leave_them_most_probable():
@@ -155,3 +237,43 @@ def test_a_likelihood_that_is_nowhere_finite_is_refused():
         prior_scaled(broken, jnp.zeros((4, 4)), KEY, 10, 20)
     with pytest.raises(PalpateError, match="hardly any draw of the prior"):
         temper(broken, KEY, 100)
+
+
+class Cliff(Linear):
+    """A likelihood that is finite only beyond an edge."""
+
+    edge: Array
+
+    def log_likelihood(self, position):
+        return jnp.where(position[0] > self.edge, super().log_likelihood(position), jnp.nan)
+
+
+def test_one_particle_with_a_finite_likelihood_is_too_few():
+    """Of the draws of the prior that `temper` begins with, one or three are beyond the edge."""
+    first, _ = jax.random.split(KEY)
+    along = np.sort(np.asarray(jax.random.normal(first, (100, 4)))[:, 0])[::-1]
+    one, three = (0.5 * (along[n - 1] + along[n]) for n in (1, 3))
+    target = linear()
+    with pytest.raises(PalpateError, match="hardly any draw of the prior"):
+        temper(Cliff(target.design, target.observed, jnp.asarray(one)), KEY, 100)
+    found = temper(Cliff(target.design, target.observed, jnp.asarray(three)), KEY, 100)
+    assert np.min(found.position[:, 0]) > three
+
+
+def test_no_particle_moves_among_what_is_impossible():
+    position, one = jax.random.normal(KEY, (50, 2)), jnp.ones(())
+    likelihood = jnp.full(50, IMPOSSIBLE)
+    moved, after, _, rate = move(
+        lambda position: jnp.full(len(position), IMPOSSIBLE),
+        position, likelihood, one, jnp.eye(2), one, KEY, 5,
+    )  # fmt: skip
+    np.testing.assert_array_equal(moved, position)
+    np.testing.assert_array_equal(after, likelihood)
+    assert float(rate) == 0.0
+
+
+def test_as_many_particles_are_resampled_as_are_asked_for():
+    weight = jnp.log(jnp.asarray([0.0, 0.5, 0.25, 0.25]))
+    counts = np.bincount(systematic(KEY, weight, 8), minlength=4)
+    np.testing.assert_array_equal(counts, [0, 4, 2, 2])
+    np.testing.assert_array_equal(systematic(KEY, weight), systematic(KEY, weight, 4))

@@ -30,7 +30,7 @@ from palpate.experiments.cart_trials import HANDLED, PRACTISED, Planning, Trial,
 from palpate.experiments.names import suffix
 from palpate.experiments.rope_stabilization import announce, finish, wall_time
 from palpate.report.style import STYLES
-from palpate.result import Figure, Result
+from palpate.result import Figure, Result, two_standard_errors
 from palpate.runs import Run, progress
 from palpate.storage import write_bytes
 
@@ -167,7 +167,7 @@ def figures(name: str, rewards: Rewards) -> list[Figure]:
             bar=BAR,
             seed_document="PBRL close to TRUE after few steps",
             rival=float(rival.mean()),
-            spread=float(2 * own.std() / np.sqrt(max(len(own) - 1, 1))),
+            spread=two_standard_errors(own),
         ),
         Figure(
             f"{name}.regret_first_{FROM}",
@@ -211,9 +211,10 @@ def draw(path: Path, earned: dict[str, Rewards]) -> None:
             # Within an episode the reward rises whether or not anything is learnt.
             episodes = rows.reshape(worlds, -1, min(task.episode, decisions)).mean(axis=2)
             ends = decisions / episodes.shape[1] * np.arange(1, episodes.shape[1] + 1)
-            middle, error = episodes.mean(0), episodes.std(0) / np.sqrt(max(worlds - 1, 1))
+            middle = episodes.mean(axis=0)
+            error = np.array([two_standard_errors(of) or 0.0 for of in episodes.T])
             axis.fill_between(
-                ends, middle - 2 * error, middle + 2 * error, color=style.light, alpha=0.15, lw=0
+                ends, middle - error, middle + error, color=style.light, alpha=0.15, lw=0
             )
             axis.plot(
                 ends, middle, label=agent, color=style.light,

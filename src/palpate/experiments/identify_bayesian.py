@@ -4,6 +4,7 @@ Nothing here knows what was recorded: `options.prepare` and `options.hypotheses`
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.experiments import folders
 from palpate.experiments.options import Hypotheses, IdentifyBayesian
-from palpate.identification.bayesian import Posterior, draw
+from palpate.identification.bayesian import Posterior, check_numbers, draw
 from palpate.identification.laplace import Modes, settle
 from palpate.identification.likelihood import (
     MotionPosterior,
@@ -22,7 +23,8 @@ from palpate.identification.likelihood import (
     motion_posterior,
 )
 from palpate.identification.posterior_files import write_posterior
-from palpate.identification.predictive import Predicted, Score
+from palpate.identification.prediction import or_nan
+from palpate.identification.predictive import Predicted, Score, check_seen
 from palpate.identification.segments import Segments, cut, difference, noise_scale
 from palpate.models.model import Model
 from palpate.parameters import format_value
@@ -50,8 +52,10 @@ class Found:
 def run(options: IdentifyBayesian) -> Path:
     """Identify, print what a person wants to know, and return the folder everything is in.
 
-    Raises `PalpateError` for recordings and folders that cannot be used.
+    Raises `PalpateError` for recordings and folders that cannot be used, and for fewer draws than
+    can be judged; before anything takes minutes.
     """
+    check_numbers(options.chains, options.draws)
     fitted, period = _read(options, options.recordings)
     scored = _read(options, options.validate)[0] if options.validate else None
     name = f"identify-{options.family}"
@@ -63,14 +67,20 @@ def run(options: IdentifyBayesian) -> Path:
     with folders.open_run(options, name, configuration, DRAWS) as run:
         if not run.finished:
             shown = [fitted] if scored is None else [fitted, scored]
+            aligned, asked = (
+                recording.align(period, options.observation, options.action)
+                for recording in (fitted, scored or fitted)
+            )
             hypotheses = options.hypotheses(shown, period)
-            aligned = fitted.align(period, options.observation, options.action)
+            # Before the sampling: where nothing can be cut, nobody waits for it in vain.
+            pieces = _cut(asked, next(iter(hypotheses.models.values())))
+            check_seen(pieces)
             targets = {
                 name: posterior_of(options.sufficient(model, shown), aligned)
                 for name, model in hypotheses.models.items()
             }
             found = identify(targets, options.draws, options.chains, options.seed)
-            _write(run, name, options, fitted, scored, hypotheses, found)
+            _write(run, name, options, (fitted, scored), pieces, hypotheses, found)
         result = read_result(run.path / RESULT)
         _print(result)
         title = f"What was found out about the {options.family}"
@@ -85,8 +95,9 @@ def identify(
 
     All of them are alike before. The evidence is Laplace's at the best mode of each: tempered
     particles (`tempered.compare`) give it without the assumption of a normal posterior, and take
-    many times as long.
+    many times as long. Raises as `bayesian.draw`.
     """
+    check_numbers(chains, draws)
     explored = explore(targets, seed)
     probability = shares({name: evidence(modes) for name, (_, modes) in explored.items()})
     structure = max(probability, key=probability.__getitem__)
@@ -116,8 +127,12 @@ def shares(logarithms: Mapping[str, float]) -> dict[str, float]:
 
 def posterior_of(model: Model, aligned: Aligned) -> MotionPosterior:
     """What is to be sampled: of pieces of the trials, the first of each from rest if it is so."""
-    segments = cut(aligned, model, PIECE, begins_at_rest(aligned, model))
-    return motion_posterior(model, segments, inferred_scales(model, noise_scale(aligned, model)))
+    scales = inferred_scales(model, noise_scale(aligned, model))
+    return motion_posterior(model, _cut(aligned, model), scales)
+
+
+def _cut(aligned: Aligned, model: Model) -> Segments:
+    return cut(aligned, model, PIECE, begins_at_rest(aligned, model))
 
 
 def _read(options: IdentifyBayesian, paths: tuple[Path, ...]) -> tuple[Recording, float]:
@@ -187,18 +202,18 @@ def _write(
     run: Run,
     name: str,
     options: IdentifyBayesian,
-    fitted: Recording,
-    scored: Recording | None,
+    recordings: tuple[Recording, Recording | None],
+    pieces: Segments,
     hypotheses: Hypotheses,
     found: Found,
 ) -> None:
-    """Draws, evidence and result into the run's folder; the result last."""
-    posterior = found.posterior
+    """Draws, evidence and result into the run's folder; the result last.
+
+    `recordings` are what was fitted and, if that is another, what `pieces` to score on are from.
+    """
+    posterior, (fitted, scored) = found.posterior, recordings
     write_posterior(run.path / DRAWS, posterior, hypotheses.models[found.structure])
     model = posterior.target.coordinates.reference
-    which = scored or fitted
-    aligned = which.align(model.control_period, options.observation, options.action)
-    pieces = cut(aligned, model, PIECE, begins_at_rest(aligned, model))
     predicted = posterior.predict(pieces)
     score = posterior.score(pieces)
     write_evidence(run.path, _horizon(predicted, pieces, model))
@@ -230,16 +245,11 @@ def _write(
 
 
 def _figures(posterior: Posterior, score: Score, model: Model, wall_time: float) -> list[Figure]:
-    error = score.error.reshape(-1, score.error.shape[-1])
     units = model.observation_units
-    figures = [
-        Figure(
-            f"rmse_{unit}", float(np.sqrt(np.mean(error[:, np.array(units) == unit] ** 2))), unit
-        )
-        for unit in dict.fromkeys(units)
-    ]
+    errors = {unit: score.pooled(np.array(units) == unit) for unit in dict.fromkeys(units)}
     return [
-        *figures,
+        # None for what JSON lacks: the error of what nobody saw.
+        *(Figure(f"rmse_{u}", e if math.isfinite(e) else None, u) for u, e in errors.items()),
         Figure("coverage_90", score.coverage[LEVEL], ""),
         Figure("log_score", score.log_score, "", better="higher"),
         Figure("rhat_max_predictions", posterior.rhat_of_predictions, ""),
@@ -250,14 +260,14 @@ def _figures(posterior: Posterior, score: Score, model: Model, wall_time: float)
 
 
 def _horizon(predicted: Predicted, pieces: Segments, model: Model) -> dict[str, np.ndarray]:
-    """How the error of position grows, and how far predictions reach that hold 90 %."""
+    """How the error of position grows, and how large it is expected to be, NaN if unseen."""
     unit = model.observation_units[0]
     of = np.array([u == unit for u in model.observation_units])
     seen = np.asarray(pieces.seen)[..., of]
     off = difference(model, np.asarray(predicted.motion), np.asarray(pieces.target))[..., of]
     mean = np.where(seen, off.mean(axis=0), 0.0)
     axes = (0, *range(2, mean.ndim))
-    count = np.maximum(seen.sum(axis=axes), 1)
+    count = or_nan(seen.sum(axis=axes))
     spread = np.where(seen, np.var(np.asarray(predicted.observed)[..., of], axis=0), 0.0)
     return {
         "horizon.time": model.control_period * np.arange(1, pieces.horizon + 1),
@@ -293,7 +303,7 @@ def _print(result: Result) -> None:
     values = {figure.name: figure for figure in result.figures}
     coverage = values["coverage_90"].value or 0.0
     errors = ", ".join(
-        f"{figure.value:.3g} {figure.unit}"
+        f"{'unknown' if figure.value is None else f'{figure.value:.3g}'} {figure.unit}"
         for name, figure in values.items()
         if name.startswith("rmse_")
     )

@@ -7,9 +7,9 @@ feet, which caster is locked and at what angle, where a hinge holds. It fits wha
 where the load stands, friction and rolling resistance, and is told the ranges they were drawn from,
 as a prior and a place to begin. It yields one point and no posterior.
 
-Both begin from the same smoothed starts of the same pieces of a second (`segments.cut`). What a
-start does not show is where free casters point: that follows from the way they were dragged before
-(`caster_angles`), and pieces that begin before it is known are left out.
+Both begin at starts that are smoothed alike (`segments.cut`): here of pieces of a second, ours of
+pieces of two. What a start does not show is where free casters point: that follows from the way
+they were dragged before (`caster_angles`), and pieces that begin before it is known are left out.
 """
 
 import contextlib

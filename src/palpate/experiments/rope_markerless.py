@@ -36,7 +36,7 @@ from palpate.experiments.rope_trials import Episodes, LearnedController, Trial, 
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
 from palpate.report.evidence import write_evidence
-from palpate.result import Figure, Result
+from palpate.result import Figure, Result, two_standard_errors
 from palpate.runs import Run, interruptible, progress
 from palpate.tasks import RopeStabilization
 from palpate.worlds.camera import Sensor
@@ -217,7 +217,7 @@ def _figures(
     by_trial = np.sqrt(np.nanmean(missed, axis=-1)) * 100.0
     spread = None
     if np.isfinite(by_trial).all():
-        spread = float(2.0 * by_trial.std() / math.sqrt(len(by_trial)))
+        spread = two_standard_errors(by_trial)
     rates = {
         name: summarise(_trials(row, counts, seed), _episodes(filmed[name]))
         for name, row in ROWS.items()

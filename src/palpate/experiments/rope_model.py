@@ -34,7 +34,7 @@ from palpate.recording import Aligned
 from palpate.recording_files import read_recording
 from palpate.recording_markers import repair_markers, with_driven
 from palpate.report import write_evidence
-from palpate.result import Figure, Result
+from palpate.result import Figure, Result, two_standard_errors
 from palpate.runs import Run
 from palpate.worlds.rope import RopeConfiguration
 
@@ -200,7 +200,7 @@ def _simulated_figures(
             bar=0.03,
             seed_document=table[0],
             rival=theirs,
-            spread=float(2.0 * np.std(tips["damped"]) / np.sqrt(len(tips["damped"]))),
+            spread=two_standard_errors(tips["damped"]),
         ),
         Figure(
             f"{name}.ratio_to_undamped",
@@ -245,7 +245,7 @@ def _real(
             "cm",
             bar=0.90,
             rival=DEFORM_L1["dlo1"],
-            spread=float(2.0 * np.std(by_trial) / np.sqrt(len(by_trial))),
+            spread=two_standard_errors(by_trial),
         ),
         Figure(
             "real.ratio_to_undamped",

@@ -21,8 +21,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from palpate.errors import PalpateError
 from palpate.identification import predictive
-from palpate.identification.diagnostics import bulk_size, rhat, tail_size
+from palpate.identification.diagnostics import FEWEST, bulk_size, rhat, tail_size
 from palpate.identification.draws import Draws
 from palpate.identification.hamiltonian import no_u_turn
 from palpate.identification.laplace import Modes, settle
@@ -240,8 +241,10 @@ def identify(
     compared by what they predict at the ends of `probes`, by default the pieces themselves.
     `tell(done, blocks)` is called as the sampling goes on. The same seed gives the same draws.
 
-    Raises `PalpateError` when no piece can be cut, or the likelihood is not finite anywhere.
+    Raises `PalpateError` when no piece can be cut, the likelihood is not finite anywhere, or so few
+    chains or draws are asked for that they cannot be judged.
     """
+    check_numbers(chains, draws)
     segments = cut(aligned, model, seconds, at_rest)
     target = motion_posterior(model, segments, inferred_scales(model, noise_scale(aligned, model)))
     return sample(target, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
@@ -257,6 +260,7 @@ def sample(
     tell: Callable[[int, int], None] = lambda done, blocks: None,
 ) -> Posterior:
     """As `identify`, for a target that was made apart."""
+    check_numbers(chains, draws)
     climbing, _ = jax.random.split(jax.random.key(seed))
     settled = settle(target, climbing)
     return draw(*settled, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
@@ -273,9 +277,19 @@ def draw(
     tell: Callable[[int, int], None] = lambda done, blocks: None,
 ) -> Posterior:
     """As `sample`, for a target that has been settled (`laplace.settle`) about its modes."""
+    check_numbers(chains, draws)
     _, sampling = jax.random.split(jax.random.key(seed))
     found = no_u_turn(target, modes, sampling, chains, draws, tell)
     return Posterior(target, found, modes, target.segments if probes is None else probes)
+
+
+def check_numbers(chains: int, draws: int) -> None:
+    """Raise `PalpateError` for so few chains or draws that nothing says how far to trust them."""
+    if chains < 1 or draws < FEWEST:
+        raise PalpateError(
+            f"expected at least 1 chain of {FEWEST} draws, by which it can be judged, got {chains} "
+            f"of {draws}: 4 of 300 are usual"
+        )
 
 
 @eqx.filter_jit

@@ -14,6 +14,7 @@ from scipy.stats import rankdata
 from palpate.errors import PalpateError
 
 TAILS = 0.05, 0.95  # quantiles that the tail size is of
+FEWEST = 4  # draws of a chain: two of each half, of which a variance can be taken
 
 
 def rhat(draws: Float[np.ndarray, "chains draws ..."]) -> Float[np.ndarray, "..."]:
@@ -48,9 +49,9 @@ def tail_size(draws: Float[np.ndarray, "chains draws ..."]) -> Float[np.ndarray,
 def _checked(draws: np.ndarray) -> np.ndarray:
     """The draws as (chains, draws, quantities)."""
     values = np.asarray(draws, np.float64)
-    if values.ndim < 2 or values.shape[1] < 4:
+    if values.ndim < 2 or values.shape[1] < FEWEST:
         raise PalpateError(
-            f"expected draws of shape (chains, at least 4 draws, ...), got {values.shape}"
+            f"expected draws of shape (chains, at least {FEWEST} draws, ...), got {values.shape}"
         )
     if not np.all(np.isfinite(values)):
         raise PalpateError("a draw is NaN or infinite: expected finite draws to judge chains by")

@@ -32,7 +32,7 @@ class Draws:
 
 
 def time_to_compile(
-    seconds: Sequence[float], evaluations: Sequence[float], first: Sequence[int]
+    seconds: Sequence[float], evaluations: Sequence[float | int], first: Sequence[int]
 ) -> float:
     """Of so many seconds those that compiling took, s.
 

@@ -33,14 +33,15 @@ FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on f
 class Modes(eqx.Module):
     """Normal approximations at stationary points, best density first.
 
-    `slope` is the density's, near zero; `covariance` the inverse of the target's curvature;
-    `evidence` Laplace's logarithm of the data's density by each mode alone.
+    `slope` is the density's, near zero; `covariance` the inverse of the target's curvature, in
+    float64: rounded to float32 that of a narrow ridge is no longer positive definite; `evidence`
+    Laplace's logarithm of the data's density by each mode alone.
     """
 
     position: Float[Array, "*batch modes free"]
     density: Float[Array, "*batch modes"]
     slope: Float[Array, "*batch modes free"]
-    covariance: Float[Array, "*batch modes free free"]
+    covariance: Float[np.ndarray | Array, "*batch modes free free"]
     evidence: Float[Array, "*batch modes"]
 
     def draw(self, key: PRNGKeyArray, count: int) -> Array:
@@ -48,8 +49,9 @@ class Modes(eqx.Module):
         which, where = jax.random.split(key)
         chosen = jax.random.categorical(which, self.evidence, shape=(count,))
         noise = jax.random.normal(where, (count, self.position.shape[1]), self.position.dtype)
-        root = jnp.linalg.cholesky(self.covariance)[chosen]
-        return self.position[chosen] + jnp.einsum("nij,nj->ni", root, noise)
+        root = np.linalg.cholesky(np.asarray(self.covariance, np.float64))[np.asarray(chosen)]
+        off = np.einsum("nij,nj->ni", root, np.asarray(noise, np.float64))
+        return jnp.asarray(np.asarray(self.position)[np.asarray(chosen)] + off, noise.dtype)
 
 
 def find_modes(target: Target, key: PRNGKeyArray, starts: int = 8, steps: int = 40) -> Modes:
@@ -109,17 +111,30 @@ def climb_each(
         for kept, new in zip((value, slope, information), after, strict=True):
             kept[better] = new[better]
     _, volume = np.linalg.slogdet(information / (2.0 * np.pi))
-    inverse = np.linalg.inv(information)
-    covariance = 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
-    found = here, value, slope, covariance, value - 0.5 * volume
     order = np.argsort(-value, axis=-1)
     dtype = jnp.zeros(()).dtype
 
-    def sorted_by_density(part: np.ndarray) -> Array:
+    def sorted_by_density(part: np.ndarray) -> np.ndarray:
         index = order.reshape(*order.shape, *(1,) * (part.ndim - order.ndim))
-        return jnp.asarray(np.take_along_axis(part, index, axis=order.ndim - 1), dtype)
+        return np.take_along_axis(part, index, axis=order.ndim - 1)
 
-    return Modes(*map(sorted_by_density, found))
+    def rounded(part: np.ndarray) -> Array:
+        return jnp.asarray(sorted_by_density(part), dtype)
+
+    return Modes(
+        position=rounded(here),
+        density=rounded(value),
+        slope=rounded(slope),
+        covariance=sorted_by_density(_inverse(information)),
+        evidence=rounded(value - 0.5 * volume),
+    )
+
+
+def _inverse(information: Float[np.ndarray, "*batch free free"]) -> np.ndarray:
+    """Of what is at least the prior's identity; positive definite however far eigenvalues part."""
+    values, vectors = np.linalg.eigh(information)
+    inverse = (vectors / np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
 
 
 def search(

@@ -158,8 +158,11 @@ class MotionPosterior(Target):
     def curvature(self, position: Float[Array, " free"]) -> tuple[Array, Array, Array]:
         """Density and slope with Fisher's information of mean and scales, prior included.
 
-        Of a normal distribution with the covariance C: J^T C^-1 J + 1/2 tr(C^-1 dC C^-1 dC). All
-        from one sweep in forward mode, which compiles in a fraction of the time of a reverse one.
+        Of a normal distribution with the covariance C: J^T C^-1 J + 1/2 tr(C^-1 dC C^-1 dC). Where
+        starts are uncertain, C = D + A A^T, the second term is taken with D alone: a little more
+        than is known of the scales, enough for the steps of a climb and the shape of a proposal.
+        All from one sweep in forward mode, which compiles in a fraction of the time of a reverse
+        one.
         """
 
         def moments(position: Array):

@@ -62,10 +62,11 @@ def covariance_adapted(
 def _sampled(target, start, key, draws: int, warm_up: int, thin: int, adapted: bool) -> Draws:
     began = time.monotonic()
     check_start(target, np.asarray(start), np.asarray(_densities(target, start)))
+    spent = [time.monotonic() - began]
     chains, size = start.shape
     length = -(-warm_up // LOOKS)
     scale, position = 2.38 / np.sqrt(size), start
-    covariance, history, spent = np.eye(size), [], []
+    covariance, history = np.eye(size), []
 
     def walked(key: PRNGKeyArray, draws: int, thin: int) -> _Walk:
         now = time.monotonic()
@@ -83,15 +84,15 @@ def _sampled(target, start, key, draws: int, warm_up: int, thin: int, adapted: b
         if adapted:
             covariance = _learnt(history[len(history) // 2 :])
     walk = walked(jax.random.fold_in(key, 1), draws, thin)
-    steps = [length] * LOOKS + [draws * thin]
+    steps = [1] + [length] * LOOKS + [draws * thin]  # the first is where the chains begin
     return Draws(
-        position=walk.position,
-        density=walk.density,
-        acceptance=walk.accepted.mean(axis=1),
+        position=np.asarray(walk.position),
+        density=np.asarray(walk.density),
+        acceptance=np.asarray(walk.accepted).mean(axis=1),
         divergences=0,
         evaluations=chains * sum(steps),
         seconds=time.monotonic() - began,
-        compiling=time_to_compile(spent, steps, first=(0, LOOKS)),
+        compiling=time_to_compile(spent, steps, first=(0, 1, LOOKS + 1)),
     )
 
 
@@ -109,9 +110,7 @@ def _densities(target: Target, position: Array) -> Array:
 
 
 @eqx.filter_jit
-def _walk(
-    target: Target, start: Array, root: Array, keys: PRNGKeyArray, draws: int, thin: int
-) -> _Walk:
+def _walk(target: Target, start: Array, root: Array, keys: Array, draws: int, thin: int) -> _Walk:
     def chain(target: Target, root: Array, start: Array, key: PRNGKeyArray) -> _Walk:
         def step(carry, key):
             here, value = carry
@@ -131,6 +130,7 @@ def _walk(
 
     def part(shared, each) -> _Walk:
         # Side by side: all take as many steps.
-        return jax.vmap(lambda start, key: chain(*shared, start, key))(*each)
+        target, root = shared
+        return jax.vmap(lambda start, key: chain(target, root, start, key))(*each)
 
     return over_devices(part)((target, root), (start, keys))

@@ -8,7 +8,8 @@ A new piece of motion weighs the particles by its likelihood. Where few would be
 by degrees, and the particles are resampled and moved by Metropolis steps with all pieces so far
 (resample and move: Gilks and Berzuini, J. R. Stat. Soc. B 63, 2001; Chopin 2002, with bridging by
 temperature). When no particle explains a new piece, or steps are no longer accepted, all begin
-anew from the prior and pass through all the pieces at once: a belief never dies.
+anew from the prior and pass through all the pieces at once. What they cannot explain either, such
+as an action that is not finite, is left out: a belief never dies.
 
 The target has a fixed number of places for pieces, and computes them all: nothing is compiled
 anew as data arrive. When they are full, the oldest piece is forgotten.
@@ -81,6 +82,9 @@ def begin(target: MotionPosterior, key: PRNGKeyArray, particles: int = 256) -> B
 def absorb(belief: Belief, piece: Segments, key: PRNGKeyArray) -> tuple[Belief, str | None]:
     """The belief after one more piece of motion, and a sentence when it had to begin anew.
 
+    A piece that the prior explains no more than the particles do takes a place, and is not seen:
+    the belief stays what it was, and the sentence says so.
+
     Raises `PalpateError` for a piece of another length, or more than one.
     """
     if piece.count != 1 or piece.horizon != belief.target.segments.horizon:
@@ -89,7 +93,8 @@ def absorb(belief: Belief, piece: Segments, key: PRNGKeyArray) -> tuple[Belief, 
             f"{piece.count} of {piece.horizon}: `cut` pads a shorter one"
         )
     place = belief.filled % belief.target.segments.count
-    target = _placed(belief.target, piece, place, _mean(belief))
+    mean = _mean(belief)
+    target = _placed(belief.target, piece, place, mean)
     moving, anew = jax.random.split(key)
     position, log_weight, scale, acceptance, reached = _absorb(
         target, belief.position, belief.log_weight, belief.scale, jnp.asarray(place), moving
@@ -97,14 +102,17 @@ def absorb(belief: Belief, piece: Segments, key: PRNGKeyArray) -> tuple[Belief, 
     note = None
     if float(reached) < 1.0 or float(acceptance) < LOST:
         lost = "no particle explained what was seen" if float(reached) < 1.0 else "particles stuck"
-        note = f"{lost}, so the belief began anew from the prior"
-        log_weight = jnp.zeros_like(log_weight)
         try:
             found = temper(target, anew, len(belief.position))
             position, scale = found.position, found.scale
+            log_weight = jnp.zeros_like(log_weight)
+            note = f"{lost}, so the belief began anew from the prior"
         except PalpateError:
-            note += ", which explains no more: it is the prior"
-            position = jax.random.normal(anew, belief.position.shape)
+            # In the place of the oldest piece all the same: if it is the old ones that cannot be
+            # explained together with what is seen now, they are forgotten one by one.
+            target = _placed(belief.target, jax.tree.map(jnp.zeros_like, piece), place, mean)
+            position, log_weight, scale = belief.position, belief.log_weight, belief.scale
+            note = f"{lost}, and the prior explains no more: the piece was left out"
     return Belief(target, position, log_weight, scale, belief.filled + 1), note
 
 
@@ -120,10 +128,7 @@ def models_of(belief: Belief, count: int, key: PRNGKeyArray) -> Model:
 
 @eqx.filter_jit
 def _resampled(position: Array, log_weight: Array, key: PRNGKeyArray, count: int) -> Array:
-    points = (jax.random.uniform(key) + jnp.arange(count)) / count
-    cumulative = jnp.cumsum(jax.nn.softmax(log_weight))
-    chosen = jnp.searchsorted(cumulative, points * cumulative[-1])
-    return position[jnp.clip(chosen, 0, len(log_weight) - 1)]
+    return position[systematic(key, log_weight, count)]
 
 
 def _mean(belief: Belief) -> Float[Array, " free"]:
@@ -182,8 +187,9 @@ def _absorb(
 
     def bridge(_):
         def unfinished(carry):
-            index, *_, reached, _ = carry
-            return (reached < 1.0) & (index < BRIDGES)
+            index, _, _, news_of, *_, reached, _ = carry
+            possible = jnp.max(news_of) > IMPOSSIBLE
+            return (reached < 1.0) & (index < BRIDGES) & possible
 
         def let_in(carry):
             index, position, log_weight, news_of, scale, _, reached, key = carry

@@ -172,15 +172,15 @@ def prediction_error(model: Model, aligned: Aligned) -> PredictionError:
     axes = error.shape[-1] if error.ndim > 2 else 1
     return PredictionError(
         mean_absolute=float(np.abs(error).sum() / seen.sum()),
-        by_trial=np.abs(error).sum(per_trial) / _or_nan(seen.sum(per_trial)),
+        by_trial=np.abs(error).sum(per_trial) / or_nan(seen.sum(per_trial)),
         horizon=aligned.period * np.arange(1, error.shape[1] + 1),
-        rmse=np.sqrt(np.square(error).sum(per_time) / _or_nan(seen.sum(per_time) / axes)),
+        rmse=np.sqrt(np.square(error).sum(per_time) / or_nan(seen.sum(per_time) / axes)),
         prediction=prediction,
         windows=windows,
     )
 
 
-def _or_nan(count: np.ndarray) -> np.ndarray:
+def or_nan(count: np.ndarray) -> np.ndarray:
     """The count to divide by, NaN in place of zero."""
     return np.where(count > 0, count, np.nan)
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
 from palpate.identification.likelihood import (
@@ -14,6 +14,7 @@ from palpate.identification.likelihood import (
     discrepancy_covariance,
     from_start,
 )
+from palpate.identification.prediction import or_nan
 from palpate.identification.segments import Segments, difference
 
 LANES = 2048  # pieces times draws that are simulated at a time
@@ -48,7 +49,8 @@ class Score:
     is the mean logarithm of the predictive density of an observed number (higher is better;
     Gneiting and Raftery, J. Am. Stat. Assoc. 102, 2007). `error` is the root mean square of the
     posterior mean's error by channel, and `spread` that of the predictive deviation, which is as
-    large when the posterior is honest.
+    large when the posterior is honest. `seen` counts what was seen of each channel; where that is
+    nothing, the channel's numbers are NaN.
     """
 
     coverage: dict[float, float]
@@ -56,6 +58,16 @@ class Score:
     log_score: float
     error: np.ndarray
     spread: np.ndarray
+    seen: np.ndarray
+
+    def pooled(self, channels: Bool[np.ndarray, " last"]) -> float:
+        """Root mean square of `error` over all that was seen of these entries of an observation.
+
+        NaN where that is nothing.
+        """
+        count = self.seen[..., channels]
+        square = np.square(self.error[..., channels]) * count
+        return float(np.sqrt(square[count > 0].sum() / or_nan(np.asarray(count.sum()))))
 
 
 def predict(
@@ -91,6 +103,12 @@ def predict(
     return Predicted(motion, observed, deviation)
 
 
+def check_seen(segments: Segments) -> None:
+    """Raise `PalpateError` when these pieces show nothing to hold predictions against."""
+    if not np.asarray(segments.seen).any():
+        raise PalpateError("nothing is seen in these pieces: there is nothing to score against")
+
+
 def score(
     target: MotionPosterior,
     predicted: Predicted,
@@ -99,11 +117,10 @@ def score(
 ) -> Score:
     """Hold predictions against the pieces' targets, over what was seen in them.
 
-    Raises `PalpateError` when nothing was.
+    Raises as `check_seen`.
     """
+    check_seen(segments)
     seen = np.asarray(segments.seen)
-    if not seen.any():
-        raise PalpateError("nothing is seen in these pieces: there is nothing to score against")
     model = target.coordinates.reference
 
     def beyond(motion: np.ndarray) -> np.ndarray:
@@ -119,7 +136,7 @@ def score(
         lower, upper = np.quantile(observed, (tail, 1.0 - tail), axis=0)
         inside = (lower <= 0.0) & (upper >= 0.0) & seen
         coverage[level] = float(inside.sum() / seen.sum())
-        by_channel[level] = inside.sum(axis=channels) / np.maximum(counts, 1)
+        by_channel[level] = inside.sum(axis=channels) / or_nan(counts)
     variance = np.square(predicted.deviation, dtype=np.float64)
     each = -0.5 * (np.square(motion) / variance + np.log(2.0 * np.pi * variance))
     top = each.max(axis=0)
@@ -130,8 +147,9 @@ def score(
         coverage=coverage,
         coverage_by_channel=by_channel,
         log_score=float(density[seen].mean()),
-        error=np.sqrt(np.square(mean_error).sum(axis=channels) / np.maximum(counts, 1)),
-        spread=np.sqrt(spread.sum(axis=channels) / np.maximum(counts, 1)),
+        error=np.sqrt(np.square(mean_error).sum(axis=channels) / or_nan(counts)),
+        spread=np.sqrt(spread.sum(axis=channels) / or_nan(counts)),
+        seen=counts,
     )
 
 

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from palpate.errors import PalpateError
 from palpate.identification.target import Target
@@ -25,6 +25,7 @@ from palpate.identification.target import Target
 KEPT = 0.5  # share of the particles that one change of temperature may leave effective
 LONGEST = 200  # temperatures
 ACCEPTANCE = 0.3
+FEWEST = 2  # draws of the prior whose likelihood is finite: all copies of one never part
 BISECTIONS = 24
 IMPOSSIBLE = -1e30  # a log-likelihood that is not finite, as a number that survives arithmetic
 
@@ -51,7 +52,7 @@ def temper(target: Target, key: PRNGKeyArray, particles: int = 512, moves: int =
     `moves` Metropolis steps are made at each temperature. Raises `PalpateError` when fewer than
     two particles have a finite likelihood, or when the temperatures run out.
     """
-    return _checked(_temper(target, key, particles, moves))
+    return _checked(*_temper(target, key, particles, moves))
 
 
 def compare(
@@ -63,7 +64,7 @@ def compare(
     Raises as `temper`.
     """
     count = jax.tree.leaves(eqx.filter(targets, eqx.is_array))[0].shape[0]
-    found = _checked(_temper_batch(targets, jax.random.split(key, count), particles, moves))
+    found = _checked(*_temper_batch(targets, jax.random.split(key, count), particles, moves))
     evidence = np.asarray(found.evidence, np.float64)
     weight = np.exp(evidence - evidence.max())
     return weight / weight.sum(), found
@@ -84,9 +85,10 @@ def batch_of(targets: list[Target]) -> Any:
     return jax.tree.map(lambda *x: jnp.stack(x) if eqx.is_array(x[0]) else x[0], *targets)
 
 
-def _checked(particles: Particles) -> Particles:
+def _checked(particles: Particles, possible: Int[Array, "*batch"]) -> Particles:
+    """The particles, if so many draws of the prior were `possible` that there are any to trust."""
     temperature = np.asarray(particles.temperature)
-    if np.any(np.asarray(particles.likelihood).max(axis=-1) <= IMPOSSIBLE):
+    if np.any(np.asarray(possible) < FEWEST):
         raise PalpateError(
             "hardly any draw of the prior has a finite likelihood: expected a model that can "
             "predict the data somewhere; declare narrower priors, or check the data"
@@ -100,21 +102,25 @@ def _checked(particles: Particles) -> Particles:
 
 
 @eqx.filter_jit
-def _temper_batch(targets: Any, keys: Array, particles: int, moves: int) -> Particles:
+def _temper_batch(targets: Any, keys: Array, particles: int, moves: int) -> tuple[Particles, Array]:
     return eqx.filter_vmap(lambda t, k: _temper(t, k, particles, moves))(targets, keys)
 
 
 @eqx.filter_jit
-def _temper(target: Target, key: PRNGKeyArray, particles: int, moves: int) -> Particles:
+def _temper(
+    target: Target, key: PRNGKeyArray, particles: int, moves: int
+) -> tuple[Particles, Array]:
+    """The particles, and how many of the first had a finite likelihood; too few are left there."""
     likelihoods = jax.vmap(lambda p: finite(target.log_likelihood(p)))
     first, key = jax.random.split(key)
     position = jax.random.normal(first, (particles, target.dimension))
     zero = jnp.zeros((), position.dtype)
     begin = Particles(position, likelihoods(position), zero, zero, zero + 0.5, zero)
+    possible = jnp.sum(begin.likelihood > IMPOSSIBLE)
 
     def unfinished(carry) -> Bool[Array, ""]:
         index, state, _ = carry
-        return (state.temperature < 1.0) & (index < LONGEST)
+        return (state.temperature < 1.0) & (index < LONGEST) & (possible >= FEWEST)
 
     def cool(carry):
         index, state, key = carry
@@ -134,7 +140,7 @@ def _temper(target: Target, key: PRNGKeyArray, particles: int, moves: int) -> Pa
         )
         return index + 1, state, key
 
-    return jax.lax.while_loop(unfinished, cool, (0, begin, key))[1]
+    return jax.lax.while_loop(unfinished, cool, (0, begin, key))[1], possible
 
 
 def move(
@@ -150,7 +156,8 @@ def move(
     """Metropolis steps that leave prior x likelihood^temperature as it is.
 
     `scale` times the covariance's root is a step's length; it is steered to an acceptance of 0.3
-    between the steps. Returns positions, their likelihoods, the scale and the mean acceptance.
+    between the steps. No step is to where the likelihood is `IMPOSSIBLE`, not even from there.
+    Returns positions, their likelihoods, the scale and the mean acceptance.
     """
     size = position.shape[1]
     regular = covariance + 1e-6 * jnp.eye(size)
@@ -167,6 +174,8 @@ def move(
         after = likelihoods(proposed)
         ratio = density(proposed, after) - density(position, likelihood)
         accepted = jnp.log(jax.random.uniform(coin, ratio.shape, ratio.dtype)) < ratio
+        # Beside such a number the prior is lost: from one to another every step would be accepted.
+        accepted &= after > IMPOSSIBLE
         position = jnp.where(accepted[:, None], proposed, position)
         rate = jnp.mean(accepted.astype(position.dtype))
         scale = jnp.clip(scale * jnp.exp(rate - ACCEPTANCE), 1e-3, 2.0)
@@ -182,12 +191,18 @@ def finite(likelihood: Array) -> Array:
     return jnp.where(jnp.isfinite(likelihood), likelihood, IMPOSSIBLE)
 
 
-def systematic(key: PRNGKeyArray, log_weight: Float[Array, " particles"]) -> Array:
-    """Indices of resampled particles, by one uniform number (Kitagawa 1996)."""
-    count = log_weight.shape[0]
+def systematic(
+    key: PRNGKeyArray, log_weight: Float[Array, " particles"], count: int | None = None
+) -> Int[Array, " count"]:
+    """Indices of resampled particles, by one uniform number (Kitagawa 1996).
+
+    As many as asked for; where no `count` is given, as many as there are.
+    """
+    particles = log_weight.shape[0]
+    count = particles if count is None else count
     cumulative = jnp.cumsum(jax.nn.softmax(log_weight))
     points = (jax.random.uniform(key) + jnp.arange(count)) / count
-    return jnp.clip(jnp.searchsorted(cumulative, points * cumulative[-1]), 0, count - 1)
+    return jnp.clip(jnp.searchsorted(cumulative, points * cumulative[-1]), 0, particles - 1)
 
 
 def effective_share(log_weight: Float[Array, " particles"]) -> Float[Array, ""]:

@@ -1,7 +1,10 @@
 """Any map ends in a plan that passes the exact check or in one clear sentence, and soon."""
 
+import json
 import math
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +15,8 @@ from hypothesis import strategies as st
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.geometry import checked_polygon
 from palpate.planning.movable_obstacles.map import Map, Movable, Robot, map_of
+from palpate.planning.movable_obstacles.map_description import read_described
+from palpate.planning.movable_obstacles.map_svg_paths import path_outlines
 from palpate.planning.movable_obstacles.planner import Planner
 from palpate.planning.movable_obstacles.tree_search import Settings
 from palpate.planning.movable_obstacles.verification import faults_of
@@ -77,12 +82,12 @@ def built(drawn) -> Map:
 @given(maps())
 def test_any_map_ends_in_a_checked_plan_or_a_sentence(drawn):
     began = time.perf_counter()
-    world = built(drawn)
     said = None
     try:
+        world = built(drawn)  # a box that is larger than the map is refused
         plan = Planner(settings=QUICK).plan(world)
     except PalpateError as error:
-        plan, said = None, str(error)
+        world, plan, said = None, None, str(error)
     if said is not None:
         assert "\n" not in said
         assert len(said) < 400
@@ -107,7 +112,61 @@ def test_any_corners_make_a_simple_polygon_or_a_sentence(corners):
         polygon = checked_polygon(corners, "it")
     except PalpateError as error:
         polygon, said = None, str(error)
-    assert said.startswith("it ") if polygon is None else polygon.is_valid and polygon.area > 0
+    assert said.startswith("it ") if polygon is None else polygon.is_valid and polygon.area >= 1e-6
+
+
+NUMBERS = st.sampled_from(
+    ["0", "1", "-3", ".5", "1e-9", "-1e-300", "1e8", "1e9", "1e10", "1e999", "100000.1", "nan"]
+)
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.lists(st.sampled_from("MmLlHhVvZzCcQqSsTtAa") | NUMBERS, max_size=24))
+def test_any_path_has_finite_outlines_or_ends_in_a_sentence(tokens):
+    said = None
+    try:
+        outlines = path_outlines("M 1 2 " + " ".join(tokens), "it")
+    except PalpateError as error:
+        outlines, said = [], str(error)
+    assert bool(outlines) != bool(said)
+    assert all(points.shape[1:] == (2,) and np.isfinite(points).all() for points in outlines)
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.sampled_from([0, 1, -2.5, 1e-200, 1e200, 10**400, "", "90deg"]),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(["outline", "holes", "polygon", "pose", "hints", "radius", "a"]), inner
+        )
+    ),
+    max_leaves=8,
+)
+SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
+KEYS = ("name", "robot", "movables", "start", "goals", "cell_size", "margin", "bounds", "walls")
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=3))
+def test_any_description_is_a_map_or_ends_in_a_sentence(said):
+    whole = {
+        "format": "palpate map 1",
+        "robot": {"radius": 0.2},
+        "start": [1, 1],
+        "bounds": [0, 0, 4, 3],
+        "cell_size": 0.1,
+        "movables": {"a": SQUARE},
+        "walls": [{"outline": SQUARE, "holes": []}],
+    }
+    sentence = None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.json"
+        path.write_text(json.dumps(whole | said))
+        try:
+            read_described(path)
+        except PalpateError as error:
+            sentence = str(error).replace(folder, "")
+    assert sentence is None or ("\n" not in sentence and len(sentence) < 400)
 
 
 def test_a_huge_map_is_planned_or_refused_but_never_a_hang():

@@ -1,4 +1,4 @@
-"""Maps of ROS and of our own, their side-cars, and what is refused."""
+"""Maps of our own, maps in folders, and what is refused of any map."""
 
 import json
 import math
@@ -7,159 +7,68 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from PIL import Image
+from shapely import affinity
+from shapely.geometry import Polygon
 
+from namo_grids import CORNERS, room, ros_map
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.errors import PalpateError
+from palpate.planning.movable_obstacles.geometry import checked_polygon, checked_pose, shown
 from palpate.planning.movable_obstacles.map import Map, Movable, Robot
 from palpate.planning.movable_obstacles.map_description import write_map
 from palpate.planning.movable_obstacles.map_files import maps_in, read_map
-from palpate.planning.movable_obstacles.map_ros import walls_of
-
-DATA = Path(__file__).parents[3] / "shared" / "data" / "namo_scenarios"
-BESIDE = {
-    "robot": {"radius": 0.2},
-    "start": [1.0, 1.0],
-    "goals": [[3.0, 1.0, 1.5]],
-    "movables": {"crate": [[1.8, 0.8], [2.2, 0.8], [2.2, 1.2], [1.8, 1.2]]},
-}
 
 
-def ros_map(folder: Path, pixels: np.ndarray, suffix=".pgm", beside=BESIDE, **keys) -> Path:
-    """A map_server YAML of `pixels` (rows from the top) and its side-car."""
-    Image.fromarray(pixels).save(folder / f"place{suffix}")
-    said = {"image": f"place{suffix}", "resolution": 0.1, "origin": [0, 0, 0]} | keys
-    path = folder / "place.yaml"
-    path.write_text("\n".join(f"{key}: {json.dumps(value)}" for key, value in said.items()))
-    if beside is not None:
-        (folder / "place.movables.json").write_text(json.dumps(beside))
+def own_map(folder: Path, **keys) -> Path:
+    """A map of our own with other keys."""
+    said = {
+        "format": "palpate map 1",
+        "robot": {"radius": 0.2},
+        "start": [1, 1],
+        "bounds": [0, 0, 4, 2],
+        "cell_size": 0.1,
+    }
+    path = folder / "own.json"
+    path.write_text(json.dumps(said | keys))
     return path
 
 
-def room(height=20, width=40) -> np.ndarray:
-    """White, with a black border of one pixel and, from the lower left, a block of 3 x 2 pixels."""
-    pixels = np.full((height, width), 254, np.uint8)
-    pixels[[0, -1]] = pixels[:, [0, -1]] = 0
-    pixels[-5:-3, 4:7] = 0
-    return pixels
-
-
-@pytest.mark.parametrize("suffix", [".pgm", ".png"])
-def test_occupied_pixels_are_walls_with_the_origin_at_the_lower_left(tmp_path, suffix):
-    world = read_map(
-        ros_map(
-            tmp_path, room(), suffix, origin=[-1.0, 2.0, 0.0], beside=BESIDE | {"start": [0, 3]}
-        )
-    )
-    assert world.bounds == pytest.approx((-1.0, 2.0, 3.0, 4.0))
-    assert world.cell_size == world.margin == 0.1
-    block = shapely.box(-0.6, 2.3, -0.3, 2.5)
-    assert world.walls.contains(block)
-    border = 4.0 * 2.0 - 3.8 * 1.8
-    assert world.walls.area == pytest.approx(border + block.area)
-    assert world.movables["crate"].pose == pytest.approx((2.0, 1.0, 0.0))
-    assert world.goals == ((3.0, 1.0, 1.5),)
-
-
-def test_thresholds_negation_and_modes(tmp_path):
-    pixels = room()
-    pixels[5, 5] = 205  # 20 % occupied: what map_saver writes for unknown
-    area = read_map(ros_map(tmp_path, room())).walls.area
-    unknown = read_map(ros_map(tmp_path, pixels, free_thresh=0.19)).walls.area
-    assert unknown == pytest.approx(area + 0.01)
-    assert read_map(ros_map(tmp_path, pixels, free_thresh=0.25)).walls.area == pytest.approx(area)
-    negated = ros_map(tmp_path, 255 - room(), negate=1)
-    assert read_map(negated).walls.area == pytest.approx(area)
-    raw = np.where(room() == 0, 100, 0).astype(np.uint8)
-    raw[5, 5] = 255  # unknown
-    assert read_map(ros_map(tmp_path, raw, mode="raw")).walls.area == pytest.approx(area + 0.01)
-
-
-def test_colours_are_averaged_and_sixteen_bits_understood(tmp_path):
-    coloured = np.repeat(room()[..., None], 3, axis=2)
-    area = read_map(ros_map(tmp_path, room())).walls.area
-    assert read_map(ros_map(tmp_path, coloured, ".png")).walls.area == pytest.approx(area)
-    deep = room().astype(np.uint16) * 257
-    assert read_map(ros_map(tmp_path, deep, ".png")).walls.area == pytest.approx(area)
-
-
-def test_runs_of_pixels_make_the_polygons_that_the_pixels_make():
-    blocked = np.random.default_rng(3).random((13, 17)) < 0.4
-    rows, columns = np.nonzero(blocked)
-    cells = shapely.box(columns * 0.5 - 1, rows * 0.5, columns * 0.5 - 0.5, rows * 0.5 + 0.5)
-    walls = walls_of(blocked, -1.0, 0.0, 0.5)
-    assert walls.symmetric_difference(shapely.union_all(cells)).area == pytest.approx(0, abs=1e-9)
-    assert walls_of(np.zeros((3, 3), bool), 0.0, 0.0, 1.0).is_empty
-
-
 @pytest.mark.parametrize(
-    ("keys", "says"),
+    ("text", "says"),
     [
-        ({"image": "absent.pgm"}, "no file"),
-        ({"image": "place.yaml"}, "no picture"),
-        ({"resolution": "0.1 m"}, "number"),
-        ({"resolution": 0}, "m per pixel"),
-        ({"origin": [1]}, "origin"),
-        ({"origin": ["a", 2]}, "number"),
-        ({"mode": "fuzzy"}, "mode"),
-        ({"free_thresh": "low"}, "number"),
+        ("a: [1", "no plain YAML"),
+        ("!!python/object:os.system {}", "no plain YAML"),
+        ("- 1\n- 2", "expected keys and values"),
+        ("\x00", "no plain YAML"),
+        ("a: 1\n---\nb: 2", "no plain YAML"),
+        ("a: &a [*a]\nimage: 3", "alias"),
+        ("a: &a {b: 1}\nc: {<<: *a}", "alias"),
+        ("image: 3\nresolution: 0x" + 9999 * "1" + "\norigin: [0, 0]", "resolution .* number"),
+        ("image: 3\nresolution: [" + 999 * "1," + "1]\norigin: [0, 0]", "resolution .* number"),
+        ('map_yaml: "\\0"', "cannot read"),
     ],
 )
-def test_a_map_server_file_that_makes_no_sense_is_refused(tmp_path, keys, says):
-    with pytest.raises(PalpateError, match=says):
-        read_map(ros_map(tmp_path, room(), **keys))
-
-
-@pytest.mark.parametrize(
-    ("beside", "says"),
-    [
-        (None, "says nothing of the robot"),
-        ({"robot": {"radius": 0.2}}, "says nothing of the start"),
-        (BESIDE | {"robots": 3}, "unknown key 'robots'"),
-        (BESIDE | {"robot": {}}, "radius or a footprint"),
-        (BESIDE | {"robot": {"radius": "wide"}}, "number"),
-        (BESIDE | {"robot": {"radius": -1}}, "above 0"),
-        (BESIDE | {"robot": {"radius": 1, "drive": "legs"}}, "differential, holonomic"),
-        (BESIDE | {"movables": [1]}, "names with polygons"),
-        (BESIDE | {"movables": {"a": [[0, 0], [1, 1]]}}, "3 or more"),
-        (BESIDE | {"movables": {"a": {"shape": 3}}}, "unknown key 'shape'"),
-        (BESIDE | {"movables": {"a": {"polygon": [[0, 0], [1, 0], [0, 1]], "pose": [1]}}}, "pose"),
-        (BESIDE | {"goals": 3}, "list of"),
-        (BESIDE | {"goals": [["x", 1]]}, "goal"),
-        (BESIDE | {"start": [1, float("inf")]}, "JSON|start"),
-    ],
-)
-def test_a_side_car_that_makes_no_sense_is_refused(tmp_path, beside, says):
-    with pytest.raises(PalpateError, match=says):
-        read_map(ros_map(tmp_path, room(), beside=beside))
-
-
-def test_a_side_car_may_be_yaml_and_give_a_footprint(tmp_path):
-    path = ros_map(tmp_path, room(), beside=None)
-    (tmp_path / "place.movables.yaml").write_text(
-        "robot:\n  footprint: [[-0.3, -0.1], [0.3, -0.1], [0.3, 0.1], [-0.3, 0.1]]\n"
-        "  drive: holonomic\n"
-        "start: [1, 1, 0.5]\nmovables:\n  cart:\n    polygon: [[0, 0], [0.4, 0], [0.4, 0.2]]\n"
-        "    pose: [2, 1, 0.3]\n    hints: {wheels: 2}\n"
-    )
-    world = read_map(path)
-    assert world.robot.radius == pytest.approx(math.hypot(0.3, 0.1))
-    assert world.robot.drive == "holonomic"
-    assert world.movables["cart"].pose == (2.0, 1.0, 0.3)
-    assert world.movables["cart"].hints == {"wheels": 2}
-    assert world.goals == ()
-    with pytest.raises(PalpateError, match="has no goal"):
-        world.check()
-
-
-@pytest.mark.parametrize(
-    "text", ["a: [1", "!!python/object:os.system {}", "- 1\n- 2", "\x00", "a: &a [*a]\nimage: 3"]
-)
-def test_yaml_that_is_no_plain_map_is_refused(tmp_path, text):
+def test_yaml_that_is_no_plain_map_is_refused(tmp_path, text, says):
     path = tmp_path / "map.yaml"
     path.write_text(text)
-    with pytest.raises(PalpateError):
+    with pytest.raises(PalpateError, match=says) as caught:
         read_map(path)
+    assert len(str(caught.value)) < 400
+
+
+def test_aliases_do_not_expand(tmp_path):
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join(9 * [f'*a{k - 1}'])}]" for k in range(1, 12)]
+    path = ros_map(tmp_path, room(), beside=None)
+    (tmp_path / "place.movables.yaml").write_text("\n".join([*lines, "start: *a11"]))
+    with pytest.raises(PalpateError, match="has the alias 'a0'"):
+        read_map(path)
+
+
+def test_what_a_sentence_shows_is_short():
+    for value in ("x" * 999, [1] * 999, {str(k): k for k in range(999)}, 10**400, 10**9999):
+        assert len(shown(value)) < 100
+    assert shown("box") == "'box'"
 
 
 def test_a_map_is_written_and_read_back(tmp_path):
@@ -176,6 +85,108 @@ def test_a_map_is_written_and_read_back(tmp_path):
         same = again.movables[name]
         assert same.polygon.symmetric_difference(movable.polygon).area < 1e-9
         assert dict(same.hints) == dict(movable.hints)
+
+
+@pytest.mark.parametrize(
+    ("corners", "pose"),
+    [
+        ([[0, 0], [0.6, 0], [0.6, 0.2], [0, 0.2]], [2.0, 1.0, 0.0]),
+        ([[0.1, -0.1], [0.5, -0.1], [0.5, 0.3]], [1.5, 0.7, 2.0]),
+    ],
+)
+def test_a_polygon_with_a_pose_is_put_there_by_its_own_origin(tmp_path, corners, pose):
+    world = read_map(own_map(tmp_path, movables={"a": {"polygon": corners, "pose": pose}}))
+    turned = affinity.rotate(shapely.Polygon(corners), pose[2], origin=(0, 0), use_radians=True)
+    expected = affinity.translate(turned, *pose[:2])
+    movable = world.movables["a"]
+    assert movable.polygon.symmetric_difference(expected).area < 1e-12
+    assert movable.pose[:2] == pytest.approx(expected.centroid.coords[0])
+    assert Polygon(movable.outline).centroid.coords[0] == pytest.approx((0, 0))
+
+
+def test_what_is_written_is_read_back_exactly(tmp_path):
+    generator = np.random.default_rng(5)
+    movables = {}
+    for k in range(30):
+        corners = shapely.MultiPoint(generator.uniform(0, 3, (8, 2))).convex_hull.exterior.coords
+        movable = Movable.from_corners(f"m{k}", corners[:-1])
+        movables[f"m{k}"] = movable.moved(generator.uniform(0, 3, 3))
+    world = Map(**{**vars(two_rooms({}, size=(9.0, 9.0))), "movables": movables})
+    write_map(tmp_path / "map.json", world)
+    again = read_map(tmp_path / "map.json")
+    for name, movable in movables.items():
+        assert again.movables[name].pose == movable.pose
+        np.testing.assert_array_equal(again.movables[name].outline, movable.outline)
+
+
+def test_slivers_of_walls_do_not_keep_a_map_from_being_read_back(tmp_path):
+    speck = shapely.box(1, 1, 1.0005, 1.0005)
+    pierced = shapely.box(2, 1, 3, 2) - shapely.box(2.5, 1.5, 2.5005, 1.5005)
+    world = two_rooms({}, extra=(speck, pierced))
+    write_map(tmp_path / "map.json", world)
+    again = read_map(tmp_path / "map.json").walls
+    assert again.symmetric_difference(world.walls).area < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"walls": [{"outline": CORNERS, "holes": 3}]}, "holes that are no list"),
+        ({"walls": 3}, "no list of outlines"),
+        ({"walls": [[[0, 0], [1e-4, 0], [0, 1e-4]]]}, "area of 5e-09 .* 1 square mm"),
+        ({"movables": {"a": {"hints": {}}}}, "lacks its polygon"),
+        ({"movables": []}, "movables of .* of type list"),
+        ({"movables": {"a": {"polygon": CORNERS, "pose": [10**400, 0]}}}, "pose"),
+        ({"bounds": [0, 0, 10**400, 1]}, "number"),
+        ({"bounds": [0, 0, 1e9, 1e9]}, "within 100 km"),
+        ({"name": 3}, "name 3"),
+        ({"robot": {"radius": 1, "drive": "x" * 9999}}, "drive"),
+        ({"x" * 9999: 1}, "unknown key"),
+    ],
+)
+def test_a_map_of_our_own_that_makes_no_sense_is_refused(tmp_path, keys, says):
+    assert read_map(own_map(tmp_path)).start == (1.0, 1.0, 0.0)
+    with pytest.raises(PalpateError, match=says) as caught:
+        read_map(own_map(tmp_path, **keys))
+    assert len(str(caught.value)) < 400
+
+
+def test_a_movable_larger_than_the_map_is_refused(tmp_path):
+    in_mm = [[1000, 800], [1400, 800], [1400, 1200], [1000, 1200]]
+    with pytest.raises(PalpateError, match=r"'a' takes 400 m x 400 m .* corners in m"):
+        read_map(own_map(tmp_path, movables={"a": in_mm}))
+    with pytest.raises(PalpateError, match="movable 'a' takes"):
+        read_map(own_map(tmp_path, movables={"a": [[1, -1], [1.2, -1], [1.2, 1.5], [1, 1.5]]}))
+    along = {"polygon": [[-0.1, -1.5], [0.1, -1.5], [0.1, 1.5], [-0.1, 1.5]], "pose": [2, 1, 1.57]}
+    assert "a" in read_map(own_map(tmp_path, movables={"a": along})).movables
+
+
+def test_an_outline_is_closed_only_by_the_same_corner():
+    far = np.array([[0, 0], [1, 0], [1, 1], [0, 0.5]]) + 9e4
+    assert len(checked_polygon(far, "it").exterior.coords) == 5
+    near = [[0, 0], [1, 0], [1, 1], [1e-10, 0]]
+    assert len(checked_polygon(near, "it").exterior.coords) == 4
+
+
+@pytest.mark.parametrize("pose", [[10**400, 1], "here", [1], None, {"x": 1}, "x" * 9999])
+def test_what_is_no_pose_is_refused(pose):
+    with pytest.raises(PalpateError, match=r"it is .*: expected x and y") as caught:
+        checked_pose(pose, "it")
+    assert len(str(caught.value)) < 200
+
+
+def test_a_file_that_cannot_be_read_is_left_to_its_own_trial(tmp_path):
+    write_map(tmp_path / "own.json", two_rooms({}))
+    (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "two.yaml").write_text("a: 1\n---\nb: 2")
+    (tmp_path / "tagged.yaml").write_text("!!python/object:os.system {}")
+    (tmp_path / "large.yml").write_bytes(b" " * 5_000_001)
+    (tmp_path / "gone.svg").symlink_to(tmp_path / "absent.svg")
+    names = [path.name for path in maps_in(tmp_path)]
+    assert names == ["large.yml", "own.json", "tagged.yaml", "two.yaml"]
+    for name in set(names) - {"own.json"}:
+        with pytest.raises(PalpateError):
+            read_map(tmp_path / name)
 
 
 def test_a_folder_gives_maps_but_not_their_parts(tmp_path):
@@ -197,18 +208,6 @@ def test_a_file_of_another_kind_is_refused(tmp_path, name, says):
     (tmp_path / "a.txt").write_text("")
     with pytest.raises(PalpateError, match=says):
         read_map(tmp_path / name)
-
-
-@pytest.mark.skipif(not DATA.is_dir(), reason="the scenarios are not in this checkout")
-def test_namosims_ros_map_with_its_layered_drawing_is_read():
-    paths = maps_in(DATA)
-    assert [path.name for path in paths if path.parent.name == "citi_ing"] == ["namo.yaml"]
-    world = read_map(DATA / "citi_ing" / "namo.yaml")
-    assert world.bounds == pytest.approx((0, 0, 10.75, 12.1))
-    assert sorted(world.movables) == ["box_0", "box_0-6"]
-    assert world.movables["box_0"].pose[:2] == pytest.approx((6.3, 5.95), abs=0.05)
-    assert len(world.goals) == 1
-    world.check()
 
 
 # --- impossible places ------------------------------------------------------------------------
@@ -235,7 +234,9 @@ def test_impossible_places_are_said(changes, says):
     [
         ({"cell": 0.0}, "cells of"),
         ({"cell": math.nan}, "cells of"),
-        ({"cell": 1e-5}, "at most 4,000,000"),
+        ({"cell": 1e-5}, "cells of"),
+        ({"cell": 1e200}, "cells of"),
+        ({"cell": 1e-3}, "at most 4,000,000"),
         ({"margin": -0.1}, "margin"),
         ({"size": (0.0, 3.0)}, "bounds"),
         ({"radius": math.inf}, "radius"),

@@ -4,8 +4,8 @@ Outlines are (points, 2) arrays in metres without the first point repeated. A po
 and theta in radians; an outline in body coordinates has its centroid at the origin.
 """
 
-import math
-from collections.abc import Sequence
+import reprlib
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import shapely
@@ -16,26 +16,45 @@ from shapely.validation import explain_validity
 from palpate.errors import PalpateError
 
 MOST_POINTS = 20_000  # of one outline: a drawing has hundreds
-_LARGEST = 1e5  # m: what lies farther out is a broken file, not a room
+LARGEST = 1e5  # m: what lies farther out is a broken file, not a room
+LEAST_AREA = 1e-6  # m2: less is a slip of the pen, not a body
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 60
+
+
+def shown(value: object) -> str:
+    """What a file gave, for a sentence: as `repr`, but never longer than that sentence."""
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python prints no integers of thousands of digits
+        return f"a huge {type(value).__name__}"
+
+
+def listed(names: Iterable[str], most: int = 8) -> str:
+    """Names for a sentence, the first few of them."""
+    every = list(names)
+    more = f" and {len(every) - most} more" if len(every) > most else ""
+    return (", ".join(shown(name).strip("'") for name in every[:most]) or "none") + more
 
 
 def checked_polygon(points: object, what: str) -> Polygon:
     """A polygon from corner points (points, 2) in metres; `what` is what errors call it.
 
-    Raises `PalpateError` for fewer than three corners, NaN, corners farther than 100 km away, no
-    area, and an outline that crosses itself.
+    Raises `PalpateError` for fewer than three corners, NaN, corners farther than 100 km away, an
+    area of less than a square millimetre, and an outline that crosses itself.
     """
     try:
         corners = np.asarray(points, float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise PalpateError(f"{what} is no list of corners: expected [[x, y], ...] in m") from error
     if corners.ndim != 2 or corners.shape[-1] != 2:
         raise PalpateError(f"{what} is no list of corners: expected [[x, y], ...] in m")
-    if not np.isfinite(corners).all() or np.abs(corners).max(initial=0.0) > _LARGEST:
+    if not np.isfinite(corners).all() or np.abs(corners).max(initial=0.0) > LARGEST:
         raise PalpateError(f"{what} has a corner that is no place within 100 km of the origin")
     if len(corners) > MOST_POINTS:
         raise PalpateError(f"{what} has {len(corners)} corners: expected at most {MOST_POINTS}")
-    if len(corners) > 1 and np.allclose(corners[0], corners[-1], atol=1e-9):
+    if len(corners) > 1 and np.allclose(corners[0], corners[-1], rtol=0, atol=1e-9):
         corners = corners[:-1]
     if len(corners) > 1:  # a corner that is given twice says nothing
         corners = corners[np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1) > 1e-9]
@@ -47,8 +66,11 @@ def checked_polygon(points: object, what: str) -> Polygon:
             f"{what} is no simple polygon ({explain_validity(polygon)}): "
             "expected an outline that does not cross itself"
         )
-    if polygon.area < 1e-10:
-        raise PalpateError(f"{what} has no area: expected a polygon of at least 1 square mm")
+    if polygon.area < LEAST_AREA:
+        raise PalpateError(
+            f"{what} has an area of {polygon.area:.2g} square m: expected a polygon of at least "
+            "1 square mm"
+        )
     return shapely.geometry.polygon.orient(polygon)
 
 
@@ -59,10 +81,12 @@ def checked_pose(pose: object, what: str) -> tuple[float, float, float]:
     """
     try:
         values = [float(value) for value in np.asarray(pose, float).ravel()]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         values = []
-    if len(values) not in (2, 3) or not all(abs(value) < _LARGEST for value in values):
-        raise PalpateError(f"{what} is {pose!r}: expected x and y in m and, if given, theta in rad")
+    if len(values) not in (2, 3) or not all(abs(value) < LARGEST for value in values):
+        raise PalpateError(
+            f"{what} is {shown(pose)}: expected x and y in m and, if given, theta in rad"
+        )
     x, y, *theta = values
     return x, y, theta[0] if theta else 0.0
 
@@ -86,11 +110,6 @@ def placed(outline: np.ndarray, pose: np.ndarray | Sequence[float]) -> np.ndarra
     return np.stack(
         [pose[..., :1] + cos * x - sin * y, pose[..., 1:2] + sin * x + cos * y], axis=-1
     )
-
-
-def wrapped(angle: float) -> float:
-    """The same angle in (-pi, pi]."""
-    return math.atan2(math.sin(angle), math.cos(angle))
 
 
 def circumscribed_radius(outline: np.ndarray) -> float:

@@ -18,18 +18,22 @@ from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.geometry import (
+    LARGEST,
     centred,
     checked_polygon,
     checked_pose,
     circumscribed_radius,
     edges_of,
+    listed,
     placed,
+    shown,
 )
 
 Pose = tuple[float, float, float]
 DRIVES = ("differential", "holonomic")
 MOST_CELLS = 4_000_000
 MOST_MOVABLES = 2_000
+LEAST_CELL, LARGEST_CELL = 1e-4, 100.0  # m
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +57,7 @@ class Movable:
 
         Raises `PalpateError` as `checked_polygon`.
         """
-        outline, (x, y) = centred(checked_polygon(corners, f"movable '{name}'"))
+        outline, (x, y) = centred(checked_polygon(corners, f"movable {shown(name)}"))
         return Movable(name, outline, (x, y, 0.0), dict(hints or {}))
 
     @cached_property
@@ -95,7 +99,7 @@ class Robot:
             raise PalpateError(f"the robot's radius is {self.radius}: expected metres above 0")
         if self.drive not in DRIVES:
             raise PalpateError(
-                f"the robot's drive is {self.drive!r}: expected one of {', '.join(DRIVES)}"
+                f"the robot's drive is {shown(self.drive)}: expected one of {', '.join(DRIVES)}"
             )
         if self.reach is not None and not 0 <= self.reach < 1e3:
             raise PalpateError(f"the robot's reach is {self.reach}: expected metres, 0 or more")
@@ -109,8 +113,8 @@ class Map:
     is the clearance in m that robot and carried objects keep; `cell_size` in m is that of the
     search grid. `goals` are poses in order of preference of the file: the first is the default.
 
-    Raises `PalpateError` for sizes that are no sizes, a grid of more than 4 million cells, and
-    two movables of one name.
+    Raises `PalpateError` for sizes that are no sizes, a grid of more than 4 million cells, more
+    than 2,000 movables, and a movable that is wider or higher than the map.
     """
 
     name: str
@@ -125,32 +129,44 @@ class Map:
 
     def __post_init__(self) -> None:
         left, bottom, right, top = self.bounds
-        if not all(map(math.isfinite, self.bounds)) or left >= right or bottom >= top:
+        width, height = right - left, top - bottom
+        here = f"map {shown(self.name)}"
+        if not all(abs(side) <= LARGEST for side in self.bounds) or width <= 0 or height <= 0:
             raise PalpateError(
-                f"map '{self.name}' has the bounds {self.bounds}: expected left, bottom, right, "
-                "top in m with left below right and bottom below top"
+                f"{here} has the bounds {self.bounds}: expected left, bottom, right, top in m, "
+                "within 100 km, with left below right and bottom below top"
             )
-        if not (math.isfinite(self.cell_size) and self.cell_size > 0):
+        if not LEAST_CELL <= self.cell_size <= LARGEST_CELL:
             raise PalpateError(
-                f"map '{self.name}' has cells of {self.cell_size} m: expected a size above 0"
+                f"{here} has cells of {self.cell_size} m: expected a size of {LEAST_CELL:g} to "
+                f"{LARGEST_CELL:g} m"
             )
-        if not (math.isfinite(self.margin) and self.margin >= 0):
+        if not 0 <= self.margin < 1e3:
             raise PalpateError(
-                f"map '{self.name}' has a collision margin of {self.margin} m: expected 0 or more"
+                f"{here} has a collision margin of {self.margin} m: expected 0 or more"
             )
-        cells = (right - left) * (top - bottom) / self.cell_size**2
+        cells = width * height / self.cell_size**2
         if cells > MOST_CELLS:
-            least = math.sqrt((right - left) * (top - bottom) / MOST_CELLS)
+            least = math.sqrt(width * height / MOST_CELLS)
             raise PalpateError(
-                f"map '{self.name}' of {right - left:.4g} m x {top - bottom:.4g} m has "
-                f"{cells:.3g} cells of {self.cell_size:.3g} m: expected at most {MOST_CELLS:,}, "
-                f"that is cells of {least:.2g} m or more"
+                f"{here} of {width:.4g} m x {height:.4g} m has {cells:.3g} cells of "
+                f"{self.cell_size:.3g} m: expected at most {MOST_CELLS:,}, that is cells of "
+                f"{least:.2g} m or more"
             )
         if len(self.movables) > MOST_MOVABLES:
             raise PalpateError(
-                f"map '{self.name}' has {len(self.movables)} movables: expected at most "
-                f"{MOST_MOVABLES}"
+                f"{here} has {len(self.movables)} movables: expected at most {MOST_MOVABLES}"
             )
+        for movable in self.movables.values():
+            if 2 * movable.radius <= min(width, height):
+                continue  # it fits however it is turned
+            x_least, y_least, x_most, y_most = movable.polygon.bounds
+            if x_most - x_least > width or y_most - y_least > height:
+                raise PalpateError(
+                    f"movable {shown(movable.name)} takes {x_most - x_least:.4g} m x "
+                    f"{y_most - y_least:.4g} m where it stands, more than {here} of {width:.4g} m "
+                    f"x {height:.4g} m has: expected one that fits, with its corners in m"
+                )
 
     @cached_property
     def wall_edges(self) -> np.ndarray:
@@ -175,8 +191,8 @@ class Map:
         unknown = sorted(set(poses) - set(self.movables))
         if unknown:
             raise PalpateError(
-                f"map '{self.name}' has no movable '{unknown[0]}'; there are: "
-                + (", ".join(self.movables) or "none")
+                f"map {shown(self.name)} has no movable {shown(unknown[0])}; there are: "
+                + listed(self.movables)
             )
         movables = {
             name: movable.moved(poses[name]) if name in poses else movable
@@ -196,7 +212,8 @@ class Map:
         if goal is None:
             if not self.goals:
                 raise PalpateError(
-                    f"map '{self.name}' has no goal: give one as --goal x y theta, in m and rad"
+                    f"map {shown(self.name)} has no goal: give one as --goal x y theta, in m and "
+                    "rad"
                 )
             goal = self.goals[0]
         goal = checked_pose(goal, "the goal")
@@ -207,9 +224,10 @@ class Map:
             inside = min(x - left, right - x, y - bottom, top - y)
             if inside < radius:
                 raise PalpateError(
-                    f"the robot of radius {radius:.3g} m would not be inside map '{self.name}' at "
-                    f"its {place} ({x:.3g}, {y:.3g}): expected a place at least that far inside "
-                    f"x {left:.3g} to {right:.3g}, y {bottom:.3g} to {top:.3g}"
+                    f"the robot of radius {radius:.3g} m would not be inside map "
+                    f"{shown(self.name)} at its {place} ({x:.3g}, {y:.3g}): expected a place at "
+                    f"least that far inside x {left:.3g} to {right:.3g}, y {bottom:.3g} to "
+                    f"{top:.3g}"
                 )
             to_wall = shapely.distance(self.walls, shapely.Point(x, y))
             if to_wall < radius:  # NaN where there are no walls
@@ -221,8 +239,8 @@ class Map:
             gap = movable.polygon.distance(shapely.Point(*self.start[:2]))
             if gap < radius - 1e-9:
                 raise PalpateError(
-                    f"the robot of radius {radius:.3g} m collides with '{movable.name}' at its "
-                    f"start ({gap:.3g} m from its centre): expected a free start"
+                    f"the robot of radius {radius:.3g} m collides with {shown(movable.name)} "
+                    f"at its start ({gap:.3g} m from its centre): expected a free start"
                 )
         return goal
 
@@ -246,7 +264,10 @@ def map_of(
     named: dict[str, Movable] = {}
     for movable in movables:
         if movable.name in named:
-            raise PalpateError(f"map '{name}' has two movables named '{movable.name}'")
+            raise PalpateError(
+                f"map {shown(name)} has two movables named {shown(movable.name)}: expected names "
+                "that differ"
+            )
         named[movable.name] = movable
     return Map(
         name,

@@ -1,14 +1,26 @@
 """Robot, objects, start and goals as JSON or YAML says them: our own maps and side-car files.
 
-A map file holds everything; a side-car `NAME.movables.json` (or .yaml) beside a drawing or an
-occupancy grid adds what that cannot say. Keys, all but `robot` optional in a side-car:
+A map file holds everything; a side-car `NAME.movables.json` (or .yaml) adds what a drawing or an
+occupancy grid cannot say. Every other key than these is refused:
 
-    robot:     {radius} or {footprint: [[x, y], ...]}, drive, reach
-    movables:  {name: [[x, y], ...]} or {name: {polygon: ..., pose: ..., hints: {...}}}
-    start, goals, cell_size, margin, bounds
+    a map of our own    format, robot, start, bounds, cell_size; maybe name, movables, goals,
+                        margin, walls
+    beside a grid       robot, start; maybe movables, goals, margin, cell_size
+    beside a drawing    movables, and of them only hints: {name: {hints: {...}}}
+
+    robot:     {radius} or {footprint: [[x, y], ...]}; maybe drive, reach
+    movables:  {name: [[x, y], ...]} or {name: {polygon: [[x, y], ...]}}, maybe with pose, hints
+    start, each of goals, pose:  [x, y, theta]
+    bounds:    [left, bottom, right, top]
     walls:     [[[x, y], ...], ...], each an outline or {outline, holes}
+
+A polygon is in the world; one with a `pose` is in body coordinates, whose origin is put at x, y and
+which are turned by theta, wherever the centroid is.
 """
 
+import contextlib
+import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,19 +31,27 @@ from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.geometry import (
+    LEAST_AREA,
+    centred,
     checked_polygon,
     checked_pose,
     circumscribed_radius,
     corners_of,
+    listed,
+    placed,
+    shown,
 )
-from palpate.planning.movable_obstacles.map import Map, Movable, Robot, map_of
+from palpate.planning.movable_obstacles.map import Map, Movable, Pose, Robot, map_of
 from palpate.storage import read_json, write_json
 
 FORMAT = "palpate map 1"
 SIDE_CAR = ".movables"
 _LARGEST = 5_000_000  # bytes of YAML
-_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin", "bounds", "walls"}
-_MAP_KEYS = _KEYS | {"format", "name"}
+_DEEPEST = 50  # collections in collections
+GRID_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin"}
+_MAP_KEYS = GRID_KEYS | {"bounds", "walls", "format", "name"}
+_DRAWING_KEYS = {"movables"}
+_CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
 
 
 def read_described(path: str | Path) -> Map:
@@ -40,7 +60,7 @@ def read_described(path: str | Path) -> Map:
     content = checked_keys(read_json(path), str(path), _MAP_KEYS)
     if content.get("format") != FORMAT:
         raise PalpateError(
-            f"{path} has the format {content.get('format')!r}: expected {FORMAT!r}, as "
+            f"{path} has the format {shown(content.get('format'))}: expected {FORMAT!r}, as "
             "`write_map` writes it"
         )
     for key in ("robot", "start", "bounds", "cell_size"):
@@ -49,8 +69,11 @@ def read_described(path: str | Path) -> Map:
     walls = content.get("walls", [])
     if not isinstance(walls, list):
         raise PalpateError(f"{path} has walls that are no list of outlines")
+    name = content.get("name", path.stem)
+    if not isinstance(name, str):
+        raise PalpateError(f"{path} has the name {shown(name)}: expected a text")
     return map_of(
-        str(content.get("name", path.stem)),
+        name,
         walls=shapely.union_all([_wall(wall, f"wall {k}") for k, wall in enumerate(walls)]),
         movables=movables_from(content.get("movables", {}), str(path)),
         robot=robot_from(content["robot"], str(path)),
@@ -65,7 +88,8 @@ def read_described(path: str | Path) -> Map:
 def write_map(path: str | Path, world: Map) -> None:
     """Put a map into a JSON file that `read_described` reads back.
 
-    Objects are written as outlines about their centroids, with their poses.
+    Objects are written as outlines about their centroids, with their poses; pieces of walls and
+    holes in them of less than a square millimetre, which no reader takes, are left out.
     """
     robot: dict[str, Any] = {"radius": world.robot.radius, "drive": world.robot.drive}
     if world.robot.reach is not None:
@@ -73,10 +97,14 @@ def write_map(path: str | Path, world: Map) -> None:
     walls = [
         {
             "outline": np.asarray(part.exterior.coords)[:-1],
-            "holes": [np.asarray(hole.coords)[:-1] for hole in part.interiors],
+            "holes": [
+                np.asarray(hole.coords)[:-1]
+                for hole in part.interiors
+                if shapely.Polygon(hole).area >= LEAST_AREA
+            ],
         }
         for part in shapely.get_parts(world.walls)
-        if not part.is_empty
+        if part.area >= LEAST_AREA
     ]
     movables = {
         name: {"polygon": movable.outline, "pose": movable.pose, "hints": dict(movable.hints)}
@@ -99,30 +127,77 @@ def write_map(path: str | Path, world: Map) -> None:
     )
 
 
-def side_car(path: Path) -> dict[str, Any]:
-    """What stands beside a map's file, as `NAME.movables.json` or .yaml; empty if nothing does."""
-    for suffix in (".json", ".yaml", ".yml"):
-        beside = path.with_name(path.stem + SIDE_CAR + suffix)
-        if beside.exists():
-            content = read_json(beside) if suffix == ".json" else read_yaml(beside)
-            return checked_keys(content, str(beside), _KEYS)
-    return {}
+def side_car(path: Path, known: set[str]) -> dict[str, Any]:
+    """What stands beside a map's file, as `NAME.movables.json` or .yaml; empty if nothing does.
+
+    Raises `PalpateError` for two of them, and for other keys than `known`.
+    """
+    suffixes = (".json", ".yaml", ".yml")
+    every = [path.with_name(path.stem + SIDE_CAR + suffix) for suffix in suffixes]
+    found = [beside for beside in every if beside.exists()]
+    if len(found) > 1:
+        raise PalpateError(f"{found[0]} and {found[1]} are of the same map: expected one of them")
+    if not found:
+        return {}
+    beside = found[0]
+    content = read_json(beside) if beside.suffix == ".json" else read_yaml(beside)
+    return checked_keys(content, str(beside), known)
+
+
+def with_hints(world: Map, path: Path) -> Map:
+    """A drawing's map with what the side-car of its file says of the objects' dynamics.
+
+    Raises `PalpateError` for a side-car that says anything else, and for hints on an object that
+    is not on the map.
+    """
+    what = f"the side-car of {path}"
+    given = _mapping(side_car(path, _DRAWING_KEYS).get("movables", {}), f"movables in {what}")
+    movables = dict(world.movables)
+    for key, item in given.items():
+        name = str(key)
+        if name not in movables:
+            raise PalpateError(
+                f"{what} has hints for {shown(name)}, which is not on the map; there are: "
+                + listed(world.movables)
+            )
+        said = checked_keys(item, f"movable {shown(name)} in {what}", {"hints"})
+        hints = _hints(said.get("hints"), f"hints of {shown(name)} in {what}")
+        movables[name] = dataclasses.replace(movables[name], hints=hints)
+    return dataclasses.replace(world, movables=movables)
 
 
 def read_yaml(path: Path) -> Any:
-    """The plain data of a YAML file; raises `PalpateError` for tags, and for what is no YAML."""
+    """The plain data of a YAML file; raises `PalpateError` for tags, and for what is no YAML.
+
+    Aliases are refused as well: a few lines of them stand for gigabytes.
+    """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
     try:
         content = path.read_bytes()
-    except OSError as error:
-        raise PalpateError(f"cannot read {path}: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:  # no path has a null character
+        reason = getattr(error, "strerror", None) or error
+        raise PalpateError(f"cannot read {path}: {reason}") from error
     if len(content) > _LARGEST:
         raise PalpateError(f"{path} is of {len(content)} bytes: expected at most {_LARGEST}")
     try:
+        events = YAML(typ="safe", pure=True).parse(content) if b"*" in content else ()
+        depth = 0
+        for event in events:  # before the load, which is where they grow
+            depth += isinstance(event, CollectionStartEvent)
+            depth -= isinstance(event, CollectionEndEvent)
+            if depth > _DEEPEST:
+                raise PalpateError(f"{path} is nested more than {_DEEPEST} deep")
+            if isinstance(event, AliasEvent):
+                raise PalpateError(
+                    f"{path} has the alias {shown(event.anchor)}: expected what it stands for"
+                )
         return YAML(typ="safe", pure=True).load(content)
-    except (YAMLError, ValueError, RecursionError, UnicodeDecodeError) as error:
+    except PalpateError:
+        raise
+    except (YAMLError, ValueError, LookupError, ArithmeticError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise PalpateError(f"{path} is no plain YAML: {reason}") from error
 
@@ -137,7 +212,8 @@ def checked_keys(content: Any, what: str, known: set[str]) -> dict[str, Any]:
     unknown = sorted({str(key) for key in content} - known)
     if unknown:
         raise PalpateError(
-            f"{what} has the unknown key '{unknown[0]}'; there are: {', '.join(sorted(known))}"
+            f"{what} has the unknown key {shown(unknown[0])}; there are: "
+            + ", ".join(sorted(known))
         )
     return dict(content)
 
@@ -158,30 +234,32 @@ def robot_from(content: Any, what: str) -> Robot:
 
 
 def movables_from(content: Any, what: str) -> list[Movable]:
-    """The objects that `content` describes; those without a polygon are left out."""
-    if not isinstance(content, Mapping):
-        raise PalpateError(f"movables of {what}: expected names with polygons")
+    """The objects that `content` describes; see the head of this file."""
     movables = []
-    for name, value in content.items():
-        item: Mapping[str, Any] = value if isinstance(value, Mapping) else {"polygon": value}
-        item = checked_keys(item, f"movable '{name}' of {what}", {"polygon", "pose", "hints"})
+    for key, value in _mapping(content, f"movables of {what}").items():
+        name = str(key)
+        called = f"movable {shown(name)} of {what}"
+        item: Any = value if isinstance(value, Mapping) else {"polygon": value}
+        item = checked_keys(item, called, {"polygon", "pose", "hints"})
         if "polygon" not in item:
-            continue
-        movable = Movable.from_corners(str(name), item["polygon"], item.get("hints"))
+            raise PalpateError(f"{called} lacks its polygon: expected [[x, y], ...] in m")
+        hints = _hints(item.get("hints"), f"hints of {called}")
         if "pose" in item:
-            pose = checked_pose(item["pose"], f"the pose of movable '{name}'")
-            movable = Movable(movable.name, movable.outline, pose, movable.hints)
-        movables.append(movable)
+            pose = checked_pose(item["pose"], f"the pose of {called}")
+            movables.append(_at(name, item["polygon"], pose, hints, called))
+        else:
+            movables.append(Movable.from_corners(name, item["polygon"], hints))
     return movables
 
 
-def hints_from(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What a side-car says of objects that stand in the drawing, by name."""
-    return {
-        str(name): dict(item["hints"])
-        for name, item in content.get("movables", {}).items()
-        if isinstance(item, Mapping) and isinstance(item.get("hints"), Mapping)
-    }
+def _at(name: str, corners: Any, pose: Pose, hints: dict[str, Any], what: str) -> Movable:
+    """An object from corners in body coordinates, whose origin is put at `pose`."""
+    polygon = checked_polygon(corners, what)
+    outline, centroid = centred(polygon)
+    if np.linalg.norm(centroid) <= _CENTRED:  # as `write_map` writes it: the same numbers again
+        return Movable(name, corners_of(polygon), pose, hints)
+    ((x, y),) = placed(np.array([centroid]), pose)
+    return Movable(name, outline, (float(x), float(y), pose[2]), hints)
 
 
 def goals_from(content: Any, what: str) -> list[Any]:
@@ -193,9 +271,29 @@ def goals_from(content: Any, what: str) -> list[Any]:
 
 def number(value: Any, what: str) -> float:
     """A finite number; raises `PalpateError` for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise PalpateError(f"{what} is {value!r}: expected a number")
-    return float(value)
+    found = math.nan
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
+            found = float(value)
+    if not math.isfinite(found):
+        raise PalpateError(f"{what} is {shown(value)}: expected a number")
+    return found
+
+
+def _mapping(content: Any, what: str) -> Mapping[Any, Any]:
+    if not isinstance(content, Mapping):
+        raise PalpateError(
+            f"{what} are of type {type(content).__name__}: expected names with polygons or hints"
+        )
+    return content
+
+
+def _hints(content: Any, what: str) -> dict[str, Any]:
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise PalpateError(f"{what} are {shown(content)}: expected keys and values")
+    return dict(content)
 
 
 def _bounds(value: Any, what: str) -> tuple[float, float, float, float]:
@@ -209,5 +307,8 @@ def _wall(value: Any, what: str) -> BaseGeometry:
     item = value if isinstance(value, Mapping) else {"outline": value}
     item = checked_keys(item, what, {"outline", "holes"})
     outline = checked_polygon(item.get("outline", []), what)
-    holes = [checked_polygon(hole, f"a hole of {what}") for hole in item.get("holes", [])]
-    return outline.difference(shapely.union_all(holes)) if holes else outline
+    holes = item.get("holes", [])
+    if not isinstance(holes, list):
+        raise PalpateError(f"{what} has holes that are no list of outlines")
+    every = [checked_polygon(hole, f"a hole of {what}") for hole in holes]
+    return outline.difference(shapely.union_all(every)) if every else outline

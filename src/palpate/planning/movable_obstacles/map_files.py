@@ -1,16 +1,14 @@
 """Maps by their file: namosim SVG, ROS map_server YAML, or our own JSON."""
 
-import dataclasses
 from pathlib import Path
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.map import Map
 from palpate.planning.movable_obstacles.map_description import (
     SIDE_CAR,
-    hints_from,
     read_described,
     read_yaml,
-    side_car,
+    with_hints,
 )
 from palpate.planning.movable_obstacles.map_ros import read_ros
 from palpate.planning.movable_obstacles.map_svg import read_svg
@@ -21,8 +19,8 @@ SUFFIXES = (".svg", ".yaml", ".yml", ".json")
 def read_map(path: str | Path) -> Map:
     """The map in a file; its suffix says of which kind.
 
-    A side-car `NAME.movables.json` beside a drawing gives objects hints about their dynamics.
-    Raises `PalpateError` for another suffix and for a file that is no such map.
+    Side-cars `NAME.movables.json` are read as the head of `map_description` says. Raises
+    `PalpateError` for another suffix and for a file that is no such map.
     """
     path = Path(path)
     if path.is_dir():
@@ -30,13 +28,7 @@ def read_map(path: str | Path) -> Map:
     if not path.exists():
         raise PalpateError(f"there is no file {path}")
     if path.suffix == ".svg":
-        world = read_svg(path)
-        hints = hints_from(side_car(path))
-        movables = {
-            name: dataclasses.replace(movable, hints=hints.get(name, {}))
-            for name, movable in world.movables.items()
-        }
-        return dataclasses.replace(world, movables=movables)
+        return with_hints(read_svg(path), path)
     if path.suffix in (".yaml", ".yml"):
         return read_ros(path)
     if path.suffix == ".json":
@@ -47,8 +39,9 @@ def read_map(path: str | Path) -> Map:
 def maps_in(folder: str | Path) -> list[Path]:
     """The files in a folder and below it that are maps of their own, in order of their names.
 
-    Side-cars, and the maps and drawings that a namosim YAML puts together, are none. Raises
-    `PalpateError` for no folder, and for one without maps.
+    Side-cars, and the maps and drawings that a namosim YAML puts together, are none. A YAML that
+    cannot be read stays in the list, for whoever reads it to be told why. Raises `PalpateError` for
+    no folder, and for one without maps.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -56,12 +49,15 @@ def maps_in(folder: str | Path) -> list[Path]:
     found = [
         path
         for path in sorted(folder.rglob("*"))
-        if path.suffix in SUFFIXES and not path.stem.endswith(SIDE_CAR)
+        if path.suffix in SUFFIXES and not path.stem.endswith(SIDE_CAR) and path.is_file()
     ]
     parts: set[Path] = set()
     for path in found:
         if path.suffix in (".yaml", ".yml"):
-            content = read_yaml(path)
+            try:
+                content = read_yaml(path)
+            except PalpateError:
+                continue
             if isinstance(content, dict):
                 named = [content.get("map_yaml"), content.get("svg_file")]
                 parts |= {path.parent / str(name) for name in named if name is not None}

@@ -2,11 +2,13 @@
 
 p = (255 - v) / 255 is how occupied a pixel is, p = v / 255 where `negate` is set; above
 `occupied_thresh` it is a wall, below `free_thresh` it is free, and what lies between is unknown: as
-a wall to a planner. The origin is the lower left corner; its yaw is passed over, as most readers
-do. Robot, objects, start and goals come from a side-car file (`map_description`), or from
-namosim's `namo.yaml` and the layers of the drawing it names.
+a wall to a planner. The origin is the lower left corner; its yaw has to be 0. Robot, objects, start
+and goals come from a side-car file (`map_description`), or from namosim's `namo.yaml` and the
+layers of the drawing it names, which lies on the picture pixel by pixel.
 """
 
+import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +17,30 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.map import MOST_CELLS, Map, Robot, map_of
+from palpate.planning.movable_obstacles.geometry import checked_pose, shown
+from palpate.planning.movable_obstacles.map import MOST_CELLS, Map, Pose, Robot, map_of
 from palpate.planning.movable_obstacles.map_description import (
+    GRID_KEYS,
     goals_from,
     movables_from,
     number,
     read_yaml,
     robot_from,
     side_car,
+    with_hints,
 )
-from palpate.planning.movable_obstacles.map_svg import goals_of, movables_of, read_drawing
+from palpate.planning.movable_obstacles.map_svg import (
+    drawn_walls,
+    goals_of,
+    movables_of,
+    read_drawing,
+)
 
 MODES = ("trinary", "scale", "raw")
+_BROKEN = (OSError, ValueError, SyntaxError)  # what Pillow raises for the middle of a picture
 _THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.25}
+_TRUTHS = {"yes": True, "on": True, "true": True, "no": False, "off": False, "false": False}
+_LEAST_YAW = 1e-3  # rad: less turns a map of 10 m by a centimetre
 Bounds = tuple[float, float, float, float]
 
 
@@ -44,7 +57,7 @@ def read_ros(path: str | Path) -> Map:
     if "map_yaml" in content:
         return _namosim(path, content)
     walls, bounds, resolution = read_grid(path, content)
-    beside = side_car(path)
+    beside = side_car(path, GRID_KEYS)
     for key in ("robot", "start"):
         if key not in beside:
             raise PalpateError(
@@ -78,11 +91,17 @@ def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds
         raise PalpateError(f"{path} has the resolution {resolution}: expected m per pixel")
     origin = content["origin"]
     if not isinstance(origin, list) or len(origin) not in (2, 3):
-        raise PalpateError(f"{path} has the origin {origin!r}: expected [x, y, yaw]")
-    left, bottom = (number(value, f"origin of {path}") for value in origin[:2])
+        raise PalpateError(f"{path} has the origin {shown(origin)}: expected [x, y, yaw]")
+    left, bottom, *yaw = (number(value, f"origin of {path}") for value in origin)
+    if yaw and abs(yaw[0]) > _LEAST_YAW:
+        raise PalpateError(
+            f"{path} has an origin with a yaw of {yaw[0]:g}: expected 0, and a picture that is "
+            "turned instead"
+        )
     mode = content.get("mode", "trinary")
     if mode not in MODES:
-        raise PalpateError(f"{path} has the mode {mode!r}: expected one of {', '.join(MODES)}")
+        raise PalpateError(f"{path} has the mode {shown(mode)}: expected one of {', '.join(MODES)}")
+    negate = _truth(content.get("negate", 0), f"negate of {path}")
     occupied, free = (
         number(content.get(key, default), f"{key} of {path}")
         for key, default in _THRESHOLDS.items()
@@ -92,11 +111,20 @@ def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds
         share = value / 100  # 0 to 100, and 255 for unknown
         blocked = (share > free) | (share >= occupied)
     else:
-        share = value / 255 if content.get("negate", 0) else (255 - value) / 255
-        blocked = ~(share < free)
+        share = value / 255 if negate else (255 - value) / 255
+        blocked = (share >= occupied) | ~(share < free)
     height, width = blocked.shape
     bounds = (left, bottom, left + width * resolution, bottom + height * resolution)
     return walls_of(blocked[::-1], left, bottom, resolution), bounds, resolution
+
+
+def _truth(value: Any, what: str) -> bool:
+    """0, 1, true or false; also the words that are truths in YAML 1.1 and strings in YAML 1.2."""
+    if isinstance(value, str) and value.lower() in _TRUTHS:
+        return _TRUTHS[value.lower()]
+    if isinstance(value, bool | int) and value in (0, 1):
+        return bool(value)
+    raise PalpateError(f"{what} is {shown(value)}: expected 0, 1, true or false")
 
 
 def walls_of(blocked: np.ndarray, left: float, bottom: float, resolution: float) -> BaseGeometry:
@@ -125,7 +153,10 @@ def _picture(path: Path) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as picture:
+        with warnings.catch_warnings():  # what is too large is said below
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            opened = Image.open(path)
+        with opened as picture:
             width, height = picture.size
             if width * height > MOST_CELLS:
                 raise PalpateError(
@@ -133,9 +164,11 @@ def _picture(path: Path) -> np.ndarray:
                 )
             deep = picture.mode.startswith("I")
             values = np.asarray(picture if deep or picture.mode == "L" else picture.convert("RGB"))
+    except PalpateError:
+        raise
     except FileNotFoundError as error:
         raise PalpateError(f"there is no file {path}, which a map names as its image") from error
-    except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
+    except (UnidentifiedImageError, *_BROKEN, Image.DecompressionBombError) as error:
         raise PalpateError(f"{path} is no picture that can be read: expected PGM or PNG") from error
     values = values.astype(float)
     if values.ndim == 3:
@@ -144,34 +177,59 @@ def _picture(path: Path) -> np.ndarray:
 
 
 def _namosim(path: Path, content: dict[str, Any]) -> Map:
-    """namosim's own YAML: a map, a drawing over it in pixels, agents."""
+    """namosim's own YAML: a map, a drawing over it in pixels, agents; the first is the robot."""
     grid = path.parent / str(content["map_yaml"])
     described = read_yaml(grid)
     if not isinstance(described, dict):
         raise PalpateError(f"{grid} is no map: expected keys and values")
     walls, bounds, resolution = read_grid(grid, described)
     agents = content.get("agents")
-    if not isinstance(agents, list) or not agents or not isinstance(agents[0], dict):
+    if not isinstance(agents, list) or not agents:
         raise PalpateError(f"{path} has no agents: expected one with an id and a radius")
-    agent = agents[0]
-    if "initial_pose" not in agent or "radius" not in agent:
-        raise PalpateError(f"{path} has an agent without initial_pose and radius")
+    (robot, start), *others = (_agent(agent, str(path)) for agent in agents)
+    besides = [shapely.Point(pose[:2]).buffer(other.radius) for other, pose in others]
     movables, goals = [], []
     if "svg_file" in content:
-        drawing = read_drawing(path.parent / str(content["svg_file"]), resolution)
-        movables, goals = movables_of(drawing), goals_of(drawing)
-    behaviour = agent.get("behavior") or {}
-    drive = (behaviour.get("parameters") or {}).get("drive_type", "differential")
-    x, y, *degrees = (number(value, f"initial_pose in {path}") for value in agent["initial_pose"])
+        corner = bounds[0], bounds[3]
+        drawing = read_drawing(path.parent / str(content["svg_file"]), resolution, corner)
+        movables, goals = movables_of(drawing), goals_of(drawing, str(agents[0]["id"]))
+        besides = [*besides, *drawn_walls(drawing)]
     margin = content.get("collision_margin")
-    return map_of(
+    world = map_of(
         grid.stem,
-        walls=walls,
+        walls=shapely.union_all([walls, *besides]) if besides else walls,
         movables=movables,
-        robot=Robot(number(agent["radius"], f"radius in {path}"), str(drive)),
-        start=(x, y, np.radians(degrees[0]) if degrees else 0.0),
+        robot=robot,
+        start=start,
         goals=goals,
         bounds=bounds,
         cell_size=resolution,
         margin=None if margin is None else number(margin, f"collision_margin in {path}"),
     )
+    return with_hints(world, path)
+
+
+def _agent(content: Any, what: str) -> tuple[Robot, Pose]:
+    """An agent of namosim's YAML, and where it stands; its angles are degrees."""
+    if not isinstance(content, dict) or not {"id", "initial_pose", "radius"} <= content.keys():
+        raise PalpateError(f"{what} has an agent without id, initial_pose and radius")
+    behaviour = _keys(content.get("behavior"), f"behavior in {what}")
+    parameters = _keys(behaviour.get("parameters"), f"parameters of the behavior in {what}")
+    drive = parameters.get("drive_type", "differential")
+    pose = content["initial_pose"]
+    if not isinstance(pose, list) or len(pose) not in (2, 3):
+        raise PalpateError(
+            f"{what} has the initial_pose {shown(pose)}: expected [x, y, angle] in m and degrees"
+        )
+    x, y, *degrees = (number(value, f"initial_pose in {what}") for value in pose)
+    theta = math.radians(degrees[0]) if degrees else 0.0
+    robot = Robot(number(content["radius"], f"radius in {what}"), str(drive))
+    return robot, checked_pose((x, y, theta), f"initial_pose in {what}")
+
+
+def _keys(content: Any, what: str) -> dict[str, Any]:
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise PalpateError(f"{what} is {shown(content)}: expected keys and values")
+    return content

@@ -9,16 +9,19 @@ from palpate.errors import PalpateError
 
 _TOKEN = re.compile(r"([MmLlHhVvZzCcQqSsTtAa])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
 _COUNTS = {"M": 2, "L": 2, "H": 1, "V": 1, "Z": 0, "C": 6, "Q": 4, "S": 4, "T": 2, "A": 7}
-_CHORDS = 12  # of a curve: within 1 % of a quarter circle's radius
+_CHORDS = 12  # of a curve or a quarter circle: within 0.3 % of its radius
 _MOST = 200_000  # characters of a path
+_LARGEST = 1e9  # of any number: then no product of them overflows
+_SMALLEST = 1e-9  # of what is no point: shorter than anything that is drawn
 _TRANSFORM = re.compile(r"(matrix|translate|scale|rotate|skewX|skewY)\s*\(([^)]*)\)")
 
 
-def path_points(d: str, what: str) -> np.ndarray:
-    """The points (points, 2) of the first closed or open outline in `d`, in the drawing's units.
+def path_outlines(d: str, what: str) -> list[np.ndarray]:
+    """The closed or open outlines in `d`, each of points (points, 2), in the drawing's units.
 
-    Understands M L H V Z C S Q T A and their relative forms. Raises `PalpateError` for anything
-    else, a path that does not begin with a move, and one that is too long.
+    Understands M L H V Z C S Q T A and their relative forms. A move that nothing is drawn after is
+    no outline, unless there is no other. Raises `PalpateError` for anything else, a path that does
+    not begin with a move, one that is too long, and numbers that are not finite.
     """
     if len(d) > _MOST:
         raise PalpateError(f"{what} has a path of {len(d)} characters: expected at most {_MOST}")
@@ -28,13 +31,14 @@ def path_points(d: str, what: str) -> np.ndarray:
             f"{what} has {rest.strip()[:20]!r} in its path: expected the commands "
             "M L H V Z C S Q T A and numbers"
         )
-    tokens = [(letter, number) for letter, number in _TOKEN.findall(d)]
+    tokens = _TOKEN.findall(d)
     if not tokens or tokens[0][0] not in ("M", "m"):
         raise PalpateError(f"{what} has a path that does not begin with M: {d[:30]!r}")
-    points: list[np.ndarray] = []
-    here = np.zeros(2)
+    outlines: list[list[np.ndarray]] = []
+    here = begin = np.zeros(2)
     handle: np.ndarray | None = None  # the last control point, for S and T
     command, position = "", 0
+    closed = False
     while position < len(tokens):
         letter = tokens[position][0]
         if letter:
@@ -43,23 +47,39 @@ def path_points(d: str, what: str) -> np.ndarray:
             raise PalpateError(f"{what} has numbers after its outline was closed")
         kind = command.upper()
         if kind == "Z":
-            break  # further outlines are not part of the body
-        if kind == "M" and points:
-            break
+            here, handle, closed = begin, None, True
+            continue
         count = _COUNTS[kind]
-        numbers = [
-            float(number) for letter, number in tokens[position : position + count] if number
-        ]
+        numbers = _numbers([text for _, text in tokens[position : position + count]], what)
         if len(numbers) < count:
             raise PalpateError(f"{what} has a path command {command} with too few numbers")
+        if kind == "A" and not set(numbers[3:5]) <= {0.0, 1.0}:
+            raise PalpateError(f"{what} has an arc with other flags than 0 and 1, each by itself")
         position += count
         base = here if command.islower() else np.zeros(2)
-        new, handle = _drawn(kind, np.array(numbers), here, base, handle)
-        points.extend(new)
-        here = points[-1]
+        new, handle = _drawn(kind, numbers, here, base, handle)
         if kind == "M":
+            begin = new[-1]
+            outlines.append([])
             command = "l" if command == "m" else "L"
-    return np.array(points)
+        elif closed:  # drawing goes on where the last outline began
+            outlines.append([here])
+        outlines[-1].extend(new)
+        here, closed = new[-1], False
+    every = [np.array(points) for points in outlines]
+    return [points for points in every if len(points) > 1] or every[:1]
+
+
+def _numbers(texts: list[str], what: str) -> np.ndarray:
+    """Those before the first text that is none, as an array; each is bounded."""
+    texts = texts[: texts.index("")] if "" in texts else texts
+    numbers = np.array([float(text) for text in texts])
+    if not (np.abs(numbers) <= _LARGEST).all():
+        raise PalpateError(
+            f"{what} has a number that is not between -{_LARGEST:g} and {_LARGEST:g}: expected "
+            "places in the drawing"
+        )
+    return numbers
 
 
 def _drawn(
@@ -96,7 +116,7 @@ def _drawn(
 def _arc(begin: np.ndarray, numbers: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
     """An elliptic arc from its ends: SVG 1.1, appendix F.6."""
     rx, ry = np.abs(numbers[:2])
-    if rx == 0 or ry == 0 or np.allclose(begin, end):
+    if min(rx, ry) < _SMALLEST or np.allclose(begin, end, rtol=0, atol=_SMALLEST):
         return [end]
     tilt, large, sweep = math.radians(numbers[2]), bool(numbers[3]), bool(numbers[4])
     turn = np.array([[math.cos(tilt), math.sin(tilt)], [-math.sin(tilt), math.cos(tilt)]])
@@ -112,7 +132,8 @@ def _arc(begin: np.ndarray, numbers: np.ndarray, end: np.ndarray) -> list[np.nda
         last += 2 * math.pi
     if not sweep and last > first:
         last -= 2 * math.pi
-    angles = np.linspace(first, last, _CHORDS + 1)[1:]
+    chords = math.ceil(_CHORDS * abs(last - first) / (math.pi / 2) - 1e-6)
+    angles = np.linspace(first, last, max(1, chords) + 1)[1:]
     circle = np.stack([rx * np.cos(angles), ry * np.sin(angles)], axis=1) + centre
     points = list(circle @ turn + (begin + end) / 2)
     points[-1] = end
@@ -130,10 +151,23 @@ def transform_matrix(text: str, what: str) -> np.ndarray:
     for name, inside in _TRANSFORM.findall(text):
         try:
             numbers = [float(number) for number in re.split(r"[\s,]+", inside.strip())]
-            matrix = matrix @ _step(name, numbers)
+            step = _step(name, numbers)
         except (ValueError, IndexError) as error:
             raise PalpateError(f"{what} has the transform {name}({inside[:30]})") from error
+        matrix = joined(matrix, step, what)
     return matrix
+
+
+def joined(outer: np.ndarray, inner: np.ndarray, what: str) -> np.ndarray:
+    """The product of two matrices (3, 3), the second applied first.
+
+    Raises `PalpateError` where it is not finite or much too large for any drawing.
+    """
+    if np.abs(inner).max() <= _LARGEST:  # False for NaN
+        product = outer @ inner
+        if np.abs(product).max() <= _LARGEST:
+            return product
+    raise PalpateError(f"{what} has a transform beyond {_LARGEST:g}: expected finite numbers")
 
 
 def _step(name: str, numbers: list[float]) -> np.ndarray:

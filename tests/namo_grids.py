@@ -14,6 +14,14 @@ BESIDE = {
     "movables": {"crate": [[1.8, 0.8], [2.2, 0.8], [2.2, 1.2], [1.8, 1.2]]},
 }
 
+OWN = {
+    "format": "palpate map 1",
+    "robot": {"radius": 0.2},
+    "start": [1, 1],
+    "bounds": [0, 0, 4, 2],
+    "cell_size": 0.1,
+}  # a map of our own
+
 
 def ros_map(folder: Path, pixels: np.ndarray, suffix=".pgm", beside=BESIDE, **keys) -> Path:
     """A map_server YAML of `pixels` (rows from the top) and its side-car."""

@@ -12,6 +12,7 @@ import shapely
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from namo_grids import OWN
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.geometry import checked_polygon
 from palpate.planning.movable_obstacles.map import Map, Movable, Robot, map_of
@@ -149,15 +150,7 @@ KEYS = ("name", "robot", "movables", "start", "goals", "cell_size", "margin", "b
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=3))
 def test_any_description_is_a_map_or_ends_in_a_sentence(said):
-    whole = {
-        "format": "palpate map 1",
-        "robot": {"radius": 0.2},
-        "start": [1, 1],
-        "bounds": [0, 0, 4, 3],
-        "cell_size": 0.1,
-        "movables": {"a": SQUARE},
-        "walls": [{"outline": SQUARE, "holes": []}],
-    }
+    whole = OWN | {"movables": {"a": SQUARE}, "walls": [{"outline": SQUARE, "holes": []}]}
     sentence = None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.json"

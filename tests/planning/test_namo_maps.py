@@ -10,7 +10,7 @@ import shapely
 from shapely import affinity
 from shapely.geometry import Polygon
 
-from namo_grids import CORNERS, room, ros_map
+from namo_grids import CORNERS, OWN, room, ros_map
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.geometry import checked_polygon, checked_pose, shown
@@ -21,15 +21,8 @@ from palpate.planning.movable_obstacles.map_files import maps_in, read_map
 
 def own_map(folder: Path, **keys) -> Path:
     """A map of our own with other keys."""
-    said = {
-        "format": "palpate map 1",
-        "robot": {"radius": 0.2},
-        "start": [1, 1],
-        "bounds": [0, 0, 4, 2],
-        "cell_size": 0.1,
-    }
     path = folder / "own.json"
-    path.write_text(json.dumps(said | keys))
+    path.write_text(json.dumps(OWN | keys))
     return path
 
 

@@ -15,6 +15,7 @@ from palpate.identification.laplace import CLIMBING, Modes, climb
 from palpate.identification.likelihood import initial_position, motion_posterior
 from palpate.models.model import rollout
 from palpate.models.planar_shapes import furniture, rectangle
+from palpate.models.planar_system import system_of
 from palpate.recording import Channel, Recording, Role, Trial
 
 PERIOD = 0.02
@@ -141,7 +142,7 @@ def test_a_joint_stays_where_both_bodies_were_seen(joined, monkeypatch):
     _, whole = hypotheses(joined, PERIOD).models.values()
     alone_is("feet", "feet", monkeypatch)
     _, model = hypotheses(seen, PERIOD).models.values()
-    on_other = [m._system().links.other_anchor[0, 0] for m in (whole, model)]
+    on_other = [system_of(m).links.other_anchor[0, 0] for m in (whole, model)]
     np.testing.assert_allclose(on_other[1], on_other[0], atol=5e-3)
 
 

@@ -9,10 +9,9 @@ from scipy.stats import multivariate_normal
 
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
+from palpate.identification.discrepancy import MEMORY, discrepancy_covariance
 from palpate.identification.likelihood import (
-    MEMORY,
     VAGUE,
-    discrepancy_covariance,
     from_start,
     inferred_scales,
     initial_position,
@@ -90,6 +89,24 @@ def test_curvature_is_that_of_the_expected_information():
     assert value == pytest.approx(float(target.density(position)))
     np.testing.assert_allclose(slope, jax.grad(target.density)(position), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(curvature, -jax.hessian(target.density)(position), rtol=1e-6)
+
+
+@pytest.mark.usefixtures("float64")
+def test_several_positions_side_by_side_are_each_by_itself():
+    sled = Sled(mass=14.0, friction=[6.0, 40.0])
+    segments = cut(pushes(SLED, 1, trials=2, frames=31), sled, 0.2)
+    target = motion_posterior(sled, segments, inferred_scales(sled, NOISE))
+    positions = jnp.asarray(np.random.default_rng(0).normal(size=(3, target.dimension))) * 0.3
+    densities, curvatures = target.densities(positions), target.curvatures(positions)
+    slopes = jax.grad(lambda p: jnp.sum(target.densities(p)))(positions)
+    for index, position in enumerate(positions):
+        value, slope = jax.value_and_grad(target.density)(position)
+        assert densities[index] == pytest.approx(float(value), rel=1e-12)
+        np.testing.assert_allclose(slopes[index], slope, rtol=1e-9, atol=1e-9)
+        for several, one in zip(curvatures, target.curvature(position), strict=True):
+            np.testing.assert_allclose(several[index], one, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(curvatures[1][index], slope, rtol=1e-8, atol=1e-8)
+    assert np.ptp(densities) > 1.0
 
 
 @pytest.mark.usefixtures("float64")

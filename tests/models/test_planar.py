@@ -77,6 +77,37 @@ def test_a_thousand_draws_side_by_side_are_a_loop_over_them():
         np.testing.assert_allclose(together[index], one.pose, atol=1e-4)
 
 
+@pytest.mark.parametrize("which", ["masses", "states", "pushes", "all"])
+def test_what_has_no_batch_axis_serves_the_whole_batch(which, float64):
+    """Of two bodies that nothing couples, which are stepped side by side."""
+    model = furniture([BOX, rectangle(0.5, 0.4)], wheels=1, poses=[[0.0] * 3, [3.0, 0.0, 1.0]])
+    model = dataclasses.replace(model, pairs=model.pairs[:0], bolted=jnp.array([0.0, 0.0]))
+    state = PlanarState(jnp.array([[0.0] * 3, [3.0, 0.0, 1.0]]), jnp.full((2, 3), 0.3))
+    push = jnp.array([[30.0, -8.0, 3.0], [-9.0, 4.0, 1.0]])
+    more = jnp.array([1.0, 1.3, 0.6])
+    models, states, actions = model, state, push
+    if which in ("masses", "all"):
+        models = dataclasses.replace(model, mass=more[:, None] * model.mass)
+    if which in ("states", "all"):
+        states = PlanarState(
+            jnp.broadcast_to(state.pose, (3, 2, 3)), more[:, None, None] * state.velocity
+        )
+    if which in ("pushes", "all"):
+        actions = more[:, None, None] * push
+    together = jax.jit(lambda m, s, a: m.step(m.step(s, a), a))(models, states, actions)
+    assert together.pose.shape == (3, 2, 3)
+    for index in range(3):
+        one = (
+            models if models.mass.ndim == 1 else dataclasses.replace(model, mass=models.mass[index])
+        )
+        start = states if states.pose.ndim == 2 else jax.tree.map(lambda x, i=index: x[i], states)
+        action = actions if actions.ndim == 2 else actions[index]
+        end = one.step(one.step(start, action), action)
+        np.testing.assert_allclose(together.pose[index], end.pose, atol=1e-12)
+        np.testing.assert_allclose(together.velocity[index], end.velocity, atol=1e-12)
+    assert np.max(np.abs(np.diff(together.pose, axis=0))) > 1e-5
+
+
 def test_structure_is_a_batch_axis_and_compiles_once():
     traces = 0
 

@@ -11,6 +11,7 @@ from palpate.models import planar_geometry
 from palpate.models.model import rollout
 from palpate.models.planar import PlanarState
 from palpate.models.planar_shapes import furniture, rectangle
+from palpate.models.planar_system import system_of
 
 run = jax.jit(rollout)
 SMOOTH = {"floor_friction": 0.0, "floor_damping": 0.0, "wheels": 0}
@@ -168,7 +169,7 @@ def test_steps_of_any_length_never_add_energy(float64):
 def test_gaps_of_two_boxes_are_the_distances_between_their_faces():
     model = furniture([rectangle(1.0, 1.0), rectangle(0.5, 0.5)])
     pose = jnp.array([[0.0, 0.0, 0.0], [0.85, 0.1, 0.0]])
-    near = planar_geometry.nearest(model._system().shapes, pose)
+    near = planar_geometry.nearest(system_of(model).shapes, pose)
     np.testing.assert_allclose(near.gap[0], 0.1, atol=1e-6)
 
 

@@ -12,7 +12,7 @@ from palpate.models.model import rollout
 from palpate.models.planar import Planar, PlanarState, turned_wheel
 from palpate.models.planar_friction import STICTION, Tensor, exponential
 from palpate.models.planar_shapes import furniture, rectangle
-from palpate.models.planar_step import GRAVITY
+from palpate.models.planar_system import GRAVITY
 
 run = jax.jit(rollout)
 BOX = rectangle(1.2, 0.6)

@@ -13,7 +13,7 @@ from palpate.models.model import rollout
 from palpate.models.planar import Planar, PlanarState, turned_wheel
 from palpate.models.planar_friction import STICTION
 from palpate.models.planar_shapes import furniture, rectangle
-from palpate.models.planar_step import GRAVITY
+from palpate.models.planar_system import GRAVITY
 
 HALF = np.array([0.9, 0.425])
 

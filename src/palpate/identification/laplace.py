@@ -191,7 +191,7 @@ def _each(target: Target, position: ArrayLike) -> tuple[np.ndarray, ...]:
 
 @compiled_sooner
 def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
-    return over_devices(lambda target, part: jax.vmap(target.curvature)(part))(target, position)
+    return over_devices(lambda target, part: target.curvatures(part))(target, position)
 
 
 def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior, Modes]:

@@ -4,11 +4,9 @@ An observed channel c (the x of one body, say) is what the model predicts from t
 piece, plus
 
 - white sensor noise of standard deviation s, one for each unit;
-- a discrepancy that the model does not explain, as from a random acceleration that is forgotten
-  after `MEMORY`: twice integrated, of strength w (Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001,
-  with the kernel of Singer's filter for targets that manoeuvre, IEEE Trans. Aerosp. Electron. Syst.
-  6, 1970). Without it residuals that follow one another in time would count as independent
-  evidence, and intervals be too narrow. A w for each unit of each body;
+- a discrepancy that the model does not explain, of strength w (`discrepancy`). Without it residuals
+  that follow one another in time would count as independent evidence, and intervals be too narrow.
+  A w for each unit of each body;
 - what errors of the initial pose and rate become: linear in them, with the derivatives of a model
   nearby (`linearised`), and marginalised in closed form. The smoothed start has seen the piece's
   own frames, so its deviation is taken `VAGUE` times as wide, and the piece decides.
@@ -16,8 +14,6 @@ piece, plus
 The scales s and w are inferred beside the parameters. The covariance of the discrepancy has the
 same eigenvectors whatever its scale, so that all but the rollout is elementwise.
 """
-
-import functools
 
 import equinox as eqx
 import jax
@@ -27,15 +23,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
+from palpate.identification.discrepancy import eigenvectors
 from palpate.identification.segments import Segments
 from palpate.identification.target import Target
 from palpate.models.model import Model, rollout
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
 from palpate.small_systems import cholesky, solve_lower
 
-# s. The handling of furniture makes this one as probable as white noise (the logarithm of the
-# evidence is within 3, five kinds), 0.3 s less so by 3 to 15, and longer ones by more.
-MEMORY = 0.1
 VAGUE = 3.0  # by which the start's deviation is widened in the likelihood
 NOISE_SPREAD = 0.7  # standard deviation of the logarithm of s about what the sensor seems to have
 GROWTH_RATIO, GROWTH_SPREAD = 3.0, 1.5  # median of w over that of s (after 1 s), and its spread
@@ -148,12 +142,32 @@ class MotionPosterior(Target):
         return scale[np.array(self.scales.growth_of_channel)]
 
     def log_likelihood(self, position: Float[Array, " free"]) -> Float[Array, ""]:
-        residual, variance = self._rotated(position)
-        return jnp.sum(self._by_segment(residual, variance))
+        return jnp.sum(self.by_segment(position))
 
     def by_segment(self, position: Float[Array, " free"]) -> Float[Array, " segments"]:
         """Log-likelihood of each piece alone; they are independent given the coordinates."""
-        return self._by_segment(*self._rotated(position))
+        residual, variance = self._rotated(position[None])
+        return self._by_segment(residual[0], variance[0])
+
+    def densities(self, positions: Float[Array, "batch free"]) -> Float[Array, " batch"]:
+        """`density` at several positions: what moves is computed side by side for all of them."""
+        return self._densities(positions, *self._rotated(positions))
+
+    def _densities(self, positions: Array, residual: Array, variance: Array) -> Array:
+        likelihood = jnp.sum(jax.vmap(self._by_segment)(residual, variance), axis=1)
+        return jax.vmap(self._density)(likelihood, positions)
+
+    def predicted(
+        self, positions: Float[Array, "batch free"], segments: Segments
+    ) -> Float[Array, "batch segments time ..."]:
+        """Open-loop predictions of pieces from their starts by the models at several positions."""
+        reference = self.coordinates.reference
+
+        def values(position: Array) -> dict[str, Array]:
+            model = self.model(position)
+            return {path: value_of(model, path) for path in parameters_of(reference)}
+
+        return _from_starts(reference, jax.vmap(values)(positions), segments)
 
     def curvature(self, position: Float[Array, " free"]) -> tuple[Array, Array, Array]:
         """Density and slope with Fisher's information of mean and scales, prior included.
@@ -161,25 +175,42 @@ class MotionPosterior(Target):
         Of a normal distribution with the covariance C: J^T C^-1 J + 1/2 tr(C^-1 dC C^-1 dC). Where
         starts are uncertain, C = D + A A^T, the second term is taken with D alone: a little more
         than is known of the scales, enough for the steps of a climb and the shape of a proposal.
+        """
+        value, slope, matrix = self.curvatures(position[None])
+        return value[0], slope[0], matrix[0]
+
+    def curvatures(self, positions: Float[Array, "batch free"]) -> tuple[Array, Array, Array]:
+        """`curvature` at several positions.
+
         All from one sweep in forward mode, which compiles in a fraction of the time of a reverse
         one.
         """
 
-        def moments(position: Array):
-            residual, variance = self._rotated(position)
-            value = self._density(jnp.sum(self._by_segment(residual, variance)), position)
+        def moments(positions: Array):
+            residual, variance = self._rotated(positions)
+            value = self._densities(positions, residual, variance)
             return (residual, jnp.log(variance), value), (value, variance)
 
-        slopes, (value, variance) = jax.jacfwd(moments, has_aux=True)(position)
+        def along(direction: Array):
+            everywhere = jnp.broadcast_to(direction, positions.shape)
+            return jax.jvp(moments, (positions,), (everywhere,), has_aux=True)[1:]
+
+        # the derivatives' axis comes second, after that of positions
+        axes = jnp.eye(positions.shape[1], dtype=positions.dtype)
+        slopes, (value, variance) = jax.vmap(along, out_axes=((1, 1, 1), None))(axes)
         slope, log_slope, value_slope = slopes
-        weighted = slope * (self.counted / variance)[..., None]
-        matrix = jnp.einsum("wcti,wctj->ij", weighted, slope)
-        matrix += 0.5 * jnp.einsum("wct,wcti,wctj->ij", self.counted, log_slope, log_slope)
+        return value, value_slope, jax.vmap(self._information)(variance, slope, log_slope)
+
+    def _information(self, variance: Array, slope: Array, log_slope: Array) -> Array:
+        """Fisher's, from the derivatives (free, segments, channels, time) of the moments."""
+        weighted = slope * self.counted / variance
+        matrix = jnp.einsum("iwct,jwct->ij", weighted, slope)
+        matrix += 0.5 * jnp.einsum("wct,iwct,jwct->ij", self.counted, log_slope, log_slope)
         if self.sensitivity is not None:
-            explained = jnp.einsum("wqct,wcti->wqi", self.sensitivity, weighted)
+            explained = jnp.einsum("wqct,iwct->wqi", self.sensitivity, weighted)
             half = self._through_root(explained, variance)
             matrix -= jnp.einsum("wqi,wqj->ij", half, half)
-        return value, value_slope, matrix + jnp.eye(len(position))
+        return matrix + jnp.eye(len(slope))
 
     def linearised(self, position: Float[Array, " free"]) -> "MotionPosterior":
         """The same with start errors propagated by the derivatives of the model at `position`."""
@@ -187,12 +218,17 @@ class MotionPosterior(Target):
             return self
         return eqx.tree_at(lambda t: t.sensitivity, self, _sensitivity(self, position))
 
-    def _rotated(self, position: Array) -> tuple[Array, Array]:
-        """Residuals (segments, channels, time) along the eigenvectors, and their variances."""
-        predicted = from_start(self.model(position), self.segments)
-        residual = self._rotate(residuals(self.coordinates.reference, predicted, self.segments))
-        noise = jnp.square(self.noise(position))[:, None]
-        return residual, noise + jnp.square(self.growth(position))[:, None] * self.spectrum
+    def _rotated(self, positions: Array) -> tuple[Array, Array]:
+        """Residuals (batch, segments, channels, time) along the eigenvectors, and variances."""
+        predicted = self.predicted(positions, self.segments)
+
+        def one(position: Array, predicted: Array) -> tuple[Array, Array]:
+            off = residuals(self.coordinates.reference, predicted, self.segments)
+            noise = jnp.square(self.noise(position))[:, None]
+            growth = jnp.square(self.growth(position))[:, None]
+            return self._rotate(off), noise + growth * self.spectrum
+
+        return jax.vmap(one)(positions, predicted)
 
     def _rotate(self, residual: Array) -> Array:
         """From (segments, time, *observation) to (segments, channels, eigenvectors)."""
@@ -234,7 +270,7 @@ def motion_posterior(model: Model, segments: Segments, scales: Scales) -> Motion
             f"{type(model).__name__} observes {expected[0]} and takes actions {expected[1]}, "
             f"but the pieces have {found[0]} and {found[1]}"
         )
-    rotation, spectrum, counted = _eigenvectors(np.asarray(segments.seen), model.control_period)
+    rotation, spectrum, counted = eigenvectors(np.asarray(segments.seen), model.control_period)
     dtype = jnp.zeros(()).dtype
     deviations = np.asarray(segments.pose_deviation), np.asarray(segments.rate_deviation)
     uncertain = any(np.any(deviation > 0) for deviation in deviations)
@@ -260,13 +296,26 @@ def initial_position(target: MotionPosterior) -> Float[Array, " free"]:
 
 def from_start(model: Model, segments: Segments) -> Float[Array, "segments time ..."]:
     """Open-loop prediction of every piece from its smoothed start."""
+    values = {path: value_of(model, path)[None] for path in parameters_of(model)}
+    return _from_starts(model, values, segments)[0]
+
+
+def _from_starts(
+    model: Model, values: dict[str, Array], segments: Segments
+) -> Float[Array, "batch segments time ..."]:
+    """As `from_start`, by models with these values, whose first axis is a batch."""
+    batch = next(iter(values.values())).shape[0]
+
+    def tiled(array: Array) -> Array:
+        return jnp.tile(array, (batch, *(1,) * (array.ndim - 1)))
+
     # A copy for each piece: derivatives by what all pieces share take minutes to compile.
-    values = {path: value_of(model, path) for path in parameters_of(model)}
-    copies = {path: jnp.broadcast_to(v, (segments.count, *v.shape)) for path, v in values.items()}
+    copies = {path: jnp.repeat(value, segments.count, axis=0) for path, value in values.items()}
     model = with_values(model, copies)
     before = segments.pose - model.control_period * segments.rate
-    state = model.initial_state(jnp.stack([before, segments.pose], axis=1))
-    return model.observe(rollout(model, state, segments.action))
+    state = model.initial_state(tiled(jnp.stack([before, segments.pose], axis=1)))
+    observed = model.observe(rollout(model, state, tiled(segments.action)))
+    return observed.reshape(batch, segments.count, *observed.shape[1:])
 
 
 def residuals(
@@ -318,43 +367,3 @@ def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     slope = jax.jacfwd(moved)(jnp.zeros(size, position.dtype))
     columns = jnp.moveaxis(slope, -1, 0)  # (starts, segments, time, *observation)
     return jnp.moveaxis(jax.vmap(target._rotate)(columns), 0, 1)
-
-
-def _eigenvectors(seen: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the unit discrepancy over the frames seen: vectors, values, and one where there is data.
-
-    (segments, channels, time, time) and (segments, channels, time), in float64. Frames not seen
-    have zero columns.
-    """
-    count, horizon = seen.shape[:2]
-    masks = np.moveaxis(seen.reshape(count, horizon, -1), 1, 2)
-    time = period * np.arange(1, horizon + 1)
-    kernel = discrepancy_covariance(time)
-
-    @functools.cache
-    def decomposed(mask: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        where = np.flatnonzero(np.frombuffer(mask, bool))
-        vectors, values = np.zeros((horizon, horizon)), np.zeros(horizon)
-        counted = np.zeros(horizon)
-        if where.size:
-            found, basis = np.linalg.eigh(kernel[np.ix_(where, where)])
-            vectors[where, : where.size] = basis
-            values[: where.size] = np.maximum(found, 0.0)
-            counted[: where.size] = 1.0
-        return vectors, values, counted
-
-    parts = [[decomposed(mask.tobytes()) for mask in masks[w]] for w in range(count)]
-    return tuple(np.array([[part[i] for part in row] for row in parts]) for i in range(3))  # type: ignore[return-value]
-
-
-def discrepancy_covariance(time: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time time"]:
-    """Covariance, s^3, of the discrepancy of unit strength at times (s) after 0.
-
-    Twice integrated from rest, of an acceleration of covariance exp(-|t - t'| / m) / 2 m with the
-    memory m: far beyond m it is that of white noise, s^2 (3 t - s) / 6 at the times s <= t.
-    """
-    s, t = np.minimum(time[:, None], time), np.maximum(time[:, None], time)
-    m, fading = MEMORY, np.exp(-s / MEMORY)
-    white = s**2 * (3.0 * t - s) / 6.0
-    begun = 0.5 * m * (t + m) * (s - m + m * fading)
-    return white - begun + 0.5 * m**2 * np.exp((s - t) / m) * (m - (s + m) * fading)

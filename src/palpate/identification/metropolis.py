@@ -106,31 +106,32 @@ def _learnt(history: list[np.ndarray]) -> np.ndarray:
 
 @eqx.filter_jit
 def _densities(target: Target, position: Array) -> Array:
-    return jax.vmap(target.density)(position)
+    return target.densities(position)
 
 
 @eqx.filter_jit
 def _walk(target: Target, start: Array, root: Array, keys: Array, draws: int, thin: int) -> _Walk:
-    def chain(target: Target, root: Array, start: Array, key: PRNGKeyArray) -> _Walk:
-        def step(carry, key):
+    def part(shared, each) -> _Walk:
+        target, root = shared
+        start, keys = each
+
+        def step(carry, keys):
             here, value = carry
-            noise, coin = jax.random.split(key)
-            proposed = here + root @ jax.random.normal(noise, here.shape, here.dtype)
-            after = target.density(proposed)
-            accepted = jnp.log(jax.random.uniform(coin, (), value.dtype)) < after - value
-            here = jnp.where(accepted, proposed, here)
+            noise, coin = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+            normal = jax.vmap(lambda key: jax.random.normal(key, root.shape[:1], here.dtype))
+            proposed = here + normal(noise) @ root.T
+            after = target.densities(proposed)
+            accepted = jnp.log(jax.vmap(jax.random.uniform)(coin)) < after - value
+            here = jnp.where(accepted[:, None], proposed, here)
             return (here, jnp.where(accepted, after, value)), accepted
 
-        def kept(carry, key):
-            carry, accepted = jax.lax.scan(step, carry, jax.random.split(key, thin))
-            return carry, _Walk(*carry, jnp.mean(accepted.astype(start.dtype)))
+        def kept(carry, keys):
+            steps = jnp.moveaxis(jax.vmap(lambda key: jax.random.split(key, thin))(keys), 0, 1)
+            carry, accepted = jax.lax.scan(step, carry, steps)
+            return carry, _Walk(*carry, jnp.mean(accepted.astype(start.dtype), axis=0))
 
-        begin = start, target.density(start)
-        return jax.lax.scan(kept, begin, jax.random.split(key, draws))[1]
-
-    def part(shared, each) -> _Walk:
-        # Side by side: all take as many steps.
-        target, root = shared
-        return jax.vmap(lambda start, key: chain(target, root, start, key))(*each)
+        keys = jnp.moveaxis(jax.vmap(lambda key: jax.random.split(key, draws))(keys), 0, 1)
+        walk = jax.lax.scan(kept, (start, target.densities(start)), keys)[1]
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), walk)
 
     return over_devices(part)((target, root), (start, keys))

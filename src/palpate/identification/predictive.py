@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
+from palpate.identification.discrepancy import discrepancy_covariance
 from palpate.identification.likelihood import (
     MotionPosterior,
-    discrepancy_covariance,
     from_start,
 )
 from palpate.identification.prediction import or_nan
@@ -175,7 +175,7 @@ def final_poses(
 
 @eqx.filter_jit
 def _final(target: MotionPosterior, position: Array, segments: Segments) -> Array:
-    return jax.vmap(lambda p: from_start(target.model(p), segments)[:, -1])(position)
+    return target.predicted(position, segments)[:, :, -1]
 
 
 @eqx.filter_jit

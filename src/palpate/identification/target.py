@@ -40,6 +40,14 @@ class Target(eqx.Module):
         value = log_likelihood + log_prior(position)
         return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
+    def densities(self, positions: Float[Array, "batch free"]) -> Float[Array, " batch"]:
+        """`density` at several positions; a target may have a faster way than one by one."""
+        return jax.vmap(self.density)(positions)
+
+    def curvatures(self, positions: Float[Array, "batch free"]) -> tuple[Array, Array, Array]:
+        """`curvature` at several positions."""
+        return jax.vmap(self.curvature)(positions)
+
     def curvature(self, position: Float[Array, " free"]) -> tuple[Array, Array, Array]:
         """The density, its slope, and a positive definite curvature of minus its logarithm.
 

@@ -1,6 +1,7 @@
 """The contract of every model: what the robot believes about how an object moves."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -45,6 +46,10 @@ class Model(eqx.Module):
     @abstractmethod
     def step(self, state: Any, action: Array) -> Any:
         """The state one control period later."""
+
+    def stepper(self) -> Callable[[Any, Array], Any]:
+        """`step`, with what is the same in all steps computed beforehand: for loops over time."""
+        return self.step
 
     @abstractmethod
     def observe(self, state: Any) -> Array:
@@ -93,9 +98,10 @@ def rollout(model: Model, state: State, actions: Array) -> State:
     """
     batched = batch_size(model, actions) is not None
     in_time = jnp.moveaxis(actions, 1, 0) if batched else actions
+    step = model.stepper()
 
     def advance(state: State, action: Array) -> tuple[State, State]:
-        following = model.step(state, action)
+        following = step(state, action)
         return following, following
 
     keep = jax.checkpoint_policies.save_only_these_names(SOLVED)

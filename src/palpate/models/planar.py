@@ -1,6 +1,7 @@
 """Rigid bodies in the plane on wheels, pivots and links (physics-based RL, Scholz et al. 2014)."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,9 +12,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from palpate.models import planar_step
 from palpate.models.model import Model
 from palpate.models.planar_checks import check_axes, check_indices
-from palpate.models.planar_friction import Rolling, Tensor, Wheel
-from palpate.models.planar_geometry import Shapes
-from palpate.models.planar_links import COINCIDENT, Links, turn
+from palpate.models.planar_links import turn
+from palpate.models.planar_system import WEAKEST, System, system_of
 from palpate.parameters import (
     LogNormal,
     Normal,
@@ -23,9 +23,6 @@ from palpate.parameters import (
     axes_of,
     parameter,
 )
-
-WEAKEST = 1e-6  # N: what is less counts as this, as a logarithm needs it
-TIPPING = 0.95  # of the way to the feet on one side: where the centre of mass is at most
 
 
 class PlanarState(eqx.Module):
@@ -232,16 +229,25 @@ class Planar(Model):
 
     def step(self, state: PlanarState, action: Float[Array, "*batch bodies 3"]) -> PlanarState:
         """The state one control period later."""
-        leaves, structure = jax.tree.flatten((self, state, action))
-        batched = [leaf.ndim > axes for leaf, axes in zip(leaves, _AXES, strict=True)]
-        if not any(batched):
-            return self._step(state, action)
+        return self.stepper()(state, action)
 
-        def one(*leaves: Array) -> PlanarState:
-            model, state, action = jax.tree.unflatten(structure, leaves)
-            return model._step(state, action)
+    def stepper(self) -> Callable[[PlanarState, Array], PlanarState]:
+        if self.link_to.shape[-1] or self.pairs.shape[-2]:
+            return self._step_each
+        leaves, structure = jax.tree.flatten(self)
+        axes = _AXES[: len(leaves)]
+        own = _side_by_side(leaves, axes)
+        system = system_of(jax.tree.unflatten(structure, own))
+        batched = any(leaf.ndim > count for leaf, count in zip(leaves, axes, strict=True))
 
-        return jax.vmap(one, in_axes=[0 if axis else None for axis in batched])(*leaves)
+        def step(state: PlanarState, action: Array) -> PlanarState:
+            given = state.pose, state.velocity, action
+            after = self._advanced(system, *_side_by_side(given, [2, 2, 2], own[0].shape[-1]))
+            if batched or any(leaf.ndim > 2 for leaf in given):
+                return PlanarState(*(jnp.moveaxis(leaf, -1, 0) for leaf in after))
+            return PlanarState(*(leaf[..., 0] for leaf in after))
+
+        return step
 
     def linked_at(self, poses: Float[Array, "bodies 3"]) -> "Planar":
         """The model whose links hold as they stand at these poses."""
@@ -282,89 +288,47 @@ class Planar(Model):
         gyration = self.gyration * self.even_gyration
         return 0.5 * self.mass * (squared + jnp.square(gyration * rate))
 
-    def _step(self, state: PlanarState, action: Float[Array, "bodies 3"]) -> PlanarState:
-        system, time_step = self._system(), self.control_period / self.substeps
+    def _step_each(self, state: PlanarState, action: Array) -> PlanarState:
+        """`step` of bodies that links or contacts couple: what batch there is, one by one."""
+        leaves, structure = jax.tree.flatten((self, state, action))
+        batched = [leaf.ndim > axes for leaf, axes in zip(leaves, _AXES, strict=True)]
 
-        def advance(state: PlanarState, _: None) -> tuple[PlanarState, None]:
-            pose, velocity = planar_step.advance(
-                system, state.pose, state.velocity, action, time_step, self.iterations
+        def one(*leaves: Array) -> PlanarState:
+            model, state, action = jax.tree.unflatten(structure, leaves)
+            return PlanarState(
+                *model._advanced(system_of(model), state.pose, state.velocity, action)
             )
-            return PlanarState(pose, velocity), None
 
-        loose = 1.0 - self.bolted
-        state = PlanarState(state.pose, loose[:, None] * state.velocity)
+        if not any(batched):
+            return one(*leaves)
+        return jax.vmap(one, in_axes=[0 if axis else None for axis in batched])(*leaves)
+
+    def _advanced(
+        self, system: System, pose: Array, velocity: Array, wrench: Array
+    ) -> tuple[Array, Array]:
+        """Poses and rates one control period later, (bodies, 3) and then lanes, if any."""
+        time_step = self.control_period / self.substeps
+
+        def advance(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+            return planar_step.advance(system, *state, wrench, time_step, self.iterations), None
+
+        state = pose, system.loose[:, None] * velocity
         if self.substeps == 1:
             return advance(state, None)[0]
         return jax.lax.scan(advance, state, length=self.substeps)[0]
 
-    def _feet(self, centre: Float[Array, "bodies 2"]) -> dict[str, Array]:
-        """Four feet of each body as `Rolling` has them, with the loads that balance it."""
-        reach = self.floor_spread[:, None] * self.half_extent
-        balance = jnp.clip(centre / reach, -TIPPING, TIPPING)
-        side_x, side_y = jnp.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, -1.0, 1.0]], reach.dtype)
-        share = 0.25 * (1.0 + side_x * balance[:, :1]) * (1.0 + side_y * balance[:, 1:])
-        friction = planar_step.GRAVITY * self.mass * self.floor_friction
-        return {
-            "foot_x": side_x * reach[:, :1] - centre[:, :1],
-            "foot_y": side_y * reach[:, 1:] - centre[:, 1:],
-            "foot_friction": friction[:, None] * share,
-        }
 
-    def _system(self) -> planar_step.System:
-        """The parameters as a step uses them, without batch axes."""
-        centre = self.centre_of_mass * self.half_extent
-        lever = self.wheel_position * self.half_extent[:, None] - centre[:, None]
-        wheels = []
-        for i in range(self.wheel.shape[-1]):
-            exists = self.wheel[:, i]
-            # A wheel that does not exist may have any values.
-            log = Tensor(
-                *(
-                    jnp.where(exists > 0, entry[:, i], 0.0)
-                    for entry in (
-                        jnp.log(jnp.maximum(self.wheel_along, WEAKEST)),
-                        jnp.log(jnp.maximum(self.wheel_across, WEAKEST)),
-                        self.wheel_shear,
-                    )
-                )
-            )
-            wheels.append(Wheel(lever[:, i, 0], lever[:, i, 1], log, self.dry[:, i], exists))
-        anchor = self.link_anchor * self.half_extent[:, None]
-        # a pivot holds on to where its own anchor is at `link_pose`
-        cosine, sine = jnp.cos(self.link_pose[..., 2]), jnp.sin(self.link_pose[..., 2])
-        x, y = turn(anchor[..., 0], anchor[..., 1], cosine, sine)
-        made = jnp.stack([x, y], axis=-1) + self.link_pose[..., :2]
-        to_world = (self.link_to < 0)[..., None]
-        other_extent = jnp.where(to_world, 1.0, self.half_extent[self.link_to])
-        other_anchor = self.link_other_anchor * other_extent
-        gap = jnp.sum(jnp.square(made - other_anchor), axis=-1)
-        mass = self.mass * (1.0 + planar_step.BOLTED * self.bolted)
-        return planar_step.System(
-            bodies=Rolling(
-                mass=mass,
-                inertia=mass * jnp.square(self.gyration * self.even_gyration),
-                **self._feet(centre),
-                floor_viscosity=self.mass * self.floor_damping,
-                floor_radius=self.even_gyration,
-                wheels=tuple(wheels),
-            ),
-            centre=(centre[:, 0], centre[:, 1]),
-            links=Links(
-                anchor=anchor,
-                other_anchor=jnp.where(self.pivot[..., None] > 0, made, other_anchor),
-                length=jnp.sqrt(gap + COINCIDENT),
-                to=self.link_to,
-                pivot=self.pivot,
-                distance=self.distance,
-            ),
-            shapes=Shapes(
-                outline=self.outline,
-                walls=self.walls,
-                pairs=self.pairs,
-            ),
-            restitution=self.restitution,
-            contact_friction=self.contact_friction,
-        )
+def _side_by_side(arrays: Sequence[Array], axes: Sequence[int], lanes: int = 1) -> list[Array]:
+    """Arrays of so many axes without a batch's, with the batch axis last, of one length in all.
+
+    What lies last is taken together by a processor's vectors, and bodies have few elements.
+    """
+    last = [
+        jnp.moveaxis(array, 0, -1) if array.ndim > count else array[..., None]
+        for array, count in zip(arrays, axes, strict=True)
+    ]
+    lanes = max(lanes, *(array.shape[-1] for array in last))
+    return [jnp.broadcast_to(array, (*array.shape[:-1], lanes)) for array in last]
 
 
 def wrapped(angle: Array) -> Array:

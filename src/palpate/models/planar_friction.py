@@ -13,6 +13,10 @@ of a step minimises the sum of all of them and of what is quadratic. Newton's me
 the pull of each element beside the velocity (Chan, Golub and Mulet, SIAM J. Sci. Comput. 20, 1999):
 a size has hardly any curvature away from zero, and without the pulls a step across an ellipse of
 1 : 60 goes astray again and again.
+
+Arrays have one entry for each body, (bodies,), or one for each element of each body, (elements,
+bodies), and after these any axes of models that are stepped side by side: last, where processors
+take them together.
 """
 
 from typing import NamedTuple
@@ -56,7 +60,7 @@ class Rolling(NamedTuple):
     """Inertia of every body and what it rolls on, all (bodies,).
 
     Mass in kg, inertia in kg m^2 about the centre of mass, viscous friction of the floor in N s/m
-    and the radius (m) at which it resists turning. Of the feet, (bodies, feet): where they stand
+    and the radius (m) at which it resists turning. Of the feet, (feet, bodies): where they stand
     from the centre of mass in m, in the body's axes, and the friction of each in N.
     """
 
@@ -71,21 +75,23 @@ class Rolling(NamedTuple):
 
 
 class Dry(NamedTuple):
-    """Elements of dry friction, (bodies, elements): rows of two rates, and what they take.
+    """Elements of dry friction, (elements, bodies): where they are, what they feel and take.
 
-    The rates, m/s of a foot and W of a wheel, are in units of those below which they stick, and the
-    impulse of a step is by such a unit.
+    `x` and `y` are from the centre of mass, in m, in the body's axes. The tensor times the velocity
+    there is two rates, m/s of a foot and W of a wheel, in units of those below which they stick;
+    the impulse of a step is by such a unit.
     """
 
-    first: Triple
-    second: Triple
+    x: Array
+    y: Array
+    tensor: Tensor
     impulse: Array
 
 
 class Pull(NamedTuple):
     """What each dry element takes along its two rates, in shares of the most: a disc (0: nothing).
 
-    (bodies, elements) each.
+    (elements, bodies) each.
     """
 
     first: Array
@@ -126,13 +132,6 @@ def _series(squared: Array, factor: int) -> Array:
     return total
 
 
-def wheel_rows(wheel: Wheel, friction: Tensor) -> tuple[Triple, Triple]:
-    """F J: rows that map a body's velocity to a tensor times the velocity of its wheel."""
-    first = friction.xx, friction.xy, wheel.x * friction.xy - wheel.y * friction.xx
-    second = friction.xy, friction.yy, wheel.x * friction.yy - wheel.y * friction.xy
-    return first, second
-
-
 def resistance(bodies: Rolling, free: Triple, time_step: float) -> Resistance:
     """What resists in a step (s), of bodies that would leave it with the velocity `free`."""
     momentum = bodies.mass * free[0], bodies.mass * free[1], bodies.inertia * free[2]
@@ -149,33 +148,34 @@ def resistance(bodies: Rolling, free: Triple, time_step: float) -> Resistance:
     )
     nowhere = jnp.zeros_like(bodies.foot_x)
     here = nowhere + 1.0 / STICTION
-    first = [(here, nowhere, -here * bodies.foot_y)]
-    second = [(nowhere, here, here * bodies.foot_x)]
-    impulse = [time_step * STICTION * bodies.foot_friction]
+    holding = time_step * STICTION * bodies.foot_friction
+    feet = bodies.foot_x, bodies.foot_y, here, here, nowhere, holding
+    elements: list[tuple[Array, ...]] = [feet]
     for wheel in bodies.wheels:
         log = wheel.log_friction
-        weight = time_step * wheel.exists * (1.0 - wheel.dry)
-        # v' F v is the square of F's root times v.
-        for row in wheel_rows(wheel, exponential(Tensor(*(0.5 * entry for entry in log)))):
-            entries = add_row(entries, row, weight)
         friction = exponential(log)
+        viscous = time_step * wheel.exists * (1.0 - wheel.dry)
+        held = Tensor(*((viscous * entry)[None] for entry in friction))
+        entries = _plus(entries, at_point(wheel.x[None], wheel.y[None], held))
         creep = least_power(log, friction)
-        one, other = wheel_rows(wheel, friction)
-        first.append(scaled(one, 1.0 / creep))
-        second.append(scaled(other, 1.0 / creep))
-        impulse.append((time_step * creep * wheel.exists * wheel.dry)[:, None])
+        impulse = time_step * creep * wheel.exists * wheel.dry
+        scaled = (entry / creep for entry in friction)
+        elements.append(tuple(part[None] for part in (wheel.x, wheel.y, *scaled, impulse)))
+    x, y, *tensor, impulse = (jnp.concatenate(parts) for parts in zip(*elements, strict=True))
+    return Resistance(entries, momentum, Dry(x, y, Tensor(*tensor), impulse))
 
-    def joined(rows: list[Triple]) -> Triple:
-        x, y, turning = (jnp.concatenate(parts, axis=1) for parts in zip(*rows, strict=True))
-        return x, y, turning
 
-    dry = Dry(joined(first), joined(second), jnp.concatenate(impulse, axis=1))
-    return Resistance(entries, momentum, dry)
+def at_point(x: Array, y: Array, tensor: Tensor) -> Entries:
+    """J' T J of a tensor of the velocity at a point: how it resists the body's three rates."""
+    turning_x = tensor.xy * x - tensor.xx * y
+    turning_y = tensor.yy * x - tensor.xy * y
+    turning = turning_y * x - turning_x * y
+    return tensor.xx, tensor.yy, turning, tensor.xy, turning_x, turning_y
 
 
 def pulls(resisting: Resistance, velocity: Triple) -> Pull:
     """What dry elements take at a velocity."""
-    first, second = rates(resisting.dry.first, velocity), rates(resisting.dry.second, velocity)
+    first, second = rates(resisting.dry, velocity)
     soft = softened(first, second)
     return Pull(soft * first, soft * second)
 
@@ -187,7 +187,7 @@ def pulls_after(resisting: Resistance, velocity: Triple, pull: Pull, step: Tripl
     """
     dry = resisting.dry
     soft, along = _directions(dry, velocity)
-    first, second = rates(dry.first, step), rates(dry.second, step)
+    first, second = rates(dry, step)
     growth = along.first * first + along.second * second
     now = pulls(resisting, velocity)
     first = now.first - soft * (first - pull.first * growth)
@@ -199,11 +199,14 @@ def pulls_after(resisting: Resistance, velocity: Triple, pull: Pull, step: Tripl
 def slope(resisting: Resistance, velocity: Triple) -> Triple:
     """Derivative of the cost by the velocity: momentum that is left over, zero at the end."""
     dry, pull = resisting.dry, pulls(resisting, velocity)
-    first, second = dry.impulse * pull.first, dry.impulse * pull.second
+    tensor = dry.tensor
+    force_x = dry.impulse * (tensor.xx * pull.first + tensor.xy * pull.second)
+    force_y = dry.impulse * (tensor.xy * pull.first + tensor.yy * pull.second)
+    taken = force_x, force_y, dry.x * force_y - dry.y * force_x
     linear = product(resisting.entries, velocity)
     x, y, turning = (
-        a - p + jnp.sum(first * f + second * s, axis=1)
-        for a, p, f, s in zip(linear, resisting.momentum, dry.first, dry.second, strict=True)
+        a - p + jnp.sum(part, axis=0)
+        for a, p, part in zip(linear, resisting.momentum, taken, strict=True)
     )
     return x, y, turning
 
@@ -224,7 +227,7 @@ def curvature(resisting: Resistance, velocity: Triple, pull: Pull) -> Entries:
 
 def _directions(dry: Dry, velocity: Triple) -> tuple[Array, Pull]:
     """One over the size of the rates, at most one, and where they point; zero for what sticks."""
-    first, second = rates(dry.first, velocity), rates(dry.second, velocity)
+    first, second = rates(dry, velocity)
     soft = softened(first, second)
     sliding = jnp.where(soft < 1.0, soft, 0.0)
     return soft, Pull(sliding * first, sliding * second)
@@ -236,25 +239,28 @@ def as_viscous(resisting: Resistance, velocity: Triple) -> Entries:
     With it a step takes energy whatever the velocity is that the forces are of.
     """
     dry = resisting.dry
-    soft = softened(rates(dry.first, velocity), rates(dry.second, velocity))
+    soft = softened(*rates(dry, velocity))
     one = jnp.ones_like(soft)
     even = Tensor(one, one, jnp.zeros_like(soft))
     return _plus(resisting.entries, _weighted(dry, dry.impulse * soft, even))
 
 
-def _weighted(dry: Dry, weight: Array, tensor: Tensor) -> tuple[Array, ...]:
+def _weighted(dry: Dry, weight: Array, tensor: Tensor) -> Entries:
     """Entries of w J' T J of each element, for a tensor T of its two rates."""
-
-    def entry(i: int, j: int) -> Array:
-        (a, b), (c, d) = (dry.first[i], dry.second[i]), (dry.first[j], dry.second[j])
-        return weight * (tensor.xx * a * c + tensor.yy * b * d + tensor.xy * (a * d + b * c))
-
-    return entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2)
+    (xx, yy, xy), inner = dry.tensor, tensor
+    first_x, first_y = inner.xx * xx + inner.xy * xy, inner.xx * xy + inner.xy * yy
+    second_x, second_y = inner.xy * xx + inner.yy * xy, inner.xy * xy + inner.yy * yy
+    outer = Tensor(
+        weight * (xx * first_x + xy * second_x),
+        weight * (xy * first_y + yy * second_y),
+        weight * (xx * first_y + xy * second_y),
+    )
+    return at_point(dry.x, dry.y, outer)
 
 
 def _plus(entries: Entries, more: tuple[Array, ...]) -> Entries:
     x, y, t, xy, xt, yt = (
-        own + jnp.sum(added, axis=1) for own, added in zip(entries, more, strict=True)
+        own + jnp.sum(added, axis=0) for own, added in zip(entries, more, strict=True)
     )
     return x, y, t, xy, xt, yt
 
@@ -275,16 +281,12 @@ def softened(first: Array, second: Array) -> Array:
     return jax.lax.rsqrt(jnp.maximum(jnp.square(first) + jnp.square(second), 1.0))
 
 
-def scaled(row: Triple, factor: Array) -> Triple:
-    """The row (bodies,) times a factor of each body, as that of one element (bodies, 1)."""
-    x, y, turning = row
-    return (factor * x)[:, None], (factor * y)[:, None], (factor * turning)[:, None]
-
-
-def rates(row: Triple, velocity: Triple) -> Array:
-    """Rates J v (bodies, elements) of the velocities (bodies,)."""
-    x, y, turning = (part[:, None] for part in velocity)
-    return row[0] * x + row[1] * y + row[2] * turning
+def rates(dry: Dry, velocity: Triple) -> tuple[Array, Array]:
+    """The two rates (elements, bodies) of each element at the velocities (bodies,)."""
+    x, y, turning = velocity
+    along, across = x - dry.y * turning, y + dry.x * turning
+    tensor = dry.tensor
+    return tensor.xx * along + tensor.xy * across, tensor.xy * along + tensor.yy * across
 
 
 def product(entries: Entries, vector: Triple) -> Triple:
@@ -292,18 +294,3 @@ def product(entries: Entries, vector: Triple) -> Triple:
     x, y, t, xy, xt, yt = entries
     a, b, c = vector
     return x * a + xy * b + xt * c, xy * a + y * b + yt * c, xt * a + yt * b + t * c
-
-
-def add_row(entries: Entries, row: Triple, weight: Array) -> Entries:
-    """Entries of A + w J'J; `row` and `weight` are (bodies,)."""
-    x, y, t, xy, xt, yt = entries
-    first, second, third = row
-    by_first, by_second = weight * first, weight * second
-    return (
-        x + by_first * first,
-        y + by_second * second,
-        t + weight * third * third,
-        xy + by_first * second,
-        xt + by_first * third,
-        yt + by_second * third,
-    )

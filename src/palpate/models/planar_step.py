@@ -18,7 +18,7 @@ motion under a constant wrench exact. All of it happens in each body's axes abou
 mass, where its wheels stand still and its inertia is diagonal.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,6 @@ from palpate.models.planar_friction import (
     Entries,
     Pull,
     Resistance,
-    Rolling,
     Triple,
     as_viscous,
     curvature,
@@ -42,53 +41,44 @@ from palpate.models.planar_friction import (
     resistance,
     slope,
 )
-from palpate.models.planar_geometry import Shapes
-from palpate.models.planar_links import Links, Rows, link_rows, no_rows, turn
+from palpate.models.planar_links import Rows, link_rows, no_rows, turn
+from palpate.models.planar_system import System
+from palpate.models.trigonometry import cosine_and_sine
 from palpate.small_systems import cholesky, solve
 
-GRAVITY = 9.81  # m/s^2
 MORE_ITERATIONS = 2  # where bodies touch
-BOLTED = 1e6  # how many times as heavy a bolted body is
-
-
-class System(NamedTuple):
-    """What a step needs to know; centres of mass in m from the frames' origins."""
-
-    bodies: Rolling
-    centre: tuple[Array, Array]
-    links: Links
-    shapes: Shapes
-    restitution: Float[Array, " bodies"]
-    contact_friction: Float[Array, " bodies"]
 
 
 def advance(
     system: System,
-    pose: Float[Array, "bodies 3"],
-    rates: Float[Array, "bodies 3"],
-    wrench: Float[Array, "bodies 3"],
+    pose: Float[Array, "bodies 3 *lanes"],
+    rates: Float[Array, "bodies 3 *lanes"],
+    wrench: Float[Array, "bodies 3 *lanes"],
     time_step: float,
     iterations: int,
-) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
-    """Poses and velocities of the bodies' frames one time step (s) later."""
+) -> tuple[Float[Array, "bodies 3 *lanes"], Float[Array, "bodies 3 *lanes"]]:
+    """Poses and velocities of the bodies' frames one time step (s) later.
+
+    Where links or shapes couple bodies there are no lanes.
+    """
     half = 0.5 * time_step
     centre_x, centre_y = system.centre
     rate = rates[:, 2]
     angle = pose[:, 2]
-    lever_x, lever_y = turn(centre_x, centre_y, jnp.cos(angle), jnp.sin(angle))
+    lever_x, lever_y = turn(centre_x, centre_y, *cosine_and_sine(angle))
     start_x = rates[:, 0] - rate * lever_y
     start_y = rates[:, 1] + rate * lever_x
     begin_x, begin_y = pose[:, 0] + lever_x, pose[:, 1] + lever_y
     x, y = begin_x + half * start_x, begin_y + half * start_y
     angle = angle + half * rate
-    lever_x, lever_y = turn(centre_x, centre_y, jnp.cos(angle), jnp.sin(angle))
+    lever_x, lever_y = turn(centre_x, centre_y, *cosine_and_sine(angle))
     torque = wrench[:, 2] - (lever_x * wrench[:, 1] - lever_y * wrench[:, 0])
 
     # The new velocity serves from the middle of this step to the middle of the next: what a wheel
     # does not let through is told at the end of this one, or a body on a locked wheel would leave
     # it along tangents.
     ahead = angle + half * rate
-    cosine, sine = jnp.cos(ahead), jnp.sin(ahead)
+    cosine, sine = cosine_and_sine(ahead)
     force_x, force_y = turn(wrench[:, 0], wrench[:, 1], cosine, -sine)
     start = turn(start_x, start_y, cosine, -sine)
     bodies = system.bodies
@@ -98,13 +88,13 @@ def advance(
         rate + time_step * torque / bodies.inertia,
     )
     links = no_rows(pose.shape[0], pose.dtype)
-    if system.links.to.shape[1]:
+    if system.links is not None:
         middle = jnp.stack([x, y, angle], axis=-1)
         centre = jnp.stack(system.centre, axis=-1)
         links = link_rows(system.links, bodies.mass, centre, middle, ahead, time_step)
     resisting = resistance(bodies, free, time_step)
     velocity = solve_velocity(resisting, (start[0], start[1], rate), links, iterations)
-    if system.shapes.pairs.shape[0]:
+    if system.shapes is not None:
         contacts = planar_contact.contacts(
             system.shapes,
             system.restitution,
@@ -124,9 +114,9 @@ def advance(
     end_along, end_across, rate = velocity
     end_x, end_y = turn(end_along, end_across, cosine, sine)
     angle = angle + half * rate
-    lever_x, lever_y = turn(centre_x, centre_y, jnp.cos(angle), jnp.sin(angle))
-    pose = jnp.stack([x + half * end_x - lever_x, y + half * end_y - lever_y, angle], axis=-1)
-    return pose, jnp.stack([end_x + rate * lever_y, end_y - rate * lever_x, rate], axis=-1)
+    lever_x, lever_y = turn(centre_x, centre_y, *cosine_and_sine(angle))
+    pose = jnp.stack([x + half * end_x - lever_x, y + half * end_y - lever_y, angle], axis=1)
+    return pose, jnp.stack([end_x + rate * lever_y, end_y - rate * lever_x, rate], axis=1)
 
 
 def solve_velocity(resisting: Resistance, start: Triple, links: Rows, iterations: int) -> Triple:

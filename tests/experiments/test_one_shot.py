@@ -16,7 +16,7 @@ from palpate.experiments.identify_bayesian import posterior_of
 from palpate.experiments.one_shot_figure import shares_figure
 from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
 from palpate.experiments.one_shot_regression import OURS, RIVALS, first_samples, transitions
-from palpate.experiments.one_shot_sampling import OURS as NUTS
+from palpate.experiments.one_shot_sampling import OURS as SAMPLER
 from palpate.identification.laplace import settle
 from palpate.identification.predictive import Predicted
 from palpate.worlds.furniture import FurnitureWorld, Piece
@@ -85,7 +85,7 @@ def test_mujoco_sysid_is_held_against_ours_on_the_same_pieces():
         "chair": {"error_m": [], "displacement_m": []},
     }
     pace = {"rhat": 1.0, "size": 1.0, "seconds": 1.0, "evaluations": 1}
-    raced = {"paces": dict.fromkeys((NUTS, "metropolis", "adapted"), pace), "posterior_s": 1.0}
+    raced = {"paces": dict.fromkeys((SAMPLER, "metropolis", "adapted"), pace), "posterior_s": 1.0}
     compared = {"cart": {"shares": {name: {"1": 0.1} for name in (OURS, *RIVALS)}}}
 
     def value_of(told):

@@ -19,25 +19,26 @@ TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])
 
 
-COMPILED = {"_look", "_sensitivity", "_block"}  # what takes seconds to compile
+COMPILED = {"_look", "_sensitivity", "_crossed", "_followed"}
 
 
 @contextlib.contextmanager
-def compiled():
-    """Those of `COMPILED` that are compiled meanwhile, in a set that fills."""
+def compiled(among=COMPILED):
+    """Those functions that are compiled meanwhile, in a set that fills."""
     names, handler = set(), logging.Handler()
 
     def emit(record):
         message = record.getMessage()
         if message.startswith("Compiling"):
-            names.update(name for name in COMPILED if f"jit({name})" in message)
+            names.update(name for name in among if f"jit({name})" in message)
 
     handler.emit = emit
     logging.getLogger("jax").addHandler(handler)
+    jax.config.update("jax_log_compiles", True)  # in all threads, as `jax.log_compiles` does not
     try:
-        with jax.log_compiles():
-            yield names
+        yield names
     finally:
+        jax.config.update("jax_log_compiles", False)
         logging.getLogger("jax").removeHandler(handler)
 
 
@@ -46,7 +47,7 @@ def first():
     """A posterior, and what was compiled for it."""
     with compiled() as names:
         # Headed backwards: the camera's angle jumps by a turn within the pieces.
-        found = identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True, draws=400)
+        found = identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True)
     return found, names
 
 
@@ -89,7 +90,7 @@ def test_models_are_a_batch(posterior):
 
 
 def test_the_same_seed_gives_the_same_draws(posterior):
-    again = identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True, draws=400)
+    again = identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True)
     np.testing.assert_array_equal(again.draws.position, posterior.draws.position)
 
 
@@ -105,7 +106,7 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
         raise AssertionError("expected to be refused before the search for modes")
 
     monkeypatch.setattr("palpate.identification.bayesian.settle", searched)
-    monkeypatch.setattr("palpate.identification.bayesian.no_u_turn", searched)
+    monkeypatch.setattr("palpate.identification.bayesian.local_global", searched)
     recording = pushes(TRUE, 3, trials=1, frames=61)
     target = motion_posterior(
         MODEL, cut(recording, MODEL, 1.0, at_rest=True), known_scales(MODEL, NOISE)
@@ -121,6 +122,17 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
             draw(target, modes, **few)
 
 
+def test_a_posterior_of_too_many_coordinates_is_for_the_no_u_turn_sampler(posterior, monkeypatch):
+    monkeypatch.setattr("palpate.identification.bayesian.WIDEST", posterior.target.dimension - 1)
+    with compiled({"_block", "_crossed"}) as names:
+        found = draw(posterior.target, posterior.modes, chains=4, draws=150)
+    assert names == {"_block"}
+    assert found.draws.position.shape == (4, 150, posterior.target.dimension)
+    np.testing.assert_allclose(
+        found.flat.mean(axis=0), posterior.flat.mean(axis=0), atol=0.25 * posterior.flat.std()
+    )
+
+
 def test_an_unmoved_sled_is_said_to_tell_nothing():
     recording = pushes(TRUE, 3, trials=1, frames=61)
     still = type(recording)(
@@ -131,7 +143,7 @@ def test_an_unmoved_sled_is_said_to_tell_nothing():
         0.0 * recording.action,
         recording.length,
     )
-    found = identify(MODEL, still, at_rest=True, draws=400)
+    found = identify(MODEL, still, at_rest=True)
     assert {"mass", "friction[0]", "friction[1]"} <= set(found.undecided)
     assert any("next to nothing of" in sentence for sentence in found.warnings)
 

@@ -14,8 +14,10 @@ from palpate.identification import metropolis
 from palpate.identification.diagnostics import bulk_size, rhat
 from palpate.identification.draws import time_to_compile
 from palpate.identification.hamiltonian import no_u_turn
-from palpate.identification.laplace import climb_each, find_modes
+from palpate.identification.laplace import Modes, climb_each, find_modes
+from palpate.identification.local_global import local_global
 from palpate.identification.metropolis import covariance_adapted, prior_scaled
+from palpate.identification.mixture import fit_mixture
 from palpate.identification.target import Target
 from palpate.identification.tempered import (
     IMPOSSIBLE,
@@ -31,13 +33,17 @@ KEY = jax.random.key(7)
 
 def sampled(name, target):
     modes = find_modes(target, KEY)
+    if name == "local-global":
+        return local_global(target, modes, KEY, chains=8, draws=1000)
     if name == "no u-turn":
         return no_u_turn(target, modes, KEY, chains=4, draws=2000)
     method = {"prior scaled": prior_scaled, "covariance adapted": covariance_adapted}[name]
     return method(target, modes.draw(KEY, 4), KEY, draws=4000, warm_up=2000, thin=5)
 
 
-@pytest.mark.parametrize("name", ["prior scaled", "covariance adapted", "no u-turn"])
+@pytest.mark.parametrize(
+    "name", ["prior scaled", "covariance adapted", "no u-turn", "local-global"]
+)
 def test_draws_have_the_moments_of_the_normal_posterior(name):
     target = linear()
     mean, covariance = target.moments()
@@ -122,13 +128,64 @@ def test_modes_on_a_narrow_ridge_have_draws_all_along_it():
     assert np.std(draws @ ALONG) == pytest.approx(1.0, rel=0.1)
 
 
-def test_three_chains_begin_apart_on_a_narrow_ridge_and_stay_on_it():
-    found = no_u_turn(Ridge(), find_modes(Ridge(), KEY, starts=2), KEY, chains=3, draws=50)
+@pytest.mark.parametrize("sampler", [no_u_turn, local_global])
+def test_three_chains_begin_apart_on_a_narrow_ridge_and_stay_on_it(sampler):
+    found = sampler(Ridge(), find_modes(Ridge(), KEY, starts=2), KEY, chains=3, draws=50)
     assert found.position.shape == (3, 50, 2)
     assert found.density.shape == (3, 50)
     assert found.acceptance.shape == (3,)
     assert np.max(np.abs(found.position @ ACROSS - 1.0)) < 1e-4
     assert np.min(np.std(found.position @ ALONG, axis=1)) > 0.1
+
+
+class Islands(Target):
+    """Two normal distributions 20 standard deviations apart, of which one has three quarters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("x", "y")
+
+    def log_likelihood(self, position: Array) -> Array:
+        x, y = position
+        off = (jnp.stack([x - 1.0, x + 1.0]) / 0.1) ** 2 + (y / 0.3) ** 2
+        return jax.nn.logsumexp(jnp.log(jnp.array([0.75, 0.25])) - 0.5 * off)
+
+
+def test_chains_cross_between_islands_as_often_as_these_are_probable():
+    none = jnp.zeros(2)
+    islands = jnp.array([[1.0, 0.0], [-1.0, 0.0]])
+    spread = np.tile(np.diag([0.01, 0.08]), (2, 1, 1))
+    modes = Modes(islands, none, jnp.zeros((2, 2)), spread, none)
+    found = local_global(Islands(), modes, KEY, chains=8, draws=500)
+    on_first = found.position[..., 0] > 0
+    # A trajectory that crosses would have lost 50 in density halfway.
+    assert np.all(np.any(on_first, axis=1) & np.any(~on_first, axis=1))
+    assert np.mean(on_first) == pytest.approx(0.75, abs=0.04)
+    assert np.max(rhat(found.position)) < 1.02
+    again = local_global(Islands(), modes, KEY, chains=8, draws=500)
+    np.testing.assert_array_equal(again.position, found.position)
+
+
+def test_a_mixture_is_a_density_and_its_draws_have_it():
+    draws = np.random.default_rng(0).normal(size=(1000, 2)) @ np.array([[2.0, 0.3], [0.0, 0.1]])
+    draws[:250] += [8.0, -1.0]
+    mixture = fit_mixture(draws, np.eye(2))
+    x, y = np.meshgrid(np.linspace(-12, 20, 801), np.linspace(-5, 5, 401), indexing="ij")
+    grid = jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=1))
+    value = np.exp(jax.vmap(mixture.log_density)(grid)).reshape(x.shape)
+    assert value.sum() * (32 / 800) * (10 / 400) == pytest.approx(1.0, abs=0.01)
+    again = np.asarray(mixture.draw(KEY, 20000))
+    assert np.mean(again[:, 0] > 4.0) == pytest.approx(np.mean(draws[:, 0] > 4.0), abs=0.02)
+    np.testing.assert_allclose(again.mean(axis=0), draws.mean(axis=0), atol=0.1)
+    np.testing.assert_allclose(np.cov(again.T), np.cov(draws.T), rtol=0.15, atol=0.02)
+
+
+@pytest.mark.parametrize("count", [2, 7, 300])
+def test_a_mixture_of_few_draws_or_of_equal_ones_is_regular(count):
+    for draws in (np.ones((count, 3)), np.random.default_rng(1).normal(size=(count, 3))):
+        mixture = fit_mixture(draws, np.eye(3))
+        assert np.all(np.isfinite(np.asarray(mixture.draw(KEY, 10))))
+        assert np.isfinite(float(mixture.log_density(jnp.asarray(draws[0], jnp.float32))))
 
 
 def test_a_climb_of_some_coordinates_ends_where_the_others_leave_them_most_probable():

@@ -89,7 +89,7 @@ def run(options: IdentifyBayesian) -> Path:
 
 
 def identify(
-    targets: Mapping[str, MotionPosterior], draws: int = 300, chains: int = 4, seed: int = 0
+    targets: Mapping[str, MotionPosterior], draws: int = 100, chains: int = 16, seed: int = 0
 ) -> Found:
     """Compare hypotheses by their evidence and sample the posterior of the most probable.
 

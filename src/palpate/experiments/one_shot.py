@@ -37,7 +37,7 @@ from palpate.experiments.one_shot_pieces import (
     scene,
 )
 from palpate.experiments.one_shot_regression import OURS, RIVALS, SIZES, shares
-from palpate.experiments.one_shot_sampling import OURS as NUTS
+from palpate.experiments.one_shot_sampling import OURS as SAMPLER
 from palpate.experiments.one_shot_sampling import Pace, race
 from palpate.experiments.rope_stabilization import announce, finish
 from palpate.identification.bayesian import sample
@@ -69,9 +69,9 @@ class Size:
 
 
 FULL = Size(
-    2, 10, 300, 100, 150, 6, 500, 60.0, {"pieces": 25, "samples": 50, "samplers": 5, "scene": 15}
+    2, 10, 100, 50, 150, 6, 100, 60.0, {"pieces": 25, "samples": 50, "samplers": 5, "scene": 15}
 )
-QUICK = Size(1, 4, 100, 50, 50, 2, 100, 5.0, {"pieces": 4, "samples": 2, "samplers": 1})
+QUICK = Size(1, 4, 25, 25, 50, 2, 25, 5.0, {"pieces": 4, "samples": 2, "samplers": 1})
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
@@ -264,12 +264,12 @@ def _figures(
                spread=two_standard_errors(inside)),
         Figure("coverage_90_over", float(np.mean(inside)), "", bar=0.95),
         Figure("wins_against_regression", wins / cells, "", bar=0.9, better="higher"),
-        Figure("rhat_max_predictions", paces[NUTS].rhat, "", bar=1.01),
-        Figure("ess_min", paces[NUTS].size, "", bar=400, better="higher"),
+        Figure("rhat_max_predictions", paces[SAMPLER].rhat, "", bar=1.01),
+        Figure("ess_min", paces[SAMPLER].size, "", bar=400, better="higher"),
         Figure("sampling_s", raced["posterior_s"], "s", bar=60),
-        Figure("ess_per_s_over_metropolis", paces[NUTS].rate / paces["metropolis"].rate, "",
+        Figure("ess_per_s_over_metropolis", paces[SAMPLER].rate / paces["metropolis"].rate, "",
                bar=20, better="higher"),
-        Figure("ess_per_s_over_adapted", paces[NUTS].rate / paces["adapted"].rate, "", bar=1,
+        Figure("ess_per_s_over_adapted", paces[SAMPLER].rate / paces["adapted"].rate, "", bar=1,
                better="higher"),
     ]  # fmt: skip
     if joint is not None:

@@ -44,6 +44,7 @@ HANDLED = 10.0  # s
 MOVABLE = ("table", "cart", "couch", "bookshelf", "chair", "hinged")
 BOLTED = "bolted"
 SCENE = ("table", "cart", "couch", "chair", "bookshelf")
+CHAINS = 4  # of a scene: too wide for the sampler that has many
 APART = 4.0  # m between the pieces of the scene
 
 
@@ -111,7 +112,7 @@ def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
         values.append({path: value_of(found, path) for path in target.coordinates.declarations})
     joined = {path: jnp.concatenate([each[path] for each in values]) for path in values[0]}
     target = posterior_of(with_values(together, joined), handled.align(PERIOD, POSE, WRENCH))
-    return sample(target, draws=draws, seed=seed)
+    return sample(target, chains=CHAINS, draws=draws, seed=seed)
 
 
 def judged(model: Model, predicted: Predicted, pieces: Segments) -> Pushes:

@@ -42,7 +42,7 @@ MOVED = 0.02  # m: beyond any noise
 PIECE = 10  # samples: longest piece of the handling that the posterior is asked to explain
 RIVALS = ("lwr", "oo-lwr", "gp")
 OURS = "posterior"
-CHAINS = 2  # their draws are predicted with, and not compared
+CHAINS = 8  # their draws are predicted with, and not compared
 
 
 def shares(

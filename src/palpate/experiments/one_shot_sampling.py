@@ -18,7 +18,7 @@ from palpate.identification.diagnostics import bulk_size, rhat, tail_size
 from palpate.identification.draws import Draws
 from palpate.identification.metropolis import covariance_adapted, prior_scaled
 
-OURS = "nuts"
+OURS = "local-global"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -160,9 +160,9 @@ class IdentifyBayesian(Reading, ABC):
         tuple[Path, ...], arg(metavar="FILE ...", help_behavior_hint="(default: none)")
     ] = ()
     """Recordings to score on and not to fit."""
-    draws: int = 300
+    draws: int = 100
     """Of each chain, after its warm-up."""
-    chains: int = 4
+    chains: int = 16
     """Independent of one another, so that it shows when they do not agree."""
 
     @abstractmethod

@@ -4,8 +4,10 @@
     posterior.table                    # medians, intervals, R-hat, what the data left undecided
     posterior.predict(cut(held_out, model, 2.0, at_rest=True))
 
-The likelihood is `palpate.identification.likelihood`'s, of pieces of a second or so; chains of the
-no-U-turn sampler begin at the posterior's modes. Other samplers of the same target: Metropolis
+The likelihood is `palpate.identification.likelihood`'s, of pieces of a second or so; chains begin
+at the posterior's modes, and follow trajectories and cross it by turns (`local_global`), or those
+of the no-U-turn sampler (`hamiltonian`) where there are too many coordinates to learn proposals
+in. Other samplers of the same target: Metropolis
 (`metropolis`), tempered particles with evidence (`tempered`), and particles that follow data as
 they arrive (`online`).
 """
@@ -32,6 +34,7 @@ from palpate.identification.likelihood import (
     inferred_scales,
     motion_posterior,
 )
+from palpate.identification.local_global import local_global
 from palpate.identification.predictive import Predicted, Score
 from palpate.identification.segments import Segments, cut, noise_scale
 from palpate.models.model import Model
@@ -40,6 +43,7 @@ from palpate.recording import Aligned
 
 MIXED, ENOUGH = 1.01, 400.0  # R-hat and effective sizes that chains should reach (Vehtari et al.)
 UNDECIDED = 0.7  # posterior over prior standard deviation above which the data say nothing
+WIDEST = 40  # coordinates among which a mixture that proposes can be learnt
 PREDICTING = 400  # draws that a prediction is made of
 
 
@@ -229,8 +233,8 @@ def identify(
     *,
     seconds: float = 1.0,
     at_rest: bool = False,
-    chains: int = 4,
-    draws: int = 300,
+    chains: int = 16,
+    draws: int = 100,
     seed: int = 0,
     probes: Segments | None = None,
     tell: Callable[[int, int], None] = lambda done, blocks: None,
@@ -253,8 +257,8 @@ def identify(
 def sample(
     target: MotionPosterior,
     *,
-    chains: int = 4,
-    draws: int = 300,
+    chains: int = 16,
+    draws: int = 100,
     seed: int = 0,
     probes: Segments | None = None,
     tell: Callable[[int, int], None] = lambda done, blocks: None,
@@ -270,8 +274,8 @@ def draw(
     target: MotionPosterior,
     modes: Modes,
     *,
-    chains: int = 4,
-    draws: int = 300,
+    chains: int = 16,
+    draws: int = 100,
     seed: int = 0,
     probes: Segments | None = None,
     tell: Callable[[int, int], None] = lambda done, blocks: None,
@@ -279,7 +283,8 @@ def draw(
     """As `sample`, for a target that has been settled (`laplace.settle`) about its modes."""
     check_numbers(chains, draws)
     _, sampling = jax.random.split(jax.random.key(seed))
-    found = no_u_turn(target, modes, sampling, chains, draws, tell)
+    sampler = local_global if target.dimension <= WIDEST else no_u_turn
+    found = sampler(target, modes, sampling, chains, draws, tell)
     return Posterior(target, found, modes, target.segments if probes is None else probes)
 
 
@@ -288,7 +293,7 @@ def check_numbers(chains: int, draws: int) -> None:
     if chains < 1 or draws < FEWEST:
         raise PalpateError(
             f"expected at least 1 chain of {FEWEST} draws, by which it can be judged, got {chains} "
-            f"of {draws}: 4 of 300 are usual"
+            f"of {draws}: 16 of 100 are usual"
         )
 
 

@@ -24,7 +24,8 @@ from scipy.stats import chi2
 
 from palpate.errors import PalpateError
 from palpate.identification.diagnostics import bulk_size
-from palpate.identification.hamiltonian import BLOCK, GAIN, chain, pooled
+from palpate.identification.draws import pooled
+from palpate.identification.hamiltonian import BLOCK, GAIN, chain
 from palpate.identification.laplace import STARTS, Modes, search
 from palpate.identification.likelihood import (
     MotionPosterior,

@@ -45,6 +45,17 @@ def time_to_compile(
     return float(sum(max(0.0, spent[index] - pace * done[index]) for index in first))
 
 
+def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Covariance of the draws of all chains, with the earlier one worth a few draws.
+
+    As few draws as two for each coordinate: it keeps the estimate positive definite.
+    """
+    flat = position.reshape(-1, position.shape[-1]).astype(np.float64)
+    weight = 2.0 * flat.shape[1]
+    scatter = np.cov(flat, rowvar=False).reshape(prior.shape) * len(flat)
+    return (scatter + weight * prior) / (len(flat) + weight)
+
+
 def check_start(
     target: Target, position: Float[np.ndarray, "chains free"], value: Float[np.ndarray, " chains"]
 ) -> None:

@@ -18,7 +18,7 @@ from blackjax.mcmc.hmc import HMCState
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from palpate.devices import compiled_sooner, over_devices
-from palpate.identification.draws import Draws, check_start, time_to_compile
+from palpate.identification.draws import Draws, check_start, pooled, time_to_compile
 from palpate.identification.laplace import Modes, look
 from palpate.identification.target import Target
 from palpate.small_systems import solve_lower, solve_upper
@@ -98,17 +98,6 @@ def no_u_turn(
         seconds=time.monotonic() - began,
         compiling=time_to_compile(spent, leaps, first=(0,)),
     )
-
-
-def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Covariance of the draws of all chains, with the earlier one worth a few draws.
-
-    As few draws as two for each coordinate: it keeps the estimate positive definite.
-    """
-    flat = position.reshape(-1, position.shape[-1]).astype(np.float64)
-    weight = 2.0 * flat.shape[1]
-    scatter = np.cov(flat, rowvar=False).reshape(prior.shape) * len(flat)
-    return (scatter + weight * prior) / (len(flat) + weight)
 
 
 @compiled_sooner

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
+from palpate.identification.laplace import Modes, look
 from palpate.identification.likelihood import MotionPosterior
 from palpate.identification.target import Target
 
@@ -54,6 +55,21 @@ def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
     weight = 2.0 * flat.shape[1]
     scatter = np.cov(flat, rowvar=False).reshape(prior.shape) * len(flat)
     return (scatter + weight * prior) / (len(flat) + weight)
+
+
+def begun(
+    target: Target, modes: Modes, key: PRNGKeyArray, chains: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where chains begin, (chains, free), with density and slope: at draws of the modes' mixture.
+
+    A draw whose density is not finite is replaced by the best mode. Raises `PalpateError` where
+    that has none either.
+    """
+    position = np.array(modes.draw(key, chains))
+    position[~np.isfinite(look(target, position)[0])] = modes.position[0]
+    value, slope, _ = look(target, position)
+    check_start(target, position, value)
+    return position, value.astype(position.dtype), slope.astype(position.dtype)
 
 
 def check_start(

@@ -18,8 +18,8 @@ from blackjax.mcmc.hmc import HMCState
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from palpate.devices import compiled_sooner, over_devices
-from palpate.identification.draws import Draws, check_start, pooled, time_to_compile
-from palpate.identification.laplace import Modes, look
+from palpate.identification.draws import Draws, begun, pooled, time_to_compile
+from palpate.identification.laplace import Modes
 from palpate.identification.target import Target
 from palpate.small_systems import solve_lower, solve_upper
 
@@ -60,12 +60,8 @@ def no_u_turn(
     """
     began = time.monotonic()
     begin, *keys = jax.random.split(key, 1 + WARM_UP + -(-draws // BLOCK))
-    position = np.array(modes.draw(begin, chains))
-    lost = ~np.isfinite(look(target, position)[0])
-    position[lost] = modes.position[0]
-    value, slope, _ = look(target, position)
-    check_start(target, position, value)
-    state = position, value.astype(position.dtype), slope.astype(position.dtype)
+    state = begun(target, modes, begin, chains)
+    position = state[0]
     covariance = np.asarray(modes.covariance[0], np.float64)
     step = np.full(chains, np.log(1.2 * target.dimension**-0.25))
     blocks, leaps, spent = [], [], []

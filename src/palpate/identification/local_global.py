@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.devices import compiled_sooner, over_devices
-from palpate.identification.draws import Draws, check_start, pooled, time_to_compile
-from palpate.identification.laplace import Modes, look
+from palpate.identification.draws import Draws, begun, pooled, time_to_compile
+from palpate.identification.laplace import Modes
 from palpate.identification.mixture import Mixture, fit_mixture
 from palpate.identification.target import Target
 
@@ -53,16 +53,12 @@ def local_global(
     """
     began = time.monotonic()
     total = WARM_UP + draws
-    begin, varying, key = jax.random.split(key, 3)
+    begin, fitting, varying, key = jax.random.split(key, 4)
     shares = np.asarray(jax.random.uniform(varying, (total,), minval=VARIED[0], maxval=VARIED[1]))
     keys = jax.random.split(key, (total, 2, chains))
-    position = np.array(modes.draw(begin, max(chains, 20 * target.dimension)))
+    position, value, _ = begun(target, modes, begin, chains)
     covariance = np.asarray(modes.covariance[0], np.float64)
-    mixture = fit_mixture(position, covariance)
-    position = position[:chains]
-    position[~np.isfinite(look(target, position)[0])] = modes.position[0]
-    value = look(target, position)[0].astype(position.dtype)
-    check_start(target, position, value)
+    mixture = fit_mixture(np.asarray(modes.draw(fitting, 20 * target.dimension)), covariance)
     log_step = float(np.log(1.2 * target.dimension**-0.25))
 
     def cross(key: Array) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from palpate.devices import compiled_sooner, over_devices
+from palpate.devices import compiled_at_once, over_devices
 from palpate.errors import PalpateError
 from palpate.identification.likelihood import MotionPosterior, initial_position
 from palpate.identification.target import Target
@@ -189,7 +189,7 @@ def _each(target: Target, position: ArrayLike) -> tuple[np.ndarray, ...]:
     return tuple(np.concatenate(of)[:count] for of in zip(*found, strict=True))
 
 
-@compiled_sooner
+@compiled_at_once
 def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
     return over_devices(lambda target, part: target.curvatures(part))(target, position)
 

@@ -22,6 +22,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from palpate.devices import compiled_at_once
 from palpate.errors import PalpateError
 from palpate.identification.discrepancy import eigenvectors
 from palpate.identification.segments import Segments
@@ -345,7 +346,7 @@ def _legal_values(target: MotionPosterior, position: Array) -> dict[str, Array]:
     return jax.vmap(values)(position)
 
 
-@eqx.filter_jit
+@compiled_at_once
 def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     """Derivatives of rotated residuals by the start's errors in vague standard deviations."""
     segments, model = target.segments, target.model(position)

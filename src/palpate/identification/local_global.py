@@ -1,19 +1,21 @@
-"""Chains that follow trajectories side by side, and cross the posterior between them.
+"""Chains that walk a posterior in steps of the shape that it has where they are, and leap across.
 
-A trajectory crosses a posterior in steps as short as its narrowest place asks for. Where a wheel
-may be too weak to be noticed, its place and direction are free, ten times as wide as where it is
-felt, and from the one to the other takes dozens of trajectories. So between any two of them a chain
-may go to one of several candidates from a mixture that is fitted to what all chains have seen, in
-proportion to the target's density over the mixture's (iterated sampling importance resampling:
-Andrieu, Lee and Vihola, Bernoulli 24, 2018; with local moves: Samsonov et al., NeurIPS 2022).
+Where a wheel may be too weak to be noticed, its place and direction are free, ten times as wide as
+where it is felt: no one shape of a step fits both. What all chains have seen is described by a
+mixture. A chain takes the shape of a step from one of its components, chosen by their
+responsibility for where the chain is (the localised random walk of Andrieu and Thoms, Stat. Comput.
+18, 2008, section 6), or, less often, from all that has been seen; and now and then it is proposed a
+draw of the mixture itself (Tierney, Ann. Stat. 22, 1994). No move needs a slope.
 
-The trajectories have one length for all chains, varied from draw to draw (Duane et al., Phys. Lett.
-B 195, 1987; Neal 2011), so that none waits for another and their densities are computed together.
+A leap leads back as seldom as the mixture knows where a chain has got to, so it has to know the
+posterior's tails as well. In the warm-up half of the chains therefore see a flatter likelihood, the
+flattest its root (as in tempering: Geyer, Comput. Sci. Stat. 23, 1991).
+
+All chains step at once, so that their densities are computed side by side.
 """
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -24,16 +26,17 @@ from palpate.devices import compiled_sooner, over_devices
 from palpate.identification.draws import Draws, begun, pooled, time_to_compile
 from palpate.identification.laplace import Modes
 from palpate.identification.mixture import Mixture, fit_mixture
-from palpate.identification.target import Target
+from palpate.identification.target import Target, log_prior
 
-WARM_UP, ROUND = 250, 25  # draws of the warm-up, and after how many something is learnt in it
-REMEMBERED = 2 / 3  # share of the warm-up's draws so far, the last ones, that is learnt from
-CANDIDATES = 16  # of a crossing, besides where a chain is
-LENGTH = 2.0  # of a trajectory, mean, in standard deviations of the posterior
-VARIED = 0.2, 1.8  # by which that is multiplied
-ACCEPTANCE = 0.8
-GAIN = 0.15  # of the step size's logarithm per draw, at first; falls as the root of the draws
-DIVERGED = 1000.0  # loss of density's logarithm
+STEPS = 3  # between two draws, for each coordinate
+ROUNDS, ROUND = 18, 40  # of the warm-up, and looks at the chains in each
+LOOKS = 2  # of these in as many steps as there are coordinates
+FLATTEST, STRAIGHT = 0.5, 3  # power of the likelihood; rounds of the warm-up that end without any
+MORE = 1.2  # times as much as was learnt from has to be seen before more is learnt
+REMEMBERED = 2 / 3  # share of the warm-up's looks so far, the last ones, that is learnt from
+LEAPING, WHOLE = 0.2, 0.2  # shares of steps that leap, and that have the shape of all that was seen
+ACCEPTANCE = 0.25  # of steps that do not leap
+LENGTH = 2.38  # over the root of the dimension: first length of a step, in standard deviations
 
 
 def local_global(
@@ -47,130 +50,125 @@ def local_global(
     """Sample `draws` of each of `chains` after the warm-up.
 
     Chains begin at draws of the modes' mixture. `tell(done, rounds)` is called after every round.
-    In the warm-up the mixture and the metric are learnt from the draws of all chains, and the step
-    size is steered to its acceptance; then all are kept. Raises `PalpateError` when the density is
-    not finite where a chain begins.
+    In the warm-up the mixture and the length of steps are learnt from all chains; then they are
+    kept. Raises `PalpateError` when the density is not finite where a chain begins.
     """
     began = time.monotonic()
-    total = WARM_UP + draws
-    begin, fitting, varying, key = jax.random.split(key, 4)
-    shares = np.asarray(jax.random.uniform(varying, (total,), minval=VARIED[0], maxval=VARIED[1]))
-    keys = jax.random.split(key, (total, 2, chains))
+    begin, fitting, key = jax.random.split(key, 3)
+    size = target.dimension
     position, value, _ = begun(target, modes, begin, chains)
     covariance = np.asarray(modes.covariance[0], np.float64)
-    mixture = fit_mixture(np.asarray(modes.draw(fitting, 20 * target.dimension)), covariance)
-    log_step = float(np.log(1.2 * target.dimension**-0.25))
-
-    def cross(key: Array) -> tuple[np.ndarray, np.ndarray]:
-        return jax.device_get(_crossed(target, mixture, position, value, key))
-
-    def follow(key: Array, leaps: int) -> tuple[np.ndarray, ...]:
-        root = np.linalg.cholesky(covariance).astype(position.dtype)
-        step = np.asarray(np.exp(log_step), position.dtype)
-        return jax.device_get(_followed(target, position, root, step, np.asarray(leaps), key))
-
-    now = time.monotonic()
-    with ThreadPoolExecutor() as pool:  # both compile at once
-        for each in pool.submit(cross, keys[0, 0]), pool.submit(follow, keys[0, 1], 1):
-            each.result()
-    spent, evaluations = [time.monotonic() - now], [chains * (2 + CANDIDATES)]
-    positions, values, accepted, gains, steps = [], [], [], [], []
-    for index in range(total):
-        now = time.monotonic()
-        position, value = cross(keys[index, 0])
-        leaps = max(1, round(float(shares[index]) * LENGTH / np.exp(log_step)))
-        position, value, gain = follow(keys[index, 1], leaps)
-        chance = np.exp(np.minimum(gain, 0.0))
-        for kept, new in ((positions, position), (values, value), (accepted, chance)):
-            kept.append(new)
-        gains.append(gain)
-        evaluations.append(chains * (leaps + 1 + CANDIDATES))
+    mixture = fit_mixture(np.asarray(modes.draw(fitting, 20 * size)), covariance)
+    log_length = float(np.log(LENGTH / np.sqrt(size)))
+    flat = np.ones(chains, position.dtype)
+    flat[: chains // 2] = np.linspace(FLATTEST, 1.0, chains // 2, endpoint=False)
+    looks = [ROUND] * ROUNDS + [ROUND] * (draws // ROUND) + [draws % ROUND] * (draws % ROUND > 0)
+    positions, values, accepted, spent, evaluations, learnt = [], [], [], [], [], 0
+    for index, count in enumerate(looks):
+        now, learning = time.monotonic(), index < ROUNDS
+        power = flat if index < ROUNDS - STRAIGHT else np.ones_like(flat)
+        steps = -(-size // LOOKS) if learning else STEPS * size
+        length = np.asarray(np.exp(log_length), position.dtype)
+        seen, density, stepped, leapt = jax.device_get(
+            _walked(
+                target, mixture, length, np.linalg.cholesky(covariance).astype(position.dtype),
+                np.asarray([count, steps]), power, position, value,
+                jax.random.split(jax.random.fold_in(key, index), chains),
+            )
+        )  # fmt: skip
+        position, value = seen[:, count - 1], density[:, count - 1]
+        positions.append(seen[:, :count])
+        values.append(density[:, :count])
+        accepted.append((stepped + leapt) / (count * steps))
+        evaluations.append(chains * count * steps)
         spent.append(time.monotonic() - now)
-        done = index + 1
-        if done <= WARM_UP:
-            fading = np.sqrt(1.0 + index % ROUND / 5.0)
-            log_step += GAIN / fading * float(chance.mean() - ACCEPTANCE)
-            steps.append(log_step)
-            if done % ROUND == 0:
-                log_step = float(np.median(steps[-ROUND // 2 :]))
-            if done % ROUND == 0 and done > ROUND:
-                seen = np.concatenate(positions[-int(REMEMBERED * done) :])
-                mixture = fit_mixture(seen, covariance)
-                if done < WARM_UP:  # the last round is for the step
-                    covariance = pooled(seen, covariance)
-        if done % ROUND == 0 or done == total:
-            tell(-(-done // ROUND), -(-total // ROUND))
+        if learning:
+            rate = stepped.sum() / ((1.0 - LEAPING) * evaluations[-1])
+            log_length += 4.0 * float(rate - ACCEPTANCE) / np.sqrt(index + 1.0)
+            if index + 1 >= MORE * learnt or index + 1 == ROUNDS:
+                learnt = index + 1
+                known = np.concatenate(positions[-int(np.ceil(REMEMBERED * learnt)) :], axis=1)
+                known = known.reshape(-1, size)
+                mixture, covariance = fit_mixture(known, covariance), pooled(known, covariance)
+        tell(index + 1, len(looks))
     return Draws(
-        position=np.stack(positions[WARM_UP:], axis=1),
-        density=np.stack(values[WARM_UP:], axis=1),
-        acceptance=np.mean(accepted[WARM_UP:], axis=0),
-        divergences=int(np.sum(np.stack(gains[WARM_UP:]) < -DIVERGED)),
-        evaluations=int(sum(evaluations)),
+        position=np.concatenate(positions[ROUNDS:], axis=1),
+        density=np.concatenate(values[ROUNDS:], axis=1),
+        acceptance=np.mean(accepted[ROUNDS:], axis=0),
+        divergences=0,
+        evaluations=2 * chains + sum(evaluations),
         seconds=time.monotonic() - began,
         compiling=time_to_compile(spent, evaluations, first=(0,)),
     )
 
 
 @compiled_sooner
-def _crossed(
-    target: Target, mixture: Mixture, position: Array, value: Array, keys: Array
-) -> tuple[Float[Array, "chains free"], Float[Array, " chains"]]:
-    """Each chain at one of its candidates or where it was, and the density there."""
+def _walked(
+    target: Target,
+    mixture: Mixture,
+    length: Array,
+    root: Array,
+    counts: Array,
+    flat: Array,
+    position: Array,
+    value: Array,
+    keys: Array,
+) -> tuple[
+    Float[Array, "chains looks free"],
+    Float[Array, "chains looks"],
+    Float[Array, " chains"],
+    Float[Array, " chains"],
+]:
+    """Positions and densities at `counts[0]` looks, each after `counts[1]` steps.
 
-    def part(shared, each) -> tuple[Array, Array]:
-        target, mixture = shared
-        position, value, keys = each
-        proposing, choosing = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
-        candidates = jax.vmap(lambda key: mixture.draw(key, CANDIDATES))(proposing)
-        found = target.densities(candidates.reshape(-1, position.shape[1]))
-        positions = jnp.concatenate([position[:, None], candidates], axis=1)
-        values = jnp.concatenate([value[:, None], found.reshape(len(position), -1)], axis=1)
-        weights = values - jax.vmap(jax.vmap(mixture.log_density))(positions)
-        chosen = jax.vmap(jax.random.categorical)(choosing, weights)
-        rows = jnp.arange(len(position))
-        return positions[rows, chosen], values[rows, chosen]
-
-    return over_devices(part)((target, mixture), (position, value, keys))
-
-
-@compiled_sooner
-def _followed(
-    target: Target, position: Array, root: Array, step: Array, leaps: Array, keys: Array
-) -> tuple[Float[Array, "chains free"], Float[Array, " chains"], Float[Array, " chains"]]:
-    """Each chain at the end of its trajectory or, refused, where it was, and the density there.
-
-    Also what the trajectory gained in the joint density's logarithm, minus infinity where that is
-    not finite. In the coordinates y of x = root y the metric is the identity.
+    There is room for `ROUND` looks, whose end stays empty. Also how many steps and how many leaps
+    of each chain were accepted. `flat` is the power of each chain's likelihood.
     """
 
-    def part(shared, each) -> tuple[Array, Array, Array]:
-        target, root, step, leaps = shared
-        position, keys = each
-        pushing, choosing = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
-        push = jax.vmap(lambda key: jax.random.normal(key, position.shape[1:], position.dtype))
-        begun = push(pushing)
+    def part(shared, each) -> tuple[Array, Array, Array, Array]:
+        target, mixture, length, root, counts = shared
+        flat, position, value, keys = each
+        looks, steps = counts
 
-        def total(position: Array) -> tuple[Array, Array]:
-            each = target.densities(position)
-            return jnp.sum(each), each
+        def proposed(position: Array, key: Array) -> tuple[Array, Array, Array]:
+            """Where to, how much more probable (its logarithm) the way back is, and the kind."""
+            deciding, pushing, choosing, leaping = jax.random.split(key, 4)
+            which = jax.random.uniform(deciding)
+            noise = length * jax.random.normal(pushing, position.shape, position.dtype)
+            share = mixture.log_shares(position)
+            of = jax.random.categorical(choosing, share)
+            local, far = position + mixture.root[of] @ noise, mixture.draw(leaping, 1)[0]
+            back = mixture.log_shares(local)[of] - share[of]
+            across = mixture.log_density(position) - mixture.log_density(far)
+            leaps, whole = which < LEAPING, which < LEAPING + WHOLE
+            there = jnp.where(leaps, far, jnp.where(whole, position + root @ noise, local))
+            return there, jnp.where(leaps, across, jnp.where(whole, 0.0, back)), leaps
 
-        # The first slope is computed in the loop too: elsewhere it would be compiled once more.
-        def leap(index: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-            position, momentum, first, _ = carry
-            (_, value), slope = jax.value_and_grad(total, has_aux=True)(position)
-            within = (index > 0) & (index < leaps)
-            slope = jnp.where(jnp.isfinite(slope), slope, 0.0) @ root
-            momentum = momentum + jnp.where(within, step, 0.5 * step) * slope
-            position = position + jnp.where(index < leaps, step, 0.0) * momentum @ root.T
-            return position, momentum, jnp.where(index == 0, value, first), value
+        def step(_: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+            position, value, keys, stepped, leapt = carry
+            keys, proposing, deciding = jnp.moveaxis(
+                jax.vmap(lambda key: jax.random.split(key, 3))(keys), 1, 0
+            )
+            there, back, leaps = jax.vmap(proposed)(position, proposing)
+            density = target.densities(there)
+            prior = log_prior(there) - log_prior(position)
+            gain = flat * (density - value - prior) + prior + back
+            taken = jnp.log(jax.vmap(jax.random.uniform)(deciding)) < gain
+            position = jnp.where(taken[:, None], there, position)
+            value = jnp.where(taken, density, value)
+            return position, value, keys, stepped + (taken & ~leaps), leapt + (taken & leaps)
 
-        nothing = jnp.zeros(len(position), position.dtype)
-        end, momentum, first, value = jax.lax.fori_loop(
-            0, leaps + 1, leap, (position, begun, nothing, nothing)
+        def look(index: Array, carry: tuple) -> tuple:
+            walk, positions, values = carry
+            walk = jax.lax.fori_loop(0, steps, step, walk)
+            return walk, positions.at[:, index].set(walk[0]), values.at[:, index].set(walk[1])
+
+        none = jnp.zeros_like(value)
+        empty = jnp.zeros((len(position), ROUND, position.shape[1]), position.dtype)
+        walk, positions, values = jax.lax.fori_loop(
+            0, looks, look, ((position, value, keys, none, none), empty, empty[..., 0])
         )
-        gain = value - first + 0.5 * jnp.sum(jnp.square(begun) - jnp.square(momentum), axis=1)
-        gain = jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-        taken = jnp.log(jax.vmap(jax.random.uniform)(choosing)) < gain
-        return jnp.where(taken[:, None], end, position), jnp.where(taken, value, first), gain
+        return positions, values, *walk[3:]
 
-    return over_devices(part)((target, root, step, leaps), (position, keys))
+    shared = target, mixture, length, root, counts
+    return over_devices(part)(shared, (flat, position, value, keys))

@@ -1,27 +1,32 @@
-"""A mixture of normal distributions fitted to draws of a posterior, that proposes others.
+"""A mixture of distributions fitted to draws of a posterior, that proposes others.
 
-Expectation maximisation (Dempster, Laird and Rubin 1977) with the covariances' prior of Fraley and
-Raftery, J. Classif. 24, 2007, here about each component's own diagonal.
+Normal ones are fitted, by expectation maximisation (Dempster, Laird and Rubin 1977) with the
+covariances' prior of Fraley and Raftery, J. Classif. 24, 2007, here about each component's own
+diagonal. What proposes has Student's distributions of the same means and shapes in their place: of
+the tails few draws were seen.
 """
+
+import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.special import logsumexp
+from scipy.special import gammaln
 
 from palpate.identification.draws import pooled
 
 COMPONENTS = 8  # at most
+DEGREES = 10  # of freedom of Student's distributions
 DRAWN = 10  # draws for each coordinate that a component is learnt from, at least
 SHRINKAGE = 2.0  # draws for each coordinate that the diagonal counts as in a covariance
 NARROWEST = 0.05  # variance of a component in that of all draws which is added to it
-MOST, ROUNDS = 1500, 40  # draws that are used of all, evenly spaced; and of the maximisation
+MOST, ROUNDS = 4000, 25  # draws that are used of all, evenly spaced; and of the maximisation
 
 
 class Mixture(eqx.Module):
-    """Normal distributions: logarithms of their weights, means, and roots of their covariances.
+    """Student's distributions: logarithms of their weights, means, and roots of their scales.
 
     `whitening` is the inverse of the root, `log_volume` the logarithm of its determinant.
     """
@@ -34,15 +39,26 @@ class Mixture(eqx.Module):
 
     def log_density(self, position: Float[Array, " free"]) -> Float[Array, ""]:
         """Logarithm of the density at a position."""
+        return jax.nn.logsumexp(self._each(position))
+
+    def log_shares(self, position: Float[Array, " free"]) -> Float[Array, " components"]:
+        """Logarithm of the probability that a draw at this position is of each component."""
+        return jax.nn.log_softmax(self._each(position))
+
+    def _each(self, position: Array) -> Array:
         white = jnp.einsum("kij,kj->ki", self.whitening, position - self.mean)
-        square = jnp.sum(jnp.square(white), axis=1) + position.size * jnp.log(2.0 * jnp.pi)
-        return jax.nn.logsumexp(self.log_weight - self.log_volume - 0.5 * square)
+        size, half = position.size, 0.5 * (DEGREES + position.size)
+        beyond = jnp.log1p(jnp.sum(jnp.square(white), axis=1) / DEGREES)
+        unit = gammaln(half) - gammaln(0.5 * DEGREES) - 0.5 * size * math.log(math.pi * DEGREES)
+        return self.log_weight - self.log_volume + unit - half * beyond
 
     def draw(self, key: Array, count: int) -> Float[Array, "count free"]:
         """Independent draws."""
-        which, where = jax.random.split(key)
+        which, where, far = jax.random.split(key, 3)
         chosen = jax.random.categorical(which, self.log_weight, shape=(count,))
         noise = jax.random.normal(where, (count, self.mean.shape[1]), self.mean.dtype)
+        normal = jax.random.normal(far, (count, DEGREES), self.mean.dtype)
+        noise /= jnp.sqrt(jnp.mean(jnp.square(normal), axis=1, keepdims=True))
         return self.mean[chosen] + jnp.einsum("nij,nj->ni", self.root[chosen], noise)
 
 
@@ -51,7 +67,7 @@ def fit_mixture(
     covariance: Float[np.ndarray, "free free"],
     seed: int = 0,
 ) -> Mixture:
-    """A mixture of as many normals as the draws can tell apart, by expectation maximisation.
+    """A mixture of as many components as the draws can tell apart.
 
     Of as many components whatever the draws are: those that they are too few for have no weight.
     The `covariance` that was believed in before is worth a few draws of that of all, and those of
@@ -70,13 +86,14 @@ def fit_mixture(
     spread = np.tile(0.5 * np.eye(size), (used, 1, 1))
     prior = SHRINKAGE * size
     for _ in range(ROUNDS if used > 1 else 1):
-        each = _each(white, weight, mean, spread)
-        share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
-        of = share.sum(axis=0) + 1e-9
+        each = _logarithms(white, weight, mean, spread)
+        share = np.exp(each - each.max(axis=0))
+        share /= share.sum(axis=0)
+        of = share.sum(axis=1) + 1e-9
         weight = (of + 1.0) / (of.sum() + used)
-        mean = (share.T @ white) / of[:, None]
-        off = white[None] - mean[:, None]
-        scatter = np.einsum("nk,kni,knj->kij", share, off, off, optimize=True)
+        mean = (share @ white) / of[:, None]
+        off = white - mean[:, None]
+        scatter = np.swapaxes(off, 1, 2) @ (share[..., None] * off)
         diagonal = np.einsum("kii->ki", scatter) / of[:, None] + NARROWEST
         spread = scatter + prior * np.einsum("ki,ij->kij", diagonal, np.eye(size))
         spread = spread / (of + prior)[:, None, None]
@@ -90,12 +107,9 @@ def fit_mixture(
     return Mixture(*(jnp.asarray(part, jnp.zeros(()).dtype) for part in parts))
 
 
-def _each(white: np.ndarray, weight, mean, covariance) -> np.ndarray:
-    """Logarithms of weight times density of each component, without what all have in common."""
-    found = []
-    for share, centre, spread in zip(weight, mean, covariance, strict=True):
-        root = np.linalg.cholesky(spread)
-        off = np.linalg.solve(root, (white - centre).T)
-        volume = np.log(np.diagonal(root)).sum()
-        found.append(np.log(share) - volume - 0.5 * np.square(off).sum(axis=0))
-    return np.stack(found, axis=1)
+def _logarithms(white: np.ndarray, weight, mean, covariance) -> np.ndarray:
+    """Logarithms of weight times density, (components, draws), but for what all have in common."""
+    root = np.linalg.cholesky(covariance)
+    off = (white - mean[:, None]) @ np.swapaxes(np.linalg.inv(root), 1, 2)
+    volume = np.log(np.einsum("kii->ki", root)).sum(axis=1)
+    return (np.log(weight) - volume)[:, None] - 0.5 * np.square(off).sum(axis=2)

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
+from scipy.stats import chi
 
 from bayesian_toys import Linear, linear
 from palpate.errors import PalpateError
+from palpate.identification import local_global as local_global_module
 from palpate.identification import metropolis
 from palpate.identification.diagnostics import bulk_size, rhat
 from palpate.identification.draws import time_to_compile
@@ -164,6 +166,63 @@ def test_chains_cross_between_islands_as_often_as_these_are_probable():
     assert np.max(rhat(found.position)) < 1.02
     again = local_global(Islands(), modes, KEY, chains=8, draws=500)
     np.testing.assert_array_equal(again.position, found.position)
+
+
+class Lobe(Target):
+    """Part of the probability is spread wider than the rest, about the same place."""
+
+    widths: tuple[float, float]
+    weights: tuple[float, float]
+    axes: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("x", "y", "z")[: self.axes]
+
+    def log_likelihood(self, position: Array) -> Array:
+        square = jnp.sum(jnp.square(position))
+        width, weight = jnp.array(self.widths), jnp.log(jnp.array(self.weights))
+        each = weight - self.axes * jnp.log(width) - 0.5 * square / width**2
+        return jax.nn.logsumexp(each) + 0.5 * square  # the prior is in the density again
+
+    def beyond(self, radius: float) -> float:
+        """How probable it is to be farther out."""
+        far = chi.sf(radius / np.array(self.widths), self.axes)
+        return float(np.dot(self.weights, far))
+
+    def sampled(self, draws: int) -> np.ndarray:
+        none, core = jnp.zeros((1, self.axes)), self.widths[0] ** 2 * np.eye(self.axes)[None]
+        modes = Modes(none, none[:, 0], none, core, none[:, 0])
+        return np.linalg.norm(local_global(self, modes, KEY, draws=draws).position, axis=-1)
+
+
+def judge(lobe: Lobe, radius: np.ndarray, at: float) -> None:
+    """As many draws have to be beyond a radius as it is probable to be there."""
+    beyond = lobe.beyond(at)
+    size = float(bulk_size((radius > at).astype(float)[..., None]).min())
+    assert size > 300
+    error = np.sqrt(beyond * (1.0 - beyond) / size)
+    assert np.mean(radius > at) == pytest.approx(beyond, abs=4.0 * error)
+
+
+def test_a_wide_lobe_that_is_no_mode_has_as_many_draws_as_it_is_probable():
+    """It is twenty times as wide as the rest: 8000 times the volume."""
+    lobe = Lobe((0.04, 0.8), (0.9, 0.1), 3)
+    radius = lobe.sampled(400)
+    for at in (0.05, 0.2, 1.0):
+        judge(lobe, radius, at)
+
+
+def test_steps_of_the_shape_where_a_chain_is_are_balanced_by_the_shape_where_it_gets_to(
+    monkeypatch,
+):
+    """With no others: what leaps would make up for them."""
+    monkeypatch.setattr(local_global_module, "LEAPING", 0.0)
+    monkeypatch.setattr(local_global_module, "WHOLE", 0.0)
+    lobe = Lobe((0.1, 0.6), (0.6, 0.4), 2)
+    radius = lobe.sampled(1000)
+    for at in (0.1, 0.3, 0.8):
+        judge(lobe, radius, at)
 
 
 def test_a_mixture_is_a_density_and_its_draws_have_it():

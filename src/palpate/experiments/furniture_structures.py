@@ -45,17 +45,19 @@ def structures(
     wheels: int = 1,
     law: Law = "coulomb",
 ) -> dict[str, Planar]:
-    """What each body may be, as models of one shape: on wheels, on feet, hinged, or bolted down.
+    """What each body may be, as models: on wheels, on feet, hinged, or bolted down.
 
     What is on feet or on a hinge has no wheels that resist; free casters are small friction of the
-    floor. Arguments as of `starting_furniture` and `furniture`.
+    floor. All but the hinged one have one shape, without a link: bodies that nothing couples are
+    stepped in a third of the time. Arguments as of `starting_furniture` and `furniture`.
     """
     bodies = range(len(names_of(recording)))
-    model = starting_furniture(
-        recording, period, size, wheels=wheels, law=law, pivots=dict.fromkeys(bodies)
+    free, held = (
+        starting_furniture(recording, period, size, wheels=wheels, law=law, pivots=pivots)
+        for pivots in ({}, dict.fromkeys(bodies))
     )
     return {
-        name: _masked(model, dict.fromkeys(bodies, name))
+        name: _masked(held if name == "hinge" else free, dict.fromkeys(bodies, name))
         for name in ("wheels", "feet", "hinge", "bolted")
     }
 
@@ -186,12 +188,16 @@ def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:
     values = {
         path: jnp.concatenate([value_of(piece, path) for piece in pieces])
         for path in parameters_of(model)
-        if value_of(model, path).size
+        if value_of(model, path).size and not path.startswith("link_")
     }
-    anchor = values.pop("link_anchor", model.link_anchor)
+    anchor = model.link_anchor
+    for body, piece in enumerate(pieces):
+        own = value_of(piece, "link_anchor")  # none but of a hinged one, which is held by the world
+        if own.size:
+            anchor = anchor.at[body, : own.shape[1]].set(own[0])
     to_world = (model.link_to < 0)[..., None]
-    values["link_anchor"] = jnp.where(to_world, anchor, model.link_anchor)
-    return with_values(model, values)
+    anchor = jnp.where(to_world, anchor, model.link_anchor)
+    return with_values(model, values | {"link_anchor": anchor})
 
 
 def _masked(model: Planar, being: Mapping[int, str], joined: Iterable[int] = ()) -> Planar:

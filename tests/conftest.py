@@ -6,6 +6,11 @@ from pathlib import Path
 import jax
 import pytest
 
+from palpate.devices import cores
+
+if cores() == 1:  # what is divided over devices has to be divided here too
+    jax.config.update("jax_num_cpu_devices", 2)
+
 MAPS, MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 
 

@@ -89,8 +89,11 @@ def test_a_file_that_is_no_map_is_told_and_not_reached(tmp_path):
 def test_the_direct_way_is_that_without_movables():
     world = two_rooms({"a": IN_DOOR})
     plan = Planner().plan(world)
-    assert study.direct_distance(world, plan) == pytest.approx(6.0, rel=0.02)
-    assert 0 < plan.path_efficiency(study.direct_distance(world, plan)) < 1
+    direct = study.direct_distance(world, plan)
+    assert direct == pytest.approx(6.0, rel=0.02)
+    assert 0 < plan.path_efficiency(direct) < 1
+    nowhere = dataclasses.replace(plan, goal=(-50.0, 0.0, 0.0))
+    assert study.direct_distance(world, nowhere) is None
 
 
 def test_the_direct_way_is_no_longer_than_straight_where_that_is_free():

@@ -19,7 +19,7 @@ TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])
 
 
-COMPILED = {"_look", "_sensitivity", "_crossed", "_followed"}
+COMPILED = {"_look", "_sensitivity", "_walked"}
 
 
 @contextlib.contextmanager
@@ -124,7 +124,7 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
 
 def test_a_posterior_of_too_many_coordinates_is_for_the_no_u_turn_sampler(posterior, monkeypatch):
     monkeypatch.setattr("palpate.identification.bayesian.WIDEST", posterior.target.dimension - 1)
-    with compiled({"_block", "_crossed"}) as names:
+    with compiled({"_block", "_walked"}) as names:
         found = draw(posterior.target, posterior.modes, chains=4, draws=150)
     assert names == {"_block"}
     assert found.draws.position.shape == (4, 150, posterior.target.dimension)

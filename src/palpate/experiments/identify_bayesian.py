@@ -15,7 +15,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.experiments import folders
 from palpate.experiments.options import Hypotheses, IdentifyBayesian
-from palpate.identification.bayesian import Posterior, check_numbers, draw
+from palpate.identification.bayesian import Posterior, check_numbers, draw, preparing
 from palpate.identification.laplace import Modes, settle
 from palpate.identification.likelihood import (
     MotionPosterior,
@@ -98,7 +98,8 @@ def identify(
     many times as long. Raises as `bayesian.draw`.
     """
     check_numbers(chains, draws)
-    explored = explore(targets, seed)
+    with preparing(next(iter(targets.values())), chains):
+        explored = explore(targets, seed)
     probability = shares({name: evidence(modes) for name, (_, modes) in explored.items()})
     structure = max(probability, key=probability.__getitem__)
     posterior = draw(*explored[structure], chains=chains, draws=draws, seed=seed)
@@ -128,7 +129,7 @@ def shares(logarithms: Mapping[str, float]) -> dict[str, float]:
 def posterior_of(model: Model, aligned: Aligned) -> MotionPosterior:
     """What is to be sampled: of pieces of the trials, the first of each from rest if it is so."""
     scales = inferred_scales(model, noise_scale(aligned, model))
-    return motion_posterior(model, _cut(aligned, model), scales)
+    return motion_posterior(model, _cut(aligned, model), scales).with_one_rotation()
 
 
 def _cut(aligned: Aligned, model: Model) -> Segments:

@@ -59,14 +59,15 @@ class Trial:
     """A map tried, one goal after the other, each on the map as the plans before have left it.
 
     `plans` are those that passed the exact check, of `goals` that there are; `fault` is the first
-    thing that went wrong. `planning_s` is of all plans, `efficiency` the mean of their paths'.
+    thing that went wrong. `planning_s` is of all plans, `efficiency` the mean of their
+    paths', None where it is not known of any.
     """
 
     name: str
     goals: int
     plans: tuple[Plan, ...]
     planning_s: float
-    efficiency: float
+    efficiency: float | None
     fault: str | None
 
     @property
@@ -156,14 +157,16 @@ def tried(
             faults.append(wrong[0])
             continue
         plans.append(plan)
-        efficiencies.append(plan.path_efficiency(direct_distance(world, plan)))
+        direct = direct_distance(world, plan)
+        if direct is not None:
+            efficiencies.append(plan.path_efficiency(direct))
         name = "plan" if len(goals) == 1 else f"plan-{number:03d}"
         write_plan(out / own / f"{name}.json", plan)
         if number <= MOST_DRAWN:
             plan_picture(out / own / f"{name}.png", world, plan)
             plan_animation(out / own / f"{name}.gif", world, plan)
         world = plan.leaves(world)
-    efficiency = statistics.mean(efficiencies) if efficiencies else 0.0
+    efficiency = statistics.mean(efficiencies) if efficiencies else None
     fault = faults[0] if faults else None
     return Trial(own, len(goals), tuple(plans), planning_s, efficiency, fault)
 
@@ -183,12 +186,15 @@ def _anew(world: Map) -> Map:
     return dataclasses.replace(world, movables=movables)
 
 
-def direct_distance(world: Map, plan: Plan) -> float:
-    """The robot's shortest way if there were no movables, m."""
+def direct_distance(world: Map, plan: Plan) -> float | None:
+    """The robot's shortest way if there were no movables, m; None where the grid knows of none.
+
+    A plan may pass where its rounding to cells leaves no way.
+    """
     space = Space(dataclasses.replace(world, movables={}))
     whole = slice(0, space.shape[0]), slice(0, space.shape[1])
     way = distances(space, whole, np.array(world.start)).path_to(np.array(plan.goal))
-    return plan.distance if way is None else length_of(way)
+    return None if way is None else length_of(way)
 
 
 def figures(trials: list[Trial]) -> list[Figure]:

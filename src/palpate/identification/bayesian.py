@@ -5,15 +5,16 @@
     posterior.predict(cut(held_out, model, 2.0, at_rest=True))
 
 The likelihood is `palpate.identification.likelihood`'s, of pieces of a second or so; chains begin
-at the posterior's modes, and follow trajectories and cross it by turns (`local_global`), or those
-of the no-U-turn sampler (`hamiltonian`) where there are too many coordinates to learn proposals
-in. Other samplers of the same target: Metropolis
-(`metropolis`), tempered particles with evidence (`tempered`), and particles that follow data as
-they arrive (`online`).
+at the posterior's modes, and walk it in steps of its local shape (`local_global`), or are those of
+the no-U-turn sampler (`hamiltonian`) where there are too many coordinates to learn proposals in.
+Other samplers of the same target: Metropolis (`metropolis`), tempered particles with evidence
+(`tempered`), and particles that follow data as they arrive (`online`).
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import cached_property
 
 import equinox as eqx
@@ -34,7 +35,7 @@ from palpate.identification.likelihood import (
     inferred_scales,
     motion_posterior,
 )
-from palpate.identification.local_global import local_global
+from palpate.identification.local_global import compiled_meanwhile, local_global
 from palpate.identification.predictive import Predicted, Score
 from palpate.identification.segments import Segments, cut, noise_scale
 from palpate.models.model import Model
@@ -250,7 +251,8 @@ def identify(
     """
     check_numbers(chains, draws)
     segments = cut(aligned, model, seconds, at_rest)
-    target = motion_posterior(model, segments, inferred_scales(model, noise_scale(aligned, model)))
+    scales = inferred_scales(model, noise_scale(aligned, model))
+    target = motion_posterior(model, segments, scales).with_one_rotation()
     return sample(target, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
 
 
@@ -266,8 +268,16 @@ def sample(
     """As `identify`, for a target that was made apart."""
     check_numbers(chains, draws)
     climbing, _ = jax.random.split(jax.random.key(seed))
-    settled = settle(target, climbing)
+    with preparing(target, chains):
+        settled = settle(target, climbing)
     return draw(*settled, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+
+
+def preparing(target: MotionPosterior, chains: int) -> AbstractContextManager[None]:
+    """Within it modes may be searched for, while the sampler of such a target is compiled."""
+    if target.dimension > WIDEST:
+        return contextlib.nullcontext()
+    return compiled_meanwhile(target, chains)
 
 
 def draw(

@@ -3,9 +3,9 @@
 Where a wheel may be too weak to be noticed, its place and direction are free, ten times as wide as
 where it is felt: no one shape of a step fits both. What all chains have seen is described by a
 mixture. A chain takes the shape of a step from one of its components, chosen by their
-responsibility for where the chain is (the localised random walk of Andrieu and Thoms, Stat. Comput.
-18, 2008, section 6), or, less often, from all that has been seen; and now and then it is proposed a
-draw of the mixture itself (Tierney, Ann. Stat. 22, 1994). No move needs a slope.
+responsibility for where the chain is (a localised random walk: Andrieu and Thoms, Stat. Comput. 18,
+2008), or, less often, from all that has been seen; and now and then it is proposed a draw of the
+mixture itself (Tierney, Ann. Stat. 22, 1994). No move needs a slope.
 
 A leap leads back as seldom as the mixture knows where a chain has got to, so it has to know the
 posterior's tails as well. In the warm-up half of the chains therefore see a flatter likelihood, the
@@ -14,8 +14,10 @@ flattest its root (as in tempering: Geyer, Comput. Sci. Stat. 23, 1991).
 All chains step at once, so that their densities are computed side by side.
 """
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +27,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from palpate.devices import compiled_sooner, over_devices
 from palpate.identification.draws import Draws, begun, pooled, time_to_compile
 from palpate.identification.laplace import Modes
-from palpate.identification.mixture import Mixture, fit_mixture
+from palpate.identification.mixture import DEGREES, Mixture, fit_mixture, one_of
 from palpate.identification.target import Target, log_prior
 
 STEPS = 3  # between two draws, for each coordinate
@@ -102,6 +104,29 @@ def local_global(
     )
 
 
+@contextlib.contextmanager
+def compiled_meanwhile(target: Target, chains: int = 16) -> Iterator[None]:
+    """Compile what `local_global` runs for a target of these shapes, beside what is done within.
+
+    A search for modes waits for a compiler of its own, and leaves a core to another.
+    """
+    wide, size = jax.config.jax_enable_x64, target.dimension  # of this thread, not of the other
+
+    def work() -> None:
+        with jax.enable_x64(wide):
+            some = np.zeros((chains, size), jnp.zeros(()).dtype)
+            none, root = some[:, 0], np.eye(size, dtype=some.dtype)
+            keys = jax.random.split(jax.random.key(0), chains)
+            of_nothing = np.zeros(2, int)
+            mixture = fit_mixture(some, root)
+            _walked(target, mixture, none[0], root, of_nothing, none, some, none, keys)
+
+    with ThreadPoolExecutor(1) as pool:
+        compiling = pool.submit(work)
+        yield
+    compiling.result()
+
+
 @compiled_sooner
 def _walked(
     target: Target,
@@ -130,30 +155,32 @@ def _walked(
         flat, position, value, keys = each
         looks, steps = counts
 
-        def proposed(position: Array, key: Array) -> tuple[Array, Array, Array]:
+        def proposed(position: Array, noise: Array, uniform: Array) -> tuple[Array, Array, Array]:
             """Where to, how much more probable (its logarithm) the way back is, and the kind."""
-            deciding, pushing, choosing, leaping = jax.random.split(key, 4)
-            which = jax.random.uniform(deciding)
-            noise = length * jax.random.normal(pushing, position.shape, position.dtype)
+            near, far = jnp.split(noise, [position.size])
             share = mixture.log_shares(position)
-            of = jax.random.categorical(choosing, share)
-            local, far = position + mixture.root[of] @ noise, mixture.draw(leaping, 1)[0]
+            of = one_of(share, uniform[0])
+            local = position + length * mixture.root[of] @ near
             back = mixture.log_shares(local)[of] - share[of]
-            across = mixture.log_density(position) - mixture.log_density(far)
-            leaps, whole = which < LEAPING, which < LEAPING + WHOLE
-            there = jnp.where(leaps, far, jnp.where(whole, position + root @ noise, local))
-            return there, jnp.where(leaps, across, jnp.where(whole, 0.0, back)), leaps
+            distant = mixture.draw(uniform[0], far)
+            across = mixture.log_density(position) - mixture.log_density(distant)
+            leaps, whole = uniform[1] < LEAPING, uniform[1] < LEAPING + WHOLE
+            there = jnp.where(whole, position + length * root @ near, local)
+            back = jnp.where(leaps, across, jnp.where(whole, 0.0, back))
+            return jnp.where(leaps, distant, there), back, leaps
 
         def step(_: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
             position, value, keys, stepped, leapt = carry
-            keys, proposing, deciding = jnp.moveaxis(
-                jax.vmap(lambda key: jax.random.split(key, 3))(keys), 1, 0
-            )
-            there, back, leaps = jax.vmap(proposed)(position, proposing)
+            keys, drawing = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+            # All from one call: each compiles for half a second.
+            numbers = 3 + 2 * position.shape[1] + DEGREES
+            normal = jax.vmap(lambda key: jax.random.normal(key, (numbers,), value.dtype))(drawing)
+            uniform = jax.scipy.special.ndtr(normal[:, :3])
+            there, back, leaps = jax.vmap(proposed)(position, normal[:, 3:], uniform)
             density = target.densities(there)
             prior = log_prior(there) - log_prior(position)
             gain = flat * (density - value - prior) + prior + back
-            taken = jnp.log(jax.vmap(jax.random.uniform)(deciding)) < gain
+            taken = jnp.log(uniform[:, 2]) < gain
             position = jnp.where(taken[:, None], there, position)
             value = jnp.where(taken, density, value)
             return position, value, keys, stepped + (taken & ~leaps), leapt + (taken & leaps)

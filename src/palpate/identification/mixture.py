@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.special import gammaln
 
 from palpate.identification.draws import pooled
@@ -52,14 +52,19 @@ class Mixture(eqx.Module):
         unit = gammaln(half) - gammaln(0.5 * DEGREES) - 0.5 * size * math.log(math.pi * DEGREES)
         return self.log_weight - self.log_volume + unit - half * beyond
 
-    def draw(self, key: Array, count: int) -> Float[Array, "count free"]:
-        """Independent draws."""
-        which, where, far = jax.random.split(key, 3)
-        chosen = jax.random.categorical(which, self.log_weight, shape=(count,))
-        noise = jax.random.normal(where, (count, self.mean.shape[1]), self.mean.dtype)
-        normal = jax.random.normal(far, (count, DEGREES), self.mean.dtype)
-        noise /= jnp.sqrt(jnp.mean(jnp.square(normal), axis=1, keepdims=True))
-        return self.mean[chosen] + jnp.einsum("nij,nj->ni", self.root[chosen], noise)
+    def draw(
+        self, which: Float[Array, ""], normal: Float[Array, " numbers"]
+    ) -> Float[Array, " free"]:
+        """A draw, made of one number from 0 to 1 and normal ones, `free` and `DEGREES` of them."""
+        of = one_of(self.log_weight, which)
+        noise, scale = jnp.split(normal, [normal.size - DEGREES])
+        return self.mean[of] + self.root[of] @ noise / jnp.sqrt(jnp.mean(jnp.square(scale)))
+
+
+def one_of(log_shares: Float[Array, " components"], which: Float[Array, ""]) -> Int[Array, ""]:
+    """The component that a number from 0 to 1 falls to, by their shares."""
+    total = jnp.cumsum(jnp.exp(log_shares))
+    return jnp.argmax(total > which * total[-1])
 
 
 def fit_mixture(

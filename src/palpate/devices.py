@@ -80,7 +80,8 @@ def compiled_at_once(function: Callable[..., Any]) -> Callable[..., Any]:
 def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
     import equinox as eqx
 
-    return eqx.filter_jit(function, **({"compiler_options": options} if _tried() else {}))
+    keywords: dict[str, Any] = {"compiler_options": options} if _tried() else {}
+    return eqx.filter_jit(function, **keywords)
 
 
 def data_parallel(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

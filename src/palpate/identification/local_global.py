@@ -110,12 +110,12 @@ def compiled_meanwhile(target: Target, chains: int = 16) -> Iterator[None]:
 
     A search for modes waits for a compiler of its own, and leaves a core to another.
     """
-    wide, size = jax.config.jax_enable_x64, target.dimension  # of this thread, not of the other
+    dtype, size = jnp.zeros(()).dtype, target.dimension
 
     def work() -> None:
-        with jax.enable_x64(wide):
-            some = np.zeros((chains, size), jnp.zeros(()).dtype)
-            none, root = some[:, 0], np.eye(size, dtype=some.dtype)
+        with jax.enable_x64(dtype == jnp.float64):  # a context is of one thread
+            some = np.zeros((chains, size), dtype)
+            none, root = some[:, 0], np.eye(size, dtype=dtype)
             keys = jax.random.split(jax.random.key(0), chains)
             of_nothing = np.zeros(2, int)
             mixture = fit_mixture(some, root)

@@ -96,7 +96,7 @@ def test_a_body_that_is_never_seen_is_refused():
         starting_furniture(checked(recording(np.full_like(pose, np.nan), wrench)), 0.02, (1.0, 1.0))
 
 
-def test_hypotheses_differ_in_nothing_but_their_data():
+def test_only_the_hinged_hypothesis_has_a_link():
     pose, wrench = still()
     models = structures(checked(recording(pose, wrench)), 0.02, (1.0, 0.5))
     assert set(models) == {"wheels", "feet", "hinge", "bolted"}

@@ -10,8 +10,8 @@ import pytest
 
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
-from palpate.identification.bayesian import draw, identify, sample
-from palpate.identification.laplace import Modes
+from palpate.identification.bayesian import draw, identify, preparing, sample
+from palpate.identification.laplace import Modes, settle
 from palpate.identification.likelihood import known_scales, motion_posterior
 from palpate.identification.segments import cut
 
@@ -99,6 +99,27 @@ def test_another_recording_of_the_same_shape_compiles_nothing(first):
     with compiled() as names:
         identify(MODEL, pushes(TRUE, 5, heading=3.1), at_rest=True, draws=50)
     assert not names
+
+
+def test_a_sampler_that_was_compiled_during_the_search_is_not_compiled_again():
+    scales = known_scales(MODEL, NOISE)  # another shape than all others here
+    target = motion_posterior(MODEL, cut(pushes(TRUE, 3), MODEL, 1.0, at_rest=True), scales)
+    with compiled() as names, preparing(target, 6):
+        settled = settle(target, jax.random.key(0))
+    assert "_walked" in names
+    with compiled() as names:
+        draw(*settled, chains=6, draws=4)
+    assert not names
+
+
+def test_one_chain_is_sampled_and_judged_by_its_halves():
+    target = motion_posterior(
+        MODEL, cut(pushes(TRUE, 3), MODEL, 1.0, at_rest=True), known_scales(MODEL, NOISE)
+    )
+    found = sample(target, chains=1, draws=200)
+    assert found.draws.position.shape == (1, 200, target.dimension)
+    mass = next(row for row in found.table if row.name == "mass")
+    assert mass.lower < 14.0 < mass.upper
 
 
 def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):

@@ -43,6 +43,22 @@ def test_particles_end_where_all_the_data_at_once_lead():
     assert 0.5 < np.std(models.mass) / masses.std() < 2.0
 
 
+def test_a_belief_that_begins_with_data_goes_on_where_a_piece_has_gaps():
+    """All that it begins with was seen and has one rotation; what comes has its own."""
+    data = pieces(TRUE, 1)
+    once = motion_posterior(MODEL, data, SCALES)
+    found = once.with_one_rotation()
+    assert found.rotation.shape[:2] == (1, 1)
+    belief = begin(found, jax.random.key(0), 64)
+    seen = np.array(data.seen[:1])
+    seen[:, 10:20] = False
+    gaps = eqx.tree_at(lambda piece: piece.seen, data.take([0]), seen)
+    belief, _ = absorb(belief, gaps, jax.random.key(1))
+    alone = motion_posterior(MODEL, gaps, SCALES)
+    np.testing.assert_array_equal(belief.target.rotation[0], alone.rotation[0])
+    np.testing.assert_array_equal(belief.target.rotation[1:], once.rotation[1:])
+
+
 def test_a_belief_narrows_with_each_piece():
     data = pieces(TRUE, 2)
     spreads = [np.std(models_of(followed(data, n)[0], 256, jax.random.key(0)).mass) for n in (1, 4)]

@@ -93,15 +93,12 @@ class IdentifyFurniture(IdentifyBayesian):
     def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
         """Models to be compared, by name: see `furniture_structures`."""
         from palpate.experiments import furniture_structures
-        from palpate.experiments.furniture_recording import check_alike, starting_furniture
+        from palpate.experiments.furniture_recording import check_alike
 
         if self.wheels < 1:
             raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
         check_alike(*recordings)
         about = recordings[0], period, self.size, self.wheels, self.law
-        if self.structure == "wheels":  # without the links that only a hinge needs
-            like = {"wheels": self.wheels, "law": self.law}
-            return Hypotheses({"wheels": starting_furniture(*about[:3], **like)})
         if self.structure == "compare":
             return furniture_structures.hypotheses(*about, seed=self.seed)
         return Hypotheses({

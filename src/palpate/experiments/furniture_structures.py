@@ -195,8 +195,6 @@ def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:
         own = value_of(piece, "link_anchor")  # none but of a hinged one, which is held by the world
         if own.size:
             anchor = anchor.at[body, : own.shape[1]].set(own[0])
-    to_world = (model.link_to < 0)[..., None]
-    anchor = jnp.where(to_world, anchor, model.link_anchor)
     return with_values(model, values | {"link_anchor": anchor})
 
 

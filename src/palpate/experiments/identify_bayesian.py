@@ -94,7 +94,7 @@ def identify(
     """Compare hypotheses by their evidence and sample the posterior of the most probable.
 
     All of them are alike before. The evidence is Laplace's at the best mode of each: tempered
-    particles (`tempered.compare`) give it without the assumption of a normal posterior, and take
+    particles (`tempered.temper`) give it without the assumption of a normal posterior, and take
     many times as long. Raises as `bayesian.draw`.
     """
     check_numbers(chains, draws)

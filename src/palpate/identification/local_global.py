@@ -52,8 +52,8 @@ def local_global(
     """Sample `draws` of each of `chains` after the warm-up.
 
     Chains begin at draws of the modes' mixture. `tell(done, rounds)` is called after every round.
-    In the warm-up the mixture and the length of steps are learnt from all chains; then they are
-    kept. Raises `PalpateError` when the density is not finite where a chain begins.
+    In the warm-up the mixture, the covariance and the length of steps are learnt from all chains;
+    then they are kept. Raises `PalpateError` when the density is not finite where a chain begins.
     """
     began = time.monotonic()
     begin, fitting, key = jax.random.split(key, 3)
@@ -96,7 +96,7 @@ def local_global(
     return Draws(
         position=np.concatenate(positions[ROUNDS:], axis=1),
         density=np.concatenate(values[ROUNDS:], axis=1),
-        acceptance=np.mean(accepted[ROUNDS:], axis=0),
+        acceptance=np.average(accepted[ROUNDS:], axis=0, weights=looks[ROUNDS:]),
         divergences=0,
         evaluations=2 * chains + sum(evaluations),
         seconds=time.monotonic() - began,
@@ -108,17 +108,19 @@ def local_global(
 def compiled_meanwhile(target: Target, chains: int = 16) -> Iterator[None]:
     """Compile what `local_global` runs for a target of these shapes, beside what is done within.
 
-    A search for modes waits for a compiler of its own, and leaves a core to another.
+    A search for modes waits for a compiler of its own, and leaves a core to another. What is raised
+    within is raised when this compiler is done.
     """
     dtype, size = jnp.zeros(()).dtype, target.dimension
 
     def work() -> None:
         with jax.enable_x64(dtype == jnp.float64):  # a context is of one thread
             some = np.zeros((chains, size), dtype)
+            nowhere = np.zeros((2, size))  # what a covariance needs at least
             none, root = some[:, 0], np.eye(size, dtype=dtype)
             keys = jax.random.split(jax.random.key(0), chains)
             of_nothing = np.zeros(2, int)
-            mixture = fit_mixture(some, root)
+            mixture = fit_mixture(nowhere, root)
             _walked(target, mixture, none[0], root, of_nothing, none, some, none, keys)
 
     with ThreadPoolExecutor(1) as pool:

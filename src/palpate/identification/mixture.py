@@ -64,7 +64,8 @@ class Mixture(eqx.Module):
 def one_of(log_shares: Float[Array, " components"], which: Float[Array, ""]) -> Int[Array, ""]:
     """The component that a number from 0 to 1 falls to, by their shares."""
     total = jnp.cumsum(jnp.exp(log_shares))
-    return jnp.argmax(total > which * total[-1])
+    below = jnp.minimum(which, 1.0 - jnp.finfo(which.dtype).eps)  # it may have been rounded to 1
+    return jnp.argmax(total > below * total[-1])
 
 
 def fit_mixture(

@@ -69,6 +69,10 @@ def begin(target: MotionPosterior, key: PRNGKeyArray, particles: int = 256) -> B
 
     Raises as `temper`.
     """
+    rotation = jnp.broadcast_to(  # a piece that comes may have its own
+        target.rotation, (*target.counted.shape[:2], *target.rotation.shape[2:])
+    )
+    target = eqx.tree_at(lambda t: t.rotation, target, rotation)
     counted = np.asarray(target.counted).sum(axis=(1, 2)) > 0
     if counted.any():
         found = temper(target, key, particles)

@@ -7,8 +7,8 @@ steps of the shape of their own covariance (Chopin, Biometrika 89, 2002). The me
 multiply to the evidence, the data's density under the model (Del Moral, Doucet and Jasra, J. R.
 Stat. Soc. B 68, 2006).
 
-Hypotheses about structure (is there a wheel, a pivot) are a batch of targets: the same shapes,
-other masks. Their evidences compare them (`compare`).
+Hypotheses about structure (is there a wheel, a bolt) of one shape, other masks, are a batch of
+targets; their evidences compare them (`compare`). Those of other shapes are tempered one by one.
 """
 
 from typing import Any

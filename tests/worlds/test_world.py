@@ -50,7 +50,9 @@ def test_a_picture_shows_the_rope():
     try:
         hanging = world.render(160, 120)
     except PalpateError as error:
-        pytest.skip(str(error))
+        if "needs OpenGL" not in str(error):
+            raise
+        pytest.skip(str(error))  # what no package of Python can bring
     assert hanging.shape == (120, 160, 3)
     assert hanging.dtype == np.uint8
     red_over_blue = hanging[..., 0].astype(int) - hanging[..., 2]

@@ -13,6 +13,7 @@ from palpate.experiments.furniture_structures import hypotheses, joints
 from palpate.experiments.identify_bayesian import posterior_of
 from palpate.identification.laplace import CLIMBING, Modes, climb
 from palpate.identification.likelihood import initial_position, motion_posterior
+from palpate.identification.settled import Part, Settled
 from palpate.models.model import rollout
 from palpate.models.planar_shapes import furniture, rectangle
 from palpate.models.planar_system import system_of
@@ -83,14 +84,15 @@ def test_what_moves_apart_or_not_at_all_is_no_candidate(joined):
     assert not joints(Recording((Trial("one", channels),), {}))
 
 
-def settled(target, mass, likely):
+def at_a_mode(target, mass, likely):
     """A target at a mode with this mass, as probable as it is `likely`."""
     reference = target.coordinates.reference
     at = dataclasses.replace(reference, mass=jnp.array([mass]))
     target = motion_posterior(at, target.segments, target.scales)
     position = initial_position(target)[None]
     some = jnp.full(1, 1e3 * likely)
-    return target, Modes(position, some, position, jnp.eye(position.shape[1])[None], some)
+    modes = Modes(position, some, position, jnp.eye(position.shape[1])[None], some)
+    return Settled(target, (Part(target, modes, np.arange(target.dimension)),))
 
 
 def alone_is(first, second, monkeypatch):
@@ -100,7 +102,7 @@ def alone_is(first, second, monkeypatch):
     def explore(targets, seed):
         seen.append(next(iter(targets.values())).segments.count)
         kind, mass = ((first, 10.0), (second, 20.0))[len(seen) - 1]
-        return {name: settled(target, mass, name == kind) for name, target in targets.items()}
+        return {name: at_a_mode(target, mass, name == kind) for name, target in targets.items()}
 
     monkeypatch.setattr(furniture_structures, "explore", explore)
     return seen

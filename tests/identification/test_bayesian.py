@@ -11,9 +11,10 @@ import pytest
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
 from palpate.identification.bayesian import draw, identify, preparing, sample
-from palpate.identification.laplace import Modes, settle
+from palpate.identification.laplace import Modes
 from palpate.identification.likelihood import known_scales, motion_posterior
 from palpate.identification.segments import cut
+from palpate.identification.settled import Part, Settled, settle_each
 
 TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])
@@ -105,10 +106,10 @@ def test_a_sampler_that_was_compiled_during_the_search_is_not_compiled_again():
     scales = known_scales(MODEL, NOISE)  # another shape than all others here
     target = motion_posterior(MODEL, cut(pushes(TRUE, 3), MODEL, 1.0, at_rest=True), scales)
     with compiled() as names, preparing(target, 6):
-        settled = settle(target, jax.random.key(0))
+        settled = settle_each(target, jax.random.key(0))
     assert "_walked" in names
     with compiled() as names:
-        draw(*settled, chains=6, draws=4)
+        draw(settled, chains=6, draws=4)
     assert not names
 
 
@@ -126,7 +127,7 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
     def searched(*_):
         raise AssertionError("expected to be refused before the search for modes")
 
-    monkeypatch.setattr("palpate.identification.bayesian.settle", searched)
+    monkeypatch.setattr("palpate.identification.bayesian.settle_each", searched)
     monkeypatch.setattr("palpate.identification.bayesian.local_global", searched)
     recording = pushes(TRUE, 3, trials=1, frames=61)
     target = motion_posterior(
@@ -134,19 +135,20 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
     )
     some = jnp.zeros((1, target.dimension))
     modes = Modes(some, some[0, :1], some, np.eye(target.dimension)[None], some[0, :1])
+    part = Part(target, modes, np.arange(target.dimension))
     for few in ({"draws": 3}, {"draws": -1}, {"chains": 0}, {"chains": -2}):
         with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
             identify(MODEL, recording, at_rest=True, **few)
         with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
             sample(target, **few)
         with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
-            draw(target, modes, **few)
+            draw(Settled(target, (part,)), **few)
 
 
 def test_a_posterior_of_too_many_coordinates_is_for_the_no_u_turn_sampler(posterior, monkeypatch):
     monkeypatch.setattr("palpate.identification.bayesian.WIDEST", posterior.target.dimension - 1)
     with compiled({"_block", "_walked"}) as names:
-        found = draw(posterior.target, posterior.modes, chains=4, draws=150)
+        found = draw(posterior.settled, chains=4, draws=150)
     assert names == {"_block"}
     assert found.draws.position.shape == (4, 150, posterior.target.dimension)
     np.testing.assert_allclose(

@@ -323,3 +323,30 @@ def test_outlines_that_are_none_are_refused_with_a_sentence(outline, said):
 def test_structure_that_cannot_be_is_refused_with_a_sentence(fields, said):
     with pytest.raises(PalpateError, match=said):
         furniture([BOX], **fields)
+
+
+@pytest.mark.usefixtures("float64")
+def test_what_nothing_couples_moves_as_it_does_in_the_whole():
+    """Joined by a pivot, near enough to touch, or alone, in an order that is not the bodies'."""
+    poses = [[0.0, 0.0, 0.1], [5.0, 0.0, 0.0], [0.9, 0.2, 0.4], [6.2, 0.1, 0.2], [9.0, 0.0, 0.0]]
+    model = furniture(
+        [BOX] * 5, [BOX + 20.0], pivots={2: 0}, poses=poses, link_anchor=[-1.0, 0.0],
+        mass=[4.0, 5.0, 6.0, 7.0, 8.0], floor_friction=[0.02, 0.04, 0.06, 0.08, 0.1],
+    )  # fmt: skip
+    first, second = np.asarray(model.pairs)[:, [0, 2]].T
+    near = (second < 0) | ((first == 1) & (second == 3))
+    model = dataclasses.replace(model, pairs=model.pairs[near])
+    parts = model.apart()
+    assert [group for _, group in parts] == [(0, 2), (1, 3), (4,)]
+    assert [part.link_to.shape[1] for part, _ in parts] == [1, 0, 0]
+    wrench = np.zeros((60, 5, 3))
+    wrench[:, 1:3] = (30.0, 5.0, 4.0)
+    wrench[:, 4] = (10.0, 0.0, 3.0)
+    start = model.initial_state(jnp.asarray([poses]))
+    whole = np.asarray(run(model, start, jnp.asarray(wrench)).pose)
+    assert np.ptp(whole[:, 3, 0]) > 0.01  # it was hit
+    for part, group in parts:
+        rows = np.array(group)
+        begun = part.initial_state(jnp.asarray(poses)[None, rows])
+        found = run(part, begun, jnp.asarray(wrench[:, rows])).pose
+        np.testing.assert_allclose(found, whole[:, rows], atol=1e-9)

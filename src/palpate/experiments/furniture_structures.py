@@ -22,7 +22,7 @@ from palpate.experiments.furniture_recording import (
     names_of,
     starting_furniture,
 )
-from palpate.experiments.identify_bayesian import evidence, explore, posterior_of, shares
+from palpate.experiments.identify_bayesian import explore, posterior_of, shares
 from palpate.experiments.options import Hypotheses
 from palpate.models.model import Model
 from palpate.models.planar import Planar
@@ -88,9 +88,9 @@ def hypotheses(
             {kind: posterior_of(meeting(model, piece), aligned) for kind, model in models.items()},
             seed,
         )
-        probability = shares({kind: evidence(modes) for kind, (_, modes) in found.items()})
+        probability = shares({kind: settled.evidence for kind, settled in found.items()})
         kinds[body] = max(probability, key=probability.__getitem__)
-        pieces.append({k: target.model(modes.position[0]) for k, (target, modes) in found.items()})
+        pieces.append({kind: settled.model for kind, settled in found.items()})
         by_itself[name] = probability
     likely = joints(recording)
     models = {}

@@ -16,7 +16,6 @@ from palpate.errors import PalpateError
 from palpate.experiments import folders
 from palpate.experiments.options import Hypotheses, IdentifyBayesian
 from palpate.identification.bayesian import Posterior, check_numbers, draw, preparing
-from palpate.identification.laplace import Modes, settle
 from palpate.identification.likelihood import (
     MotionPosterior,
     inferred_scales,
@@ -26,6 +25,7 @@ from palpate.identification.posterior_files import write_posterior
 from palpate.identification.prediction import or_nan
 from palpate.identification.predictive import Predicted, Score, check_seen
 from palpate.identification.segments import Segments, cut, difference, noise_scale
+from palpate.identification.settled import Settled, settle_each
 from palpate.models.model import Model
 from palpate.parameters import format_value
 from palpate.recording import Aligned, Recording, join
@@ -100,23 +100,16 @@ def identify(
     check_numbers(chains, draws)
     with preparing(next(iter(targets.values())), chains):
         explored = explore(targets, seed)
-    probability = shares({name: evidence(modes) for name, (_, modes) in explored.items()})
+    probability = shares({name: settled.evidence for name, settled in explored.items()})
     structure = max(probability, key=probability.__getitem__)
-    posterior = draw(*explored[structure], chains=chains, draws=draws, seed=seed)
+    posterior = draw(explored[structure], chains=chains, draws=draws, seed=seed)
     return Found(posterior, structure, probability)
 
 
-def explore(
-    targets: Mapping[str, MotionPosterior], seed: int = 0
-) -> dict[str, tuple[MotionPosterior, Modes]]:
-    """The modes of each, and the target settled about them."""
+def explore(targets: Mapping[str, MotionPosterior], seed: int = 0) -> dict[str, Settled]:
+    """The modes of each."""
     key = jax.random.fold_in(jax.random.key(seed), 1)
-    return {name: settle(target, key) for name, target in targets.items()}
-
-
-def evidence(modes: Modes) -> float:
-    """Laplace's logarithm of the density of the data, at the mode that gives most."""
-    return float(np.max(np.asarray(modes.evidence)))
+    return {name: settle_each(target, key) for name, target in targets.items()}
 
 
 def shares(logarithms: Mapping[str, float]) -> dict[str, float]:

@@ -8,26 +8,20 @@ import dataclasses
 import time
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from palpate.experiments.furniture_recording import (
     POSE,
     WRENCH,
-    alone,
     meeting,
-    names_of,
     starting_furniture,
 )
 from palpate.experiments.furniture_structures import structures
 from palpate.experiments.identify_bayesian import LEVEL, PIECE, Found, identify, posterior_of
 from palpate.identification.bayesian import Posterior, sample
-from palpate.identification.laplace import settle
 from palpate.identification.predictive import Predicted
 from palpate.identification.segments import Segments, cut, difference
 from palpate.models.model import Model
-from palpate.parameters import value_of, with_values
 from palpate.recording import Recording
 from palpate.worlds.furniture import FurnitureWorld
 from palpate.worlds.furniture_handling import (
@@ -44,7 +38,6 @@ HANDLED = 10.0  # s
 MOVABLE = ("table", "cart", "couch", "bookshelf", "chair", "hinged")
 BOLTED = "bolted"
 SCENE = ("table", "cart", "couch", "chair", "bookshelf")
-CHAINS = 4  # of a scene: too wide for the sampler that has many
 APART = 4.0  # m between the pieces of the scene
 
 
@@ -97,22 +90,10 @@ def fit(handled: Recording, draws: int, seed: int) -> tuple[Found, float]:
 
 
 def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
-    """The posterior of all pieces of a scene.
-
-    The search begins where those for each piece alone ended: among seventy parameters together it
-    would have to be lucky with every piece at once.
-    """
-    together = meeting(starting_furniture(handled, PERIOD), handled)
-    values = []
-    for body in range(len(names_of(handled))):
-        piece = alone(handled, body)
-        target = posterior_of(starting_furniture(piece, PERIOD), piece.align(PERIOD, POSE, WRENCH))
-        target, modes = settle(target, jax.random.fold_in(jax.random.key(seed), body))
-        found = target.model(modes.position[0])
-        values.append({path: value_of(found, path) for path in target.coordinates.declarations})
-    joined = {path: jnp.concatenate([each[path] for each in values]) for path in values[0]}
-    target = posterior_of(with_values(together, joined), handled.align(PERIOD, POSE, WRENCH))
-    return sample(target, chains=CHAINS, draws=draws, seed=seed)
+    """The posterior of all pieces of a scene."""
+    model = meeting(starting_furniture(handled, PERIOD), handled)
+    target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
+    return sample(target, draws=draws, seed=seed)
 
 
 def judged(model: Model, predicted: Predicted, pieces: Segments) -> Pushes:

@@ -54,7 +54,7 @@ def race(posterior: Posterior, seed: int, budget: float) -> dict[str, Pace]:
         "adapted": covariance_adapted,
     }
     start, *keys = jax.random.split(jax.random.key(seed), 1 + 2 * len(samplers))
-    begin = posterior.modes.draw(start, chains)
+    begin = posterior.settled.parts[0].modes.draw(start, chains)
     for number, (name, sampler) in enumerate(samplers.items()):
         tried = sampler(target, begin, keys[2 * number], 50, TRIED // 2, thin=TRIED // 100)
         step = (tried.seconds - tried.compiling) / TRIED

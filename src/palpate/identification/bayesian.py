@@ -13,6 +13,7 @@ Other samplers of the same target: Metropolis (`metropolis`), tempered particles
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import cached_property
@@ -29,7 +30,6 @@ from palpate.identification import predictive
 from palpate.identification.diagnostics import FEWEST, bulk_size, rhat, tail_size
 from palpate.identification.draws import Draws
 from palpate.identification.hamiltonian import no_u_turn
-from palpate.identification.laplace import Modes, settle
 from palpate.identification.likelihood import (
     MotionPosterior,
     inferred_scales,
@@ -38,6 +38,7 @@ from palpate.identification.likelihood import (
 from palpate.identification.local_global import compiled_meanwhile, local_global
 from palpate.identification.predictive import Predicted, Score
 from palpate.identification.segments import Segments, cut, noise_scale
+from palpate.identification.settled import Settled, factors_of, joined, settle_each
 from palpate.models.model import Model
 from palpate.parameters import value_of
 from palpate.recording import Aligned
@@ -81,10 +82,14 @@ class Posterior:
     may swap between draws that predict the same.
     """
 
-    target: MotionPosterior
+    settled: Settled
     draws: Draws
-    modes: Modes
     probes: Segments
+
+    @property
+    def target(self) -> MotionPosterior:
+        """What was sampled."""
+        return self.settled.target
 
     @property
     def flat(self) -> Float[np.ndarray, "draws free"]:
@@ -212,7 +217,7 @@ class Posterior:
         scales = self.target.scales
         for kind, of, values in (
             ("noise", scales.of_channel, noise),
-            ("discrepancy", scales.growth_of_channel, growth),
+            ("discrepancy", scales.of_channel, growth),
         ):
             labels = [label for label in scales.labels if label.startswith(kind)]
             for group, label in enumerate(labels):
@@ -269,20 +274,20 @@ def sample(
     check_numbers(chains, draws)
     climbing, _ = jax.random.split(jax.random.key(seed))
     with preparing(target, chains):
-        settled = settle(target, climbing)
-    return draw(*settled, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+        settled = settle_each(target, climbing)
+    return draw(settled, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
 
 
 def preparing(target: MotionPosterior, chains: int) -> AbstractContextManager[None]:
     """Within it modes may be searched for, while the sampler of such a target is compiled."""
-    if target.dimension > WIDEST:
+    first, _ = factors_of(target)[0]
+    if first.dimension > WIDEST:
         return contextlib.nullcontext()
-    return compiled_meanwhile(target, chains)
+    return compiled_meanwhile(first, chains)
 
 
 def draw(
-    target: MotionPosterior,
-    modes: Modes,
+    settled: Settled,
     *,
     chains: int = 16,
     draws: int = 100,
@@ -290,12 +295,22 @@ def draw(
     probes: Segments | None = None,
     tell: Callable[[int, int], None] = lambda done, blocks: None,
 ) -> Posterior:
-    """As `sample`, for a target that has been settled (`laplace.settle`) about its modes."""
+    """As `sample`, for a target whose modes are known."""
     check_numbers(chains, draws)
     _, sampling = jax.random.split(jax.random.key(seed))
-    sampler = local_global if target.dimension <= WIDEST else no_u_turn
-    found = sampler(target, modes, sampling, chains, draws, tell)
-    return Posterior(target, found, modes, target.segments if probes is None else probes)
+    found = []
+    for number, part in enumerate(settled.parts):
+        sampler = local_global if part.target.dimension <= WIDEST else no_u_turn
+        key = jax.random.fold_in(sampling, number) if number else sampling
+        told = functools.partial(_told, tell, number, len(settled.parts))
+        found.append(sampler(part.target, part.modes, key, chains, draws, told))
+    every = joined(settled, found, jax.random.fold_in(sampling, len(found)))
+    return Posterior(settled, every, settled.target.segments if probes is None else probes)
+
+
+def _told(tell: Callable[[int, int], None], part: int, parts: int, done: int, rounds: int) -> None:
+    """Tell how much is done of all parts, when so much is of one."""
+    tell(part * rounds + done, parts * rounds)
 
 
 def check_numbers(chains: int, draws: int) -> None:

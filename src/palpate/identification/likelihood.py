@@ -3,10 +3,10 @@
 An observed channel c (the x of one body, say) is what the model predicts from the start of its
 piece, plus
 
-- white sensor noise of standard deviation s, one for each unit;
+- white sensor noise of standard deviation s;
 - a discrepancy that the model does not explain, of strength w (`discrepancy`). Without it residuals
   that follow one another in time would count as independent evidence, and intervals be too narrow.
-  A w for each unit of each body;
+  An s and a w for each unit of each body;
 - what errors of the initial pose and rate become: linear in them, with the derivatives of a model
   nearby (`linearised`), and marginalised in closed form. The smoothed start has seen the piece's
   own frames, so its deviation is taken `VAGUE` times as wide, and the piece decides.
@@ -39,14 +39,13 @@ GROWTH_RATIO, GROWTH_SPREAD = 3.0, 1.5  # median of w over that of s (after 1 s)
 class Scales(eqx.Module):
     """Prior medians of the noise and the discrepancy, or their values where they are known.
 
-    `noise` is by entry of the observation's last axis, in its unit; `growth` is by leading entry
-    (a body) and unit, in unit / s^1.5: `of_channel` and `growth_of_channel` index them.
+    Both by leading entry of an observation (a body) and unit, in the unit and in unit / s^1.5:
+    `of_channel` indexes them.
     """
 
-    noise: Float[Array, " units"]
+    noise: Float[Array, " groups"]
     growth: Float[Array, " groups"]
     of_channel: tuple[int, ...] = eqx.field(static=True)
-    growth_of_channel: tuple[int, ...] = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
     known: bool = eqx.field(static=True)
 
@@ -54,7 +53,7 @@ class Scales(eqx.Module):
 def inferred_scales(model: Model, noise: Float[np.ndarray, " last"]) -> Scales:
     """Scales to be inferred, about a sensor noise by entry of the last observation axis.
 
-    Entries of one unit share a scale: the median of theirs.
+    Entries of one unit of a body share a scale, about the median of theirs.
     """
     return _scales(model, noise, known=False)
 
@@ -75,16 +74,14 @@ def _scales(model: Model, noise: np.ndarray, known: bool) -> Scales:
     medians = [np.median(np.asarray(noise)[np.array(units) == unit]) for unit in distinct]
     bodies = int(np.prod(shape[:-1]))
     of_last = [distinct.index(unit) for unit in units]
-    labels = [f"noise ({unit or 1})" for unit in distinct]
     of = [f" of {body}" if bodies > 1 else "" for body in range(bodies)]
+    labels = [f"noise{body} ({unit or 1})" for body in of for unit in distinct]
     labels += [f"discrepancy{body} ({unit or 1}/s^1.5)" for body in of for unit in distinct]
-    dtype = jnp.zeros(()).dtype
-    growth = 0.0 if known else GROWTH_RATIO
+    noises = jnp.asarray(np.tile(medians, bodies), jnp.zeros(()).dtype)
     return Scales(
-        noise=jnp.asarray(medians, dtype),
-        growth=jnp.asarray(np.tile(growth * np.asarray(medians), bodies), dtype),
-        of_channel=tuple(of_last * bodies),
-        growth_of_channel=tuple(b * len(distinct) + u for b in range(bodies) for u in of_last),
+        noise=noises,
+        growth=(0.0 if known else GROWTH_RATIO) * noises,
+        of_channel=tuple(b * len(distinct) + u for b in range(bodies) for u in of_last),
         labels=() if known else tuple(labels),
         known=known,
     )
@@ -142,7 +139,7 @@ class MotionPosterior(Target):
         scale = self.scales.growth
         if not self.scales.known:
             scale = scale * jnp.exp(GROWTH_SPREAD * position[self.dimension - scale.size :])
-        return scale[np.array(self.scales.growth_of_channel)]
+        return scale[np.array(self.scales.of_channel)]
 
     def log_likelihood(self, position: Float[Array, " free"]) -> Float[Array, ""]:
         return jnp.sum(self.by_segment(position))

@@ -66,6 +66,14 @@ class Model(eqx.Module):
         Shape (frames, *observation_shape), with or without a batch axis before.
         """
 
+    def apart(self) -> tuple[tuple["Model", tuple[int, ...]], ...]:
+        """What moves by itself, whatever the rest does, as models, and where each is in this one.
+
+        That is in the first axis of observations, of actions and of those parameters that each part
+        has. One part, the model itself, where all is coupled or there is one thing only.
+        """
+        return ((self, tuple(range(self.observation_shape[0]))),)
+
     def constrain(self) -> "Model":
         """The nearest legal model: what couples several parameters stands here."""
         return self

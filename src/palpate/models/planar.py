@@ -7,11 +7,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from palpate.models import planar_step
 from palpate.models.model import Model
-from palpate.models.planar_checks import check_axes, check_indices
+from palpate.models.planar_checks import check_axes, check_indices, coupled
 from palpate.models.planar_links import turn
 from palpate.models.planar_system import WEAKEST, System, system_of
 from palpate.parameters import (
@@ -248,6 +249,35 @@ class Planar(Model):
             return PlanarState(*(leaf[..., 0] for leaf in after))
 
         return step
+
+    def apart(self) -> tuple[tuple["Planar", tuple[int, ...]], ...]:
+        """Bodies, and groups of them, that no link and no contact couples.
+
+        What no link holds loses the room for links: it is stepped in a fraction of the time.
+        """
+        groups = coupled(self)
+        return tuple((self._only(of) if len(groups) > 1 else self, of) for of in groups)
+
+    def _only(self, group: tuple[int, ...]) -> "Planar":
+        """The model of a group of bodies that nothing couples to others."""
+        rows = np.array(group)
+        number = np.full(self.bodies, -1)
+        number[rows] = np.arange(len(group))
+        parts = {
+            name: getattr(self, name)[rows]
+            for name, axes in axes_of(Planar).items()
+            if axes[0] == "bodies"
+        }
+        to = np.asarray(parts["link_to"])
+        parts["link_to"] = np.where(to < 0, to, number[to])
+        if not np.any(np.asarray(parts["pivot"])) and not np.any(np.asarray(parts["distance"])):
+            linked = [name for name in parts if "links" in axes_of(Planar)[name]]
+            parts |= {name: parts[name][:, :0] for name in linked}
+        pairs = np.asarray(self.pairs)
+        pairs = pairs[np.isin(pairs[:, 0], rows)].copy()
+        pairs[:, 0] = number[pairs[:, 0]]
+        pairs[:, 2] = np.where(pairs[:, 2] < 0, -1, number[pairs[:, 2]])
+        return dataclasses.replace(self, pairs=pairs, **parts)
 
     def linked_at(self, poses: Float[Array, "bodies 3"]) -> "Planar":
         """The model whose links hold as they stand at these poses."""

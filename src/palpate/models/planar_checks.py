@@ -42,6 +42,23 @@ def check_indices(model: Any) -> None:
         _check_range("pairs", pairs[..., 3][wall], 0, walls)
 
 
+def coupled(model: Any) -> tuple[tuple[int, ...], ...]:
+    """Bodies in groups: which of them links or possible contacts couple, if only by others.
+
+    `model` has no batch axis.
+    """
+    held = (np.asarray(model.pivot) > 0) | (np.asarray(model.distance) > 0)
+    owners = np.broadcast_to(np.arange(model.bodies)[:, None], held.shape)
+    edges = np.concatenate([
+        np.stack([owners[held], np.asarray(model.link_to)[held]], axis=1),
+        np.asarray(model.pairs)[:, [0, 2]],
+    ])  # fmt: skip
+    group = np.arange(model.bodies)
+    for first, second in edges[edges[:, 1] >= 0]:
+        group[group == group[second]] = group[first]
+    return tuple(tuple(np.flatnonzero(group == of).tolist()) for of in dict.fromkeys(group))
+
+
 def _check_range(name: str, index: np.ndarray, low: int, end: int) -> None:
     if index.size and not (low <= index.min() and index.max() < end):
         raise PalpateError(

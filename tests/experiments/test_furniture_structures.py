@@ -9,7 +9,7 @@ import pytest
 
 from palpate.experiments import furniture_structures
 from palpate.experiments.furniture_recording import POSE, WRENCH, alone
-from palpate.experiments.furniture_structures import hypotheses, joints
+from palpate.experiments.furniture_structures import hypotheses, joints, structures
 from palpate.experiments.identify_bayesian import posterior_of
 from palpate.identification.laplace import CLIMBING, Modes, climb
 from palpate.identification.likelihood import initial_position, motion_posterior
@@ -154,6 +154,30 @@ def test_a_hinge_gives_way_to_a_joint(joined, monkeypatch):
     np.testing.assert_array_equal(apart.pivot, [[1], [1]])
     np.testing.assert_array_equal(apart.link_to, [[-1], [-1]])
     np.testing.assert_array_equal(together.pivot, [[1], [0]])
+
+
+def test_a_hinge_is_where_the_body_stays_in_all_frames(joined):
+    """And not where the noise of the first has it, which would be wrong at every moment."""
+    model = furniture([BOX], wheels=0, pivots={0: None}, poses=START[:1], link_anchor=[-1.0, 0.4])
+    wrench = np.zeros((200, 1, 3))
+    wrench[:, 0, 2] = 4.0 * np.sin(1.7 * PERIOD * np.arange(200))
+    state = model.initial_state(jnp.asarray(START[None, :1]))
+    poses = np.asarray(rollout(model, state, jnp.asarray(wrench)).pose)
+    poses = poses + NOISE * np.random.default_rng(1).standard_normal(poses.shape)
+    poses[0] += (0.02, -0.02, 0.0)
+    one = alone(joined, 0)
+    pose = dataclasses.replace(one.trials[0][POSE], time=PERIOD * np.arange(200), values=poses)
+    still = dataclasses.replace(pose, values=np.repeat(poses[1:2], 200, axis=0))
+    links = []
+    for seen in (pose, still):
+        trial = dataclasses.replace(one.trials[0], channels=one.trials[0].channels | {POSE: seen})
+        hinged = structures(dataclasses.replace(one, trials=(trial,)), PERIOD)["hinge"]
+        links.append((np.asarray(hinged.link_anchor[0, 0]), system_of(hinged).links.other_anchor))
+    place = START[0, :2] + turned((-0.5, 0.12), START[0, 2])
+    np.testing.assert_allclose(links[0][0] * (0.5, 0.3), (-0.5, 0.12), atol=2e-3)
+    np.testing.assert_allclose(links[0][1][0, 0], place, atol=1e-3)
+    np.testing.assert_allclose(links[1][0], 0.0, atol=1e-6)  # any point stays
+    np.testing.assert_allclose(links[1][1][0, 0], poses[1, 0, :2], atol=1e-6)
 
 
 def test_three_bodies_joined_all_round_share_out_their_pivots(joined):

@@ -15,7 +15,13 @@ from palpate.experiments.furniture_structures import structures
 from palpate.experiments.identify_bayesian import posterior_of
 from palpate.experiments.one_shot_figure import shares_figure
 from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
-from palpate.experiments.one_shot_regression import OURS, RIVALS, first_samples, transitions
+from palpate.experiments.one_shot_regression import (
+    OURS,
+    RIVALS,
+    first_samples,
+    recorded,
+    transitions,
+)
 from palpate.experiments.one_shot_sampling import OURS as SAMPLER
 from palpate.identification.laplace import settle
 from palpate.identification.predictive import Predicted
@@ -163,8 +169,11 @@ def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatc
 
     monkeypatch.setattr(one_shot_regression, "cut", noting)
     monkeypatch.setattr(one_shot_regression, "identify", stop)
+    seen = first_samples(aligned, 4)
+    told = recorded(first, seen)
+    np.testing.assert_array_equal(told.align(PERIOD, POSE, WRENCH).observation, seen.observation)
     with pytest.raises(StopIteration):
-        one_shot_regression._ours(first, aligned, first, 3, 10, 0)
+        one_shot_regression._ours(told, seen, first, 10, 0)
     transitions(aligned, starting_furniture(first, PERIOD), 3)
     np.testing.assert_array_equal(*given)
     assert len(given[0][0]) < len(aligned.observation[0])

@@ -8,7 +8,7 @@ the one body stays at one point of the other, and evidence decides.
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +38,17 @@ MOVED = 0.05  # m or rad: who moves less tells nothing of joints
 JOINTS = 3  # candidates at most, the tightest: every set of them is a hypothesis
 
 
+class Held(NamedTuple):
+    """A pivot: a point of a body, where that is held, both (2,) in m, and the body's angle there.
+
+    Place and angle (rad) are in the axes of what holds it: the world, or another body.
+    """
+
+    own: np.ndarray
+    place: np.ndarray
+    angle: float
+
+
 def structures(
     recording: Recording,
     period: float,
@@ -56,6 +67,7 @@ def structures(
         starting_furniture(recording, period, size, wheels=wheels, law=law, pivots=pivots)
         for pivots in ({}, dict.fromkeys(bodies))
     )
+    held = _with_pivots(held, {body: _hinge(recording, body) for body in bodies})
     return {
         name: _masked(held if name == "hinge" else free, dict.fromkeys(bodies, name))
         for name in ("wheels", "feet", "hinge", "bolted")
@@ -111,11 +123,10 @@ def joints(recording: Recording) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
     other in all frames in which both are seen: least squares over R_i a_i + p_i = R_j a_j + p_j.
     Pairs that part by more than `SLACK`, or of which one hardly moves, are left out.
     """
-    poses = [np.asarray(trial[POSE].values, float) for trial in recording.trials]
+    trials = [dataclasses.replace(recording, trials=(trial,)) for trial in recording.trials]
     found = {}
-    for pair in itertools.combinations(range(poses[0].shape[1]), 2):
-        of = [trial[:, pair][np.isfinite(trial[:, pair]).all(axis=(1, 2))] for trial in poses]
-        of = [seen for seen in of if len(seen)]
+    for pair in itertools.combinations(range(len(names_of(recording))), 2):
+        of = [seen for trial in trials if len(seen := _seen(trial, pair))]
         if not of or not all(
             max(np.ptp(seen[:, body], axis=0).max() for seen in of) > MOVED for body in range(2)
         ):
@@ -163,24 +174,43 @@ def _together(
     others = {owner: sum(pair) - owner for owner, pair in zip(owners, chosen, strict=True)}
     pivots |= others
     model = starting_furniture(recording, period, size, wheels=wheels, law=law, pivots=pivots)
-    anchor, pose = np.array(model.link_anchor), np.array(model.link_pose)
+    held = {b: _hinge(recording, b) for b, other in pivots.items() if other is None}
     for (owner, other), pair in zip(others.items(), chosen, strict=True):
         own, place = (chosen[pair][pair.index(body)] for body in (owner, other))
-        anchor[owner, 0] = own / np.asarray(model.half_extent[owner])
         # Where both were seen, not where each was seen first: the one may have moved before.
-        angle = _angle_between(recording, owner, other)
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        pose[owner, 0] = (*(place - turn @ own), angle)
-    model = dataclasses.replace(model, link_anchor=jnp.asarray(anchor), link_pose=jnp.asarray(pose))
-    return _masked(model, being, set(others))
+        first = _seen(recording, [owner, other])[0]
+        held[owner] = Held(own, place, first[0, 2] - first[1, 2])
+    return _masked(_with_pivots(model, held), being, set(others))
 
 
-def _angle_between(recording: Recording, body: int, other: int) -> float:
-    """The angle of a body in the other's axes, rad, in the first frame that shows both."""
+def _hinge(recording: Recording, body: int) -> Held:
+    """The point of a body that moves least in the world, and where that is.
+
+    Of all frames: a hinge that is where the noise of one pose puts it is off by as much at every
+    moment, and evidence then prefers a wheel that hardly gives way.
+    """
+    seen = _seen(recording, [body])
+    # Seen from where it was first: of what never turns the point is its centroid, wherever it is.
+    first = np.array([*seen[0, 0, :2], 0.0])
+    (own, place), _ = _common_point(np.concatenate([seen - first, np.zeros_like(seen)], axis=1))
+    return Held(own, place + first[:2], seen[0, 0, 2])
+
+
+def _seen(recording: Recording, bodies: Sequence[int]) -> Float[np.ndarray, "frames bodies 3"]:
+    """Poses of these bodies in the frames that show all of them."""
     poses = np.concatenate([np.asarray(trial[POSE].values, float) for trial in recording.trials])
-    both = np.isfinite(poses[:, [body, other]]).all(axis=(1, 2))
-    first = poses[both.argmax()]
-    return float(first[body, 2] - first[other, 2])
+    poses = poses[:, bodies]
+    return poses[np.isfinite(poses).all(axis=(1, 2))]
+
+
+def _with_pivots(model: Planar, held: Mapping[int, Held]) -> Planar:
+    """The model whose bodies' pivots are where they are `held`."""
+    anchor, pose = np.array(model.link_anchor), np.array(model.link_pose)
+    for body, (own, place, angle) in held.items():
+        anchor[body, 0] = own / np.asarray(model.half_extent[body])
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        pose[body, 0] = (*(place - turn @ own), angle)
+    return dataclasses.replace(model, link_anchor=jnp.asarray(anchor), link_pose=jnp.asarray(pose))
 
 
 def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:

@@ -8,6 +8,7 @@ open loop. Regressions get the inputs that suit them: raw as in the deck (whole
 state, whole wrench) and in the piece's own axes; of both the better on these very pushes counts.
 """
 
+import dataclasses
 import json
 
 import jax
@@ -52,7 +53,8 @@ def shares(
     aligned = handled.align(PERIOD, POSE, WRENCH)
     found: dict[str, dict[int, float | None]] = {name: {} for name in (OURS, *RIVALS)}
     for size in SIZES:
-        found[OURS][size] = _ours(handled, aligned, pushes, size, draws, seed)
+        seen = first_samples(aligned, size + 1)
+        found[OURS][size] = _ours(recorded(handled, seen), seen, pushes, draws, seed)
         for rival in RIVALS:
             share = _theirs(handled, aligned, pushes, rival, size)
             found[rival][size] = share if np.isfinite(share) else None
@@ -74,21 +76,23 @@ def first_samples(aligned: Aligned, size: int) -> Aligned:
     )
 
 
-def _ours(
-    handled: Recording,
-    aligned: Aligned,
-    pushes: Recording,
-    size: int,
-    draws: int,
-    seed: int,
-) -> float:
-    """Of the posterior given the same frames, of what the piece then most probably is.
+def recorded(recording: Recording, seen: Aligned) -> Recording:
+    """A recording of no more than these frames of its first trial."""
+    trial = recording.trials[0]
+    channels = {}
+    for name, values in ((POSE, seen.observation[0]), (WRENCH, seen.action[0])):
+        time = trial[name].time[0] + seen.period * np.arange(len(values))
+        channels[name] = dataclasses.replace(trial[name], time=time, values=values)
+    return dataclasses.replace(recording, trials=(dataclasses.replace(trial, channels=channels),))
 
-    Padded, so that all sizes compile once.
+
+def _ours(handled: Recording, seen: Aligned, pushes: Recording, draws: int, seed: int) -> float:
+    """Of the posterior given what was `seen` of the handling, of what the piece then probably is.
+
+    Padded, so that all numbers of samples compile once.
     """
     models = structures(handled, PERIOD)
     model, seconds = models["wheels"], PIECE * SAMPLE
-    seen = first_samples(aligned, size + 1)
     pieces = cut(seen, model, seconds, at_rest=True, count=max(SIZES) // PIECE)
     scales = inferred_scales(model, noise_scale(seen, model))
     targets = {name: motion_posterior(of, pieces, scales) for name, of in models.items()}

@@ -13,10 +13,10 @@ from palpate.experiments.furniture_options import IdentifyFurniture
 from palpate.experiments.furniture_recording import POSE, WRENCH
 from palpate.identification.bayesian import Posterior
 from palpate.identification.draws import Draws
-from palpate.identification.laplace import Modes
 from palpate.identification.likelihood import known_scales, motion_posterior
 from palpate.identification.predictive import Predicted, score
 from palpate.identification.segments import known_start
+from palpate.identification.settled import Settled
 from palpate.recording import Channel, Recording, Role, Trial
 from palpate.recording_files import write_recording
 from palpate.result import Result
@@ -63,6 +63,7 @@ def test_what_cannot_be_scored_on_is_refused_before_anything_is_sampled(
         raise AssertionError("expected to be refused before what takes minutes")
 
     monkeypatch.setattr(identify_bayesian, "posterior_of", began)
+    monkeypatch.setattr(IdentifyFurniture, "hypotheses", began)  # of several bodies it takes long
     fitted, scored = still(tmp_path / "R.npz"), still(tmp_path / "P.npz", seen)
     options = IdentifyFurniture(recordings=(fitted,), validate=(scored,), out=tmp_path / "out")
     with pytest.raises(PalpateError, match=sentence):
@@ -85,13 +86,8 @@ def test_the_error_of_what_nobody_saw_is_said_to_be_unknown(capsys):
     noise = random.normal(size=motion.shape)
     predicted = Predicted(motion, motion + noise, np.ones(motion.shape))
     position = random.normal(size=(2, 20, 3)).astype(np.float32)
-    one = jnp.zeros((1, 3))
-    posterior = Posterior(
-        target,
-        Draws(position, np.zeros((2, 20)), np.ones(2), 0, 40, 1.0, 0.0),
-        Modes(one, one[:, 0], one, np.eye(3)[None], one[:, 0]),
-        pieces,
-    )
+    draws = Draws(position, np.zeros((2, 20)), np.ones(2), 0, 40, 1.0, 0.0)
+    posterior = Posterior(Settled(target, ()), draws, pieces)
     found = score(target, predicted, pieces)
     figures = identify_bayesian._figures(posterior, found, SLED, 1.0)
     values = {figure.name: figure.value for figure in figures}

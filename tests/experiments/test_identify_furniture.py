@@ -136,7 +136,7 @@ def test_what_may_be_is_asked_of_recordings_of_the_same_bodies():
     assert len(options.sufficient(model, [far]).pairs) == 0
     assert len(options.sufficient(model, [far, near]).pairs) == 1
     with pytest.raises(PalpateError, match="expected the same bodies"):
-        options.hypotheses([far, checked(recording(*still()))], 1 / RATE)
+        options.reference([far, checked(recording(*still()))], 1 / RATE)
 
 
 def test_rest_is_told_from_motion():

@@ -90,14 +90,19 @@ class IdentifyFurniture(IdentifyBayesian):
 
         return checked(recording)
 
-    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
-        """Models to be compared, by name: see `furniture_structures`."""
-        from palpate.experiments import furniture_structures
-        from palpate.experiments.furniture_recording import check_alike
+    def reference(self, recordings: Sequence[Recording], period: float) -> Model:
+        """Bodies on wheels, every parameter at its prior's centre."""
+        from palpate.experiments.furniture_recording import check_alike, starting_furniture
 
         if self.wheels < 1:
             raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
         check_alike(*recordings)
+        return starting_furniture(recordings[0], period, self.size, wheels=self.wheels)
+
+    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
+        """Models to be compared, by name: see `furniture_structures`."""
+        from palpate.experiments import furniture_structures
+
         about = recordings[0], period, self.size, self.wheels, self.law
         if self.structure == "compare":
             return furniture_structures.hypotheses(*about, seed=self.seed)

@@ -71,10 +71,12 @@ def run(options: IdentifyBayesian) -> Path:
                 recording.align(period, options.observation, options.action)
                 for recording in (fitted, scored or fitted)
             )
-            hypotheses = options.hypotheses(shown, period)
-            # Before the sampling: where nothing can be cut, nobody waits for it in vain.
-            pieces = _cut(asked, next(iter(hypotheses.models.values())))
+            # First of all: where nothing can be cut, nobody waits in vain.
+            reference = options.reference(shown, period)
+            _cut(aligned, reference)
+            pieces = _cut(asked, reference)
             check_seen(pieces)
+            hypotheses = options.hypotheses(shown, period)
             targets = {
                 name: posterior_of(options.sufficient(model, shown), aligned)
                 for name, model in hypotheses.models.items()

@@ -170,10 +170,17 @@ class IdentifyBayesian(Reading, ABC):
         """The recording with the channels that the models need."""
 
     @abstractmethod
-    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
-        """The models to compare; one is fitted without comparison.
+    def reference(self, recordings: Sequence[Recording], period: float) -> Model:
+        """A model of what was recorded, at once: by it recordings are checked.
 
         The first recording is to be fitted, what follows only to be scored on.
+        """
+
+    @abstractmethod
+    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
+        """The models to compare; one is fitted without comparison. Arguments as of `reference`.
+
+        May take minutes.
         """
 
     def sufficient(self, model: Model, recordings: Sequence[Recording]) -> Model:

@@ -321,3 +321,67 @@ def test_two_bodies_on_one_pivot_keep_their_momentum_and_their_joint(float64):
     side = np.array([1.0, -1.0]) * 0.6
     joint = np.stack([x + side * np.cos(angle), y + side * np.sin(angle)], -1)
     assert np.max(np.abs(joint[:, 0] - joint[:, 1])) < 3e-3
+
+
+@pytest.mark.parametrize("pivots", [{0: None}, {0: 1}])
+def test_a_measured_state_is_begun_in_as_near_as_links_allow(float64, pivots):
+    poses = np.array([[0.4, -0.2, 0.5], [1.6, 0.3, 0.2]])
+    model = furniture(
+        [BOX, BOX], wheels=0, pivots=pivots, poses=poses, link_anchor=[1.0, 0.0], **SMOOTH
+    )
+    random = np.random.default_rng(0)
+    last = poses + 3e-3 * random.standard_normal((2, 3))
+    frames = np.stack([last - 0.02 * random.standard_normal((2, 3)), last])
+    state = model.initial_state(jnp.asarray(frames))
+
+    def gap(pose):
+        """Between the two points of the joint, m, by hand."""
+        turned = lambda p, x, y: p[:2] + jnp.array([  # noqa: E731
+            x * jnp.cos(p[2]) - y * jnp.sin(p[2]), x * jnp.sin(p[2]) + y * jnp.cos(p[2]),
+        ])  # fmt: skip
+        place = turned(jnp.asarray(poses[0]), 0.6, 0.0)
+        if pivots[0] is not None:
+            angle, apart = poses[1, 2], place - poses[1, :2]
+            x = apart[0] * np.cos(angle) + apart[1] * np.sin(angle)
+            y = apart[1] * np.cos(angle) - apart[0] * np.sin(angle)
+            place = turned(pose[1], x, y)
+        return turned(pose[0], 0.6, 0.0) - place
+
+    slope = np.asarray(jax.jacobian(gap)(state.pose)).reshape(2, 6)
+    assert np.abs(gap(jnp.asarray(last))).max() > 5e-4
+    np.testing.assert_allclose(gap(state.pose), 0.0, atol=1e-7)
+    np.testing.assert_allclose(slope @ np.ravel(state.velocity), 0.0, atol=1e-5)
+    # nearest: what was changed is normal to all that the joint allows
+    cost = np.tile([1.0, 1.0, (1.2**2 + 0.6**2) / 12.0], 2)
+    allowed = np.linalg.svd(slope)[2][2:]
+    rate = (last - frames[0]) / 0.02
+    np.testing.assert_allclose(allowed @ (cost * np.ravel(state.velocity - rate)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(allowed @ (cost * np.ravel(state.pose - last)), 0.0, atol=1e-4)
+    again = model.initial_state(jnp.asarray(np.asarray(state.pose)[None]))
+    np.testing.assert_allclose(again.pose, state.pose, atol=1e-9)
+    both = model.initial_state(jnp.asarray(np.stack([frames, frames[::-1]])))
+    np.testing.assert_allclose(both.pose[0], state.pose, atol=1e-12)
+
+
+def test_what_is_hinged_and_seen_a_little_off_does_not_begin_to_turn(float64):
+    """Its centre of mass is nearer to one end: an impulse at the hinge would turn it."""
+    pose = np.array([[0.0, 0.0, 0.0]])
+    model = body(
+        pivots={0: None}, poses=pose, link_anchor=[1.0, 0.0], centre_of_mass=[-0.5, 0.3],
+    )  # fmt: skip
+    start = model.initial_state(jnp.asarray(pose + np.array([1e-3, -2e-3, 1e-3]))[None])
+    poses, _ = pushed(model, start, 2.0)
+    assert np.ptp(poses[:, 0, 2]) < 1e-4
+
+
+def test_what_is_bolted_stays_where_it_is_seen_whatever_holds_it(float64):
+    poses = np.array([[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
+    model = furniture(
+        [BOX, BOX], wheels=0, pivots={0: 1}, poses=poses, link_anchor=[1.0, 0.0], bolted=[1],
+    )  # fmt: skip
+    seen = poses + np.array([[2e-3, 1e-3, 0.0], [0.0, 0.0, 0.0]])
+    state = model.initial_state(jnp.asarray(seen)[None])
+    np.testing.assert_allclose(state.pose, poses, atol=2e-3)
+    np.testing.assert_array_equal(state.pose[1], seen[1])
+    everything = dataclasses.replace(model, bolted=jnp.ones(2))
+    np.testing.assert_allclose(everything.initial_state(jnp.asarray(seen)[None]).pose, seen)

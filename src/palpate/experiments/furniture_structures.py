@@ -26,7 +26,7 @@ from palpate.experiments.identify_bayesian import explore, posterior_of, shares
 from palpate.experiments.options import Hypotheses
 from palpate.models.model import Model
 from palpate.models.planar import Planar
-from palpate.parameters import parameters_of, value_of, with_values
+from palpate.parameters import declare, parameters_of, value_of, with_values
 from palpate.recording import Recording
 from palpate.runs import progress
 
@@ -59,14 +59,14 @@ def structures(
     """What each body may be, as models: on wheels, on feet, hinged, or bolted down.
 
     What is on feet or on a hinge has no wheels that resist; free casters are small friction of the
-    floor. All but the hinged one have one shape, without a link: bodies that nothing couples are
-    stepped in a third of the time. Arguments as of `starting_furniture` and `furniture`.
+    floor. All but the hinged one have one shape, and are compiled once; a link, with which bodies
+    are stepped in three times the time, has the hinged one alone, and nothing that it does not
+    need. Arguments as of `starting_furniture` and `furniture`.
     """
     bodies = range(len(names_of(recording)))
-    free, held = (
-        starting_furniture(recording, period, size, wheels=wheels, law=law, pivots=pivots)
-        for pivots in ({}, dict.fromkeys(bodies))
-    )
+    free = starting_furniture(recording, period, size, wheels=wheels, law=law)
+    held = starting_furniture(recording, period, size, wheels=0, pivots=dict.fromkeys(bodies))
+    held = declare(held, link_other_anchor={"fixed": True})  # a pivot's follows from its own
     held = _with_pivots(held, {body: _hinge(recording, body) for body in bodies})
     return {
         name: _masked(held if name == "hinge" else free, dict.fromkeys(bodies, name))
@@ -215,11 +215,14 @@ def _with_pivots(model: Planar, held: Mapping[int, Held]) -> Planar:
 
 def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:
     """The model with the values that its bodies have by themselves, but for its joints."""
-    values = {
-        path: jnp.concatenate([value_of(piece, path) for piece in pieces])
-        for path in parameters_of(model)
-        if value_of(model, path).size and not path.startswith("link_")
-    }
+    values = {}
+    for path in parameters_of(model):
+        value = value_of(model, path)
+        if not value.size or path.startswith("link_"):
+            continue
+        rows = [value_of(piece, path) for piece in pieces]  # a hinged one has no wheels
+        rows = [own if own.size else value[body : body + 1] for body, own in enumerate(rows)]
+        values[path] = jnp.concatenate(rows)
     anchor = model.link_anchor
     for body, piece in enumerate(pieces):
         own = value_of(piece, "link_anchor")  # none but of a hinged one, which is held by the world

@@ -13,8 +13,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from palpate.models import planar_step
 from palpate.models.model import Model
 from palpate.models.planar_checks import check_axes, check_indices, coupled
-from palpate.models.planar_links import turn
-from palpate.models.planar_system import WEAKEST, System, system_of
+from palpate.models.planar_links import allowed, turn
+from palpate.models.planar_system import WEAKEST, System, links_of, system_of
 from palpate.parameters import (
     LogNormal,
     Normal,
@@ -213,12 +213,13 @@ class Planar(Model):
         """The state at the last of a few frames: on the straight line that fits them best.
 
         With one frame at rest. Angles may be wrapped or not. Noise s of a pose becomes
-        sqrt(12 / n^3) s / period in the velocity of n frames.
+        sqrt(12 / n^3) s / period in the velocity of n frames. Where there are links it is the
+        nearest state that they allow.
         """
         frames = observations.shape[-3]
         last = observations[..., -1, :, :]
         if frames < 2:
-            return PlanarState(last, jnp.zeros_like(last))
+            return self._allowed(PlanarState(last, jnp.zeros_like(last)))
         steps = self.difference(observations[..., 1:, :, :], observations[..., :-1, :, :])
         back = jnp.flip(jnp.cumsum(jnp.flip(steps, axis=-3), axis=-3), axis=-3)
         change = jnp.concatenate([-back, jnp.zeros_like(back[..., :1, :, :])], axis=-3)
@@ -226,7 +227,7 @@ class Planar(Model):
         centred = time - jnp.mean(time)
         slope = jnp.sum(centred * change, axis=-3) / jnp.sum(jnp.square(centred))
         offset = jnp.mean(change, axis=-3) - slope * jnp.mean(time)
-        return PlanarState(last + (offset if frames > 2 else 0.0), slope)
+        return self._allowed(PlanarState(last + (offset if frames > 2 else 0.0), slope))
 
     def step(self, state: PlanarState, action: Float[Array, "*batch bodies 3"]) -> PlanarState:
         """The state one control period later."""
@@ -251,23 +252,16 @@ class Planar(Model):
         return step
 
     def apart(self) -> tuple[tuple["Planar", tuple[int, ...]], ...]:
-        """Bodies, and groups of them, that no link and no contact couples.
-
-        What no link holds loses the room for links: it is stepped in a fraction of the time.
-        """
+        """Groups of bodies that no link and no contact couples; without links, no room for them."""
         groups = coupled(self)
         return tuple((self._only(of) if len(groups) > 1 else self, of) for of in groups)
 
     def _only(self, group: tuple[int, ...]) -> "Planar":
         """The model of a group of bodies that nothing couples to others."""
-        rows = np.array(group)
-        number = np.full(self.bodies, -1)
+        rows, number = np.array(group), np.full(self.bodies, -1)
         number[rows] = np.arange(len(group))
-        parts = {
-            name: getattr(self, name)[rows]
-            for name, axes in axes_of(Planar).items()
-            if axes[0] == "bodies"
-        }
+        own = [name for name, axes in axes_of(Planar).items() if axes[0] == "bodies"]
+        parts = {name: getattr(self, name)[rows] for name in own}
         to = np.asarray(parts["link_to"])
         parts["link_to"] = np.where(to < 0, to, number[to])
         if not np.any(np.asarray(parts["pivot"])) and not np.any(np.asarray(parts["distance"])):
@@ -319,19 +313,21 @@ class Planar(Model):
         return 0.5 * self.mass * (squared + jnp.square(gyration * rate))
 
     def _step_each(self, state: PlanarState, action: Array) -> PlanarState:
-        """`step` of bodies that links or contacts couple: what batch there is, one by one."""
-        leaves, structure = jax.tree.flatten((self, state, action))
-        batched = [leaf.ndim > axes for leaf, axes in zip(leaves, _AXES, strict=True)]
+        """`step` of bodies that links or contacts couple."""
 
-        def one(*leaves: Array) -> PlanarState:
-            model, state, action = jax.tree.unflatten(structure, leaves)
-            return PlanarState(
-                *model._advanced(system_of(model), state.pose, state.velocity, action)
-            )
+        def step(model: Planar, state: PlanarState, action: Array) -> tuple[Array, Array]:
+            return model._advanced(system_of(model), state.pose, state.velocity, action)
 
-        if not any(batched):
-            return one(*leaves)
-        return jax.vmap(one, in_axes=[0 if axis else None for axis in batched])(*leaves)
+        return _one_by_one(step, self, state, action)
+
+    def _allowed(self, state: PlanarState) -> PlanarState:
+        """The nearest state that the links allow, if there are any."""
+
+        def nearest(model: Planar, state: PlanarState) -> tuple[Array, Array]:
+            links, loose = links_of(model), 1.0 - model.bolted
+            return allowed(links, model.even_gyration, loose, state.pose, state.velocity)
+
+        return _one_by_one(nearest, self, state) if self.link_to.shape[-1] else state
 
     def _advanced(
         self, system: System, pose: Array, velocity: Array, wrench: Array
@@ -346,6 +342,19 @@ class Planar(Model):
         if self.substeps == 1:
             return advance(state, None)[0]
         return jax.lax.scan(advance, state, length=self.substeps)[0]
+
+
+def _one_by_one(function: Callable[..., tuple[Array, Array]], *given: Any) -> PlanarState:
+    """A function of a model, a state and an action at most: what batch there is, one by one."""
+    leaves, structure = jax.tree.flatten(given)
+    batched = [leaf.ndim > axes for leaf, axes in zip(leaves, _AXES, strict=False)]
+
+    def one(*leaves: Array) -> PlanarState:
+        return PlanarState(*function(*jax.tree.unflatten(structure, leaves)))
+
+    if not any(batched):
+        return one(*leaves)
+    return jax.vmap(one, in_axes=[0 if axis else None for axis in batched])(*leaves)
 
 
 def _side_by_side(arrays: Sequence[Array], axes: Sequence[int], lanes: int = 1) -> list[Array]:

@@ -6,8 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from palpate.small_systems import cholesky, solve
+
 STIFFNESS = 3e3  # of a link, in masses of its body: it gives way by 1/3000 of a free step
 FASTEST = 1.0  # m/s: how fast a link makes up for what it is off by
+CORRECTIONS = 2  # of a pose that links do not allow: the second is of the first's curvature
+SINGULAR = 1e-6  # of a row's own weight: what is not there, or cannot move, has none
 COINCIDENT = 1e-12  # m^2: anchors nearer than 1e-6 m have no direction between them
 
 
@@ -53,7 +57,8 @@ def link_rows(
 ) -> Rows:
     """Two rows for each link, along and across: a pivot needs both, a distance the first.
 
-    `pose` is that of the centres of mass in the middle of the step, `ahead` the angles at its end.
+    They are of velocities in the bodies' axes. `pose` is that of the centres of mass in the middle
+    of the step, `ahead` the angles at its end.
     What a link is off by is made up until the middle of the next.
     """
     bodies, count = links.to.shape
@@ -95,3 +100,38 @@ def link_rows(
         target=jnp.clip(-off / time_step, -FASTEST, FASTEST),
         weight=jnp.stack([stiff * (links.pivot + links.distance), stiff * links.pivot]).reshape(-1),
     )
+
+
+def allowed(
+    links: Links,
+    gyration: Float[Array, " bodies"],
+    loose: Float[Array, " bodies"],
+    pose: Float[Array, "bodies 3"],
+    velocity: Float[Array, "bodies 3"],
+) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
+    """The nearest poses and velocities of the frames' origins that the links allow.
+
+    Nearest in the metric of bodies of radii of `gyration` (m) and of one mass, of which those that
+    are not `loose` stay: it does not depend on what is not known of them. A step would make up for
+    what a measured pose is off by with an impulse, which turns the body from then on.
+    """
+    ease = loose[:, None] / jnp.stack([jnp.ones_like(gyration)] * 2 + [gyration**2], axis=1)
+    origin = jnp.zeros_like(pose[:, :2])
+
+    def moved(pose: Array, velocity: Array | None = None) -> Array:
+        """What a pose, or a velocity there, has to change by."""
+        rows = link_rows(links, jnp.ones_like(gyration), origin, pose, pose[:, 2], 1.0)
+        exists = rows.weight > 0
+        cosine, sine = jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])
+        x, y = turn(rows.jacobian[..., 0], rows.jacobian[..., 1], cosine, sine)
+        jacobian = jnp.stack([x, y, rows.jacobian[..., 2]], axis=-1) * exists[:, None, None]
+        wanted = rows.target * exists
+        if velocity is not None:
+            wanted = -jnp.einsum("rbi,bi->r", jacobian, velocity)
+        matrix = jnp.einsum("rbi,bi,sbi->rs", jacobian, ease, jacobian)
+        root = cholesky(matrix + SINGULAR * jnp.eye(len(matrix), dtype=matrix.dtype))
+        return ease * jnp.einsum("rbi,r->bi", jacobian, solve(root, wanted))
+
+    for _ in range(CORRECTIONS):
+        pose = pose + moved(pose)
+    return pose, velocity + moved(pose, velocity)

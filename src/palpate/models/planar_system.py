@@ -49,7 +49,7 @@ def system_of(model: "Planar") -> System:
         ),
         centre=(centre[:, 0], centre[:, 1]),
         loose=1.0 - model.bolted,
-        links=_links(model) if model.link_to.shape[1] else None,
+        links=links_of(model) if model.link_to.shape[1] else None,
         shapes=Shapes(model.outline, model.walls, model.pairs) if model.pairs.shape[0] else None,
         restitution=model.restitution,
         contact_friction=model.contact_friction,
@@ -86,7 +86,8 @@ def _wheels(model: "Planar", centre: Float[Array, "bodies 2 *lanes"]) -> tuple[W
     return tuple(wheels)
 
 
-def _links(model: "Planar") -> Links:
+def links_of(model: "Planar") -> Links:
+    """Its links as a step uses them."""
     anchor = model.link_anchor * model.half_extent[:, None]
     # a pivot holds on to where its own anchor is at `link_pose`
     cosine, sine = jnp.cos(model.link_pose[..., 2]), jnp.sin(model.link_pose[..., 2])

@@ -58,8 +58,8 @@ def link_rows(
     """Two rows for each link, along and across: a pivot needs both, a distance the first.
 
     They are of velocities in the bodies' axes. `pose` is that of the centres of mass in the middle
-    of the step, `ahead` the angles at its end.
-    What a link is off by is made up until the middle of the next.
+    of the step, `ahead` the angles at its end. What a link is off by is made up until the middle of
+    the next.
     """
     bodies, count = links.to.shape
     # who a link holds, as products: the derivative of an index is a loop
@@ -109,7 +109,7 @@ def allowed(
     pose: Float[Array, "bodies 3"],
     velocity: Float[Array, "bodies 3"],
 ) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
-    """The nearest poses and velocities of the frames' origins that the links allow.
+    """The nearest poses (m, m, rad) and velocities of the frames' origins that the links allow.
 
     Nearest in the metric of bodies of radii of `gyration` (m) and of one mass, of which those that
     are not `loose` stay: it does not depend on what is not known of them. A step would make up for

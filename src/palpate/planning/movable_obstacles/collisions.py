@@ -1,5 +1,6 @@
 """Whether robot and object get along a motion without coming too near to anything else."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -24,62 +25,61 @@ class Clearance:
     space: Space
     name: str
     step: float
-    _near: dict[tuple[int, int], float]
+    _obstacles: shapely.STRtree  # walls' edges and all other objects
+    _near: np.ndarray  # (obstacles,): m where it stands, infinite beyond the margin
 
     @staticmethod
     def at_start(space: Space, name: str, step: float) -> "Clearance":
         """For the object where it stands in `space`."""
-        margin = math.hypot(space.map.margin, step / 2)
-        near: dict[tuple[int, int], float] = {}
-        polygon = space.movables[name].polygon
-        for kind, tree in enumerate((space.wall_tree, space.movable_tree)):
-            for index in tree.query(polygon, predicate="dwithin", distance=margin):
-                near[kind, int(index)] = float(shapely.distance(tree.geometries[index], polygon))
-        return Clearance(space, name, step, near)
+        others = [movable.polygon for other, movable in space.movables.items() if other != name]
+        obstacles = shapely.STRtree([*space.wall_tree.geometries, *others])
+        return Clearance(space, name, step, obstacles, np.empty(0)).between(step)
+
+    def between(self, step: float) -> "Clearance":
+        """The same for steps of another length, m."""
+        polygon = self.space.movables[self.name].polygon
+        margin = math.hypot(self.space.map.margin, step / 2)
+        near = np.full(len(self._obstacles), math.inf)
+        found = self._obstacles.query(polygon, predicate="dwithin", distance=margin)
+        near[found] = shapely.distance(self._obstacles.geometries[found], polygon)
+        return dataclasses.replace(self, step=step, _near=near)
 
     def steps(self, object_poses: np.ndarray, robot_poses: np.ndarray) -> int:
         """How many of the steps (steps, 3) are possible before the first that is not."""
-        bad = self._robot_hits(robot_poses[:, :2]) | self._object_hits(object_poses)
+        bad = self.hits(object_poses, robot_poses)
         return int(np.argmax(bad)) if bad.any() else len(bad)
 
-    def _robot_hits(self, places: np.ndarray) -> np.ndarray:
-        world = self.space.map
+    def hits(self, object_poses: np.ndarray, robot_poses: np.ndarray) -> np.ndarray:
+        """(steps,): which of the poses (steps, 3) of object and robot are not possible."""
+        world, count = self.space.map, len(robot_poses)
+        corners = placed(self.space.movables[self.name].outline, object_poses)
         left, bottom, right, top = world.bounds
-        radius = world.robot.radius
-        x, y = places.T
-        hit = (
-            (x < left + radius) | (x > right - radius) | (y < bottom + radius) | (y > top - radius)
-        )
-        points = shapely.points(places)
-        gap = math.hypot(world.clearance, self.step / 2)
-        which, _ = self.space.wall_tree.query(points, predicate="dwithin", distance=gap)
-        hit[which] = True
-        which, others = self.space.movable_tree.query(points, predicate="dwithin", distance=gap)
-        hit[which[others != self.space.names.index(self.name)]] = True
-        return hit
-
-    def _object_hits(self, poses: np.ndarray) -> np.ndarray:
-        world = self.space.map
-        corners = placed(self.space.movables[self.name].outline, poses)
-        left, bottom, right, top = world.bounds
-        x, y = corners[..., 0], corners[..., 1]
-        hit = np.asarray(((x < left) | (x > right) | (y < bottom) | (y > top)).any(axis=1))
+        lowest, highest = np.array([left, bottom]), np.array([right, top])
+        places, radius = robot_poses[:, :2], world.robot.radius
+        bad = np.any((places < lowest + radius) | (places > highest - radius), axis=1)
+        bad |= np.any((corners < lowest) | (corners > highest), axis=(1, 2))
         bodies = polygons(corners)
-        margin = math.hypot(world.margin, self.step / 2)
-        own = self.space.names.index(self.name)
-        for kind, tree in enumerate((self.space.wall_tree, self.space.movable_tree)):
-            which, others = tree.query(bodies, predicate="dwithin", distance=margin)
-            if kind == 1:
-                which, others = which[others != own], others[others != own]
-            gaps = np.array([self._near.get((kind, int(index)), math.inf) for index in others])
-            hit[which[gaps == math.inf]] = True
-            close = np.flatnonzero(gaps < math.inf)
-            if len(close):
-                near, obstacles = bodies[which[close]], tree.geometries[others[close]]
-                touching = gaps[close] < TOUCHING
-                nearer = shapely.distance(near, obstacles) < gaps[close] - 1e-6
-                if touching.any():
-                    shrunk = shapely.buffer(near[touching], -SHRUNK)
-                    nearer[touching] = shapely.intersects(shrunk, obstacles[touching])
-                hit[which[close][nearer]] = True
-        return hit
+        # one question of the tree for all: its price is per question, not per shape
+        shapes = np.concatenate([np.asarray(shapely.points(places), object), bodies])
+        gap, margin = (
+            math.hypot(least, self.step / 2) for least in (world.clearance, world.margin)
+        )
+        apart = np.repeat([gap, margin], count)
+        which, others = self._obstacles.query(shapes, predicate="dwithin", distance=apart)
+        gaps = np.where(which < count, math.inf, self._near[others])
+        which = which % count
+        bad[which[gaps == math.inf]] = True
+        close = gaps < math.inf
+        if close.any():
+            which, gaps, others = (
+                which[close],
+                gaps[close],
+                self._obstacles.geometries[others[close]],
+            )
+            touching = gaps < TOUCHING
+            nearer = shapely.distance(bodies[which], others) < gaps - 1e-6
+            if touching.any():
+                shrunk = shapely.buffer(bodies[which[touching]], -SHRUNK)
+                nearer[touching] = shapely.intersects(shrunk, others[touching])
+            bad[which[nearer]] = True
+        return bad

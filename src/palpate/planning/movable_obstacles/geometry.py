@@ -107,9 +107,10 @@ def placed(outline: np.ndarray, pose: np.ndarray | Sequence[float]) -> np.ndarra
     pose = np.asarray(pose, float)
     cos, sin = np.cos(pose[..., 2:]), np.sin(pose[..., 2:])
     x, y = outline[:, 0], outline[:, 1]
-    return np.stack(
-        [pose[..., :1] + cos * x - sin * y, pose[..., 1:2] + sin * x + cos * y], axis=-1
-    )
+    points = np.empty((*pose.shape[:-1], *outline.shape))
+    points[..., 0] = pose[..., :1] + cos * x - sin * y
+    points[..., 1] = pose[..., 1:2] + sin * x + cos * y
+    return points
 
 
 def circumscribed_radius(outline: np.ndarray) -> float:

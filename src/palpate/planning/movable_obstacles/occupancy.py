@@ -132,8 +132,8 @@ class Space:
     def cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the cells that points (*batch, 2) lie in, clipped to the grid."""
         index = np.floor((np.asarray(points)[..., :2] - self.origin) / self.cell).astype(int)
-        columns = np.clip(index[..., 0], 0, self.shape[1] - 1)
-        return np.clip(index[..., 1], 0, self.shape[0] - 1), columns
+        index = np.maximum(np.minimum(index, (self.shape[1] - 1, self.shape[0] - 1)), 0)
+        return index[..., 1], index[..., 0]
 
     def cell_at(self, point: np.ndarray) -> tuple[int, int]:
         """Row and column of one point (2 or more), clipped to the grid."""
@@ -189,10 +189,12 @@ class Footprint:
         right = (xs[None, :] - poses[:, :1])[:, None, :]
         up = (ys[None, :] - poses[:, 1:2])[:, :, None]
         cos, sin = cos[:, None, None], sin[:, None, None]
-        most = len(self._mask) - 1
-        column = (cos * right + sin * up + (self._middle + 0.5)).astype(np.int32)
-        row = (cos * up - sin * right + (self._middle + 0.5)).astype(np.int32)
-        return self._mask[np.clip(row, 0, most), np.clip(column, 0, most)]
+        most, half = len(self._mask) - 1, self._middle + 0.5
+        column = (cos * right + sin * up + half).astype(np.int32)
+        row = (cos * up - sin * right + half).astype(np.int32)
+        # minimum and maximum, because clip looks up the bounds of its type each time
+        row, column = (np.maximum(np.minimum(index, most), 0) for index in (row, column))
+        return self._mask[row, column]
 
 
 def inside(geometry: BaseGeometry, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:

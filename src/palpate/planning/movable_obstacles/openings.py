@@ -4,6 +4,7 @@ The tree's first choice is a grasp, the following ones are primitives of the bas
 by a model of manipulation until the way is open or something is in the way.
 """
 
+import dataclasses
 import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ from palpate.planning.movable_obstacles.manipulation import (
 from palpate.planning.movable_obstacles.occupancy import Space, Window
 from palpate.planning.movable_obstacles.passages import Passage
 from palpate.planning.movable_obstacles.paths import distances
-from palpate.planning.movable_obstacles.transfers import Carry, Opening
-from palpate.planning.movable_obstacles.tree_search import Found, Settings, Step, search
+from palpate.planning.movable_obstacles.transfers import Carry
+from palpate.planning.movable_obstacles.tree_search import Step
 
 CARRYING = 2.0  # what a metre carried costs, in metres driven: namosim's transfer coefficient
 HANDLING = 2.0  # robot radii that a grasp and release cost, so that no object is moved for nothing
@@ -36,9 +37,8 @@ _REACH = 4.0  # how far an object is carried at most, in its own and the robot's
 _SHARES = (1.0, 0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
 _DETOUR = 8.0  # sizes of robot and object that the way on may be longer than without it
 _RELEASES = 3  # places on a primitive's way where letting go is tried
-_CHUNK = 16  # steps checked for collision at once
+_CHUNK = 16  # steps checked for collision at once, then twice as many, and so on
 _BETTER = 0.98  # of the best cost: what saves less is not worth the search
-_JUDGED = 6  # sequences that are tried in every draw
 _FINE = 8  # times as many steps for what is handed out
 
 
@@ -109,10 +109,11 @@ class OpeningSearch:
         # what is kept for between two steps is to be little beside the margin
         self._step = min(world.cell_size / 2, max(world.margin, world.cell_size / 10))
         self._clearance = Clearance.at_start(space, name, self._step)
-        self._fine = Clearance.at_start(space, name, self._step / _FINE)
+        self._fine = self._clearance.between(self._step / _FINE)
         size = world.clearance + self.movable.radius
         self._farthest = _REACH * size
         self.scale = size  # m: a cost of this much halves the reward
+        self._choices: dict[Any, list[tuple[Primitive, float]]] = {}
         self._approaches: dict[int, float] = {}
         self._sweeps: dict[Any, _Sweep] = {}
         self._best = math.inf
@@ -128,15 +129,22 @@ class OpeningSearch:
         """Grasps that can be reached, nearest to the way first; then primitives with a share."""
         if state.grasp < 0:
             return self._ordered_grasps
-        last = state.parts[-1].primitive if state.parts else None
-        primitives = self.model.primitives(
-            self.movable, self.grasps[state.grasp], self.space.map.robot.drive
-        )
         # what comes last goes on until the way is open
-        shares = _SHARES if len(state.parts) < _PRIMITIVES - 1 else _SHARES[:1]
+        last, final = state.parts[-1:], len(state.parts) == _PRIMITIVES - 1
+        key = state.grasp, last[0].primitive if last else None, final
+        if key not in self._choices:
+            self._choices[key] = self._carries(*key)
+        return self._choices[key]
+
+    def _carries(
+        self, grasp: int, last: Primitive | None, final: bool
+    ) -> list[tuple[Primitive, float]]:
+        primitives = self.model.primitives(
+            self.movable, self.grasps[grasp], self.space.map.robot.drive
+        )
         return [
             (primitive, share)
-            for share in shares
+            for share in (_SHARES[:1] if final else _SHARES)
             for primitive in primitives
             if last is None or not _undoes(last, primitive)
         ]
@@ -169,9 +177,7 @@ class OpeningSearch:
         if stop < 0:
             return Step(state, 0.0)
         part = self._part(state, primitive, sweep.motion, stop)
-        return Step(
-            self._after(state, part, float(sweep.spent[stop]), float(sweep.motion.energy[stop]))
-        )
+        return Step(self._after(state, part, sweep, stop))
 
     def _key(self, state: State, primitive: Primitive) -> Any:
         return state.draw, state.grasp, state.object_pose, state.robot_pose, primitive
@@ -190,6 +196,11 @@ class OpeningSearch:
         return np.array(poses).reshape(-1, 3)
 
     @cached_property
+    def _beyond(self) -> np.ndarray:
+        """(grasps,): at least how far it is from there to the aim, m."""
+        return self._passage.beyond(self._robot_at)
+
+    @cached_property
     def _grasp_bounds(self) -> dict[int, float]:
         """The least cost with each grasp that is free and that the robot may get to."""
         poses = self._robot_at
@@ -198,15 +209,9 @@ class OpeningSearch:
         behind = 1.5 * self.space.cell + max(0.0, world.margin - world.reach)
         back = poses[:, :2] - behind * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
         to = self._reached.at(back) - behind
-        beyond = self._passage.beyond(poses)
-        bounds = {}
-        for index, pose in enumerate(poses):
-            bound = max(0.0, to[index]) + self._handling + beyond[index]
-            if bound < math.inf and self._clearance.steps(
-                np.array([self.movable.pose]), pose[None]
-            ):
-                bounds[index] = float(bound)
-        return bounds
+        bounds = np.maximum(to, 0.0) + self._handling + self._beyond
+        hit = self._clearance.hits(np.tile(self.movable.pose, (len(poses), 1)), poses)
+        return {int(k): float(bounds[k]) for k in np.flatnonzero(~hit & (bounds < math.inf))}
 
     @cached_property
     def _ordered_grasps(self) -> list[int]:
@@ -233,30 +238,31 @@ class OpeningSearch:
             return Step(state, 0.0)
         x, y, theta = (float(value) for value in self._robot_at[grasp])
         spent = length + self._handling
-        least = spent + float(self._passage.beyond(self._robot_at[grasp : grasp + 1])[0])
+        least = spent + float(self._beyond[grasp])
         return Step(State(state.draw, grasp, state.object_pose, (x, y, theta), spent, least))
 
     # --- carrying -----------------------------------------------------------------------------
 
-    def _swept(self, state: State, primitive: Primitive) -> "_Sweep":
+    def _swept(self, state: State, primitive: Primitive) -> _Sweep:
         """Go on with a primitive until the way is open or something is in the way."""
         robot, pose = np.array(state.robot_pose), np.array(state.object_pose)
         lengths, cost = self._lengths(robot, pose, primitive)
         motion = self.model.motion(self.movable, pose, robot, primitive, lengths, state.draw)
         spent = state.spent + cost * lengths
         least = spent + self._passage.beyond(motion.robot_poses)
-        limit = self._possible(motion, least)
-        opened, begin = None, 0
+        sweep = _Sweep(motion, spent, least, self._possible(motion, least), None)
+        # how far it may be to the aim from where the robot lets go, to be worth it
+        onward = np.minimum(_BETTER * self._best - spent, least - spent + _DETOUR * self.scale)
+        begin = 0
         for _ in range(_RELEASES):
-            index = self._passage.first_open(motion, begin, limit)
+            index = self._passage.first_open(motion, onward, begin, sweep.limit)
             if index is None:
                 break
-            opened = self._released(state, primitive, motion, index, float(spent[index]))
+            opened = self._released(state, primitive, sweep, index, float(onward[index]))
             if opened is not None:
-                limit = index
-                break
+                return dataclasses.replace(sweep, limit=index, opened=opened)
             begin = index + 1
-        return _Sweep(motion, spent, least, limit, opened)
+        return sweep
 
     def _lengths(
         self, robot: np.ndarray, pose: np.ndarray, primitive: Primitive
@@ -277,9 +283,9 @@ class OpeningSearch:
         moving = np.abs(np.diff(motion.object_poses, axis=0)).max(axis=1) > 1e-9
         if not moving.all():
             limit = min(limit, int(np.argmin(moving)) + 1)
-        done = 0
+        done, chunk = 0, _CHUNK
         while done < limit:
-            end = min(limit, done + _CHUNK)
+            end, chunk = min(limit, done + chunk), 2 * chunk
             free = self._clearance.steps(
                 motion.object_poses[done:end], motion.robot_poses[done:end]
             )
@@ -289,26 +295,20 @@ class OpeningSearch:
         return done
 
     def _released(
-        self, state: State, primitive: Primitive, motion: Motion, index: int, spent: float
+        self, state: State, primitive: Primitive, sweep: _Sweep, index: int, limit: float
     ) -> Step | None:
-        """The end of a rollout; None unless the robot gets away, at less than the best."""
+        """The end of a rollout; None unless the robot gets to the aim within `limit` m."""
+        motion = sweep.motion
+        left = self._passage.onward(motion.object_poses[index], motion.robot_poses[index], limit)
+        if left == math.inf:
+            return None
         part = self._part(state, primitive, motion, index)
         if not self.keep_clear((*state.parts, part)):
             return None
-        left = self._exit(motion.object_poses[index], motion.robot_poses[index], spent)
-        if left == math.inf:
-            return None
-        cost = spent + left
+        cost = float(sweep.spent[index]) + left
         if self.draws == 1:
             self._best = min(self._best, cost)
-        final = self._after(state, part, spent, float(motion.energy[index]), left)
-        return Step(final, self._reward(cost))
-
-    def _exit(self, object_pose: np.ndarray, robot_pose: np.ndarray, spent: float) -> float:
-        """How far it is from where the robot lets go to the aim, m; infinite if not worth it."""
-        direct = float(self._passage.beyond(robot_pose[None])[0])
-        limit = min(_BETTER * self._best - spent, direct + _DETOUR * self.scale)
-        return self._passage.onward(object_pose, robot_pose, limit)
+        return Step(self._after(state, part, sweep, index, left), self._reward(cost))
 
     def keep_clear(self, parts: Iterable[Carry]) -> bool:
         """Whether the steps in between do as well, as if each were a rigid carry."""
@@ -330,7 +330,7 @@ class OpeningSearch:
         )
 
     def _after(
-        self, state: State, part: Carry, spent: float, energy: float, left: float = math.inf
+        self, state: State, part: Carry, sweep: _Sweep, last: int, left: float = math.inf
     ) -> State:
         ox, oy, ot = (float(value) for value in part.object_poses[-1])
         rx, ry, rt = (float(value) for value in part.robot_poses[-1])
@@ -339,9 +339,9 @@ class OpeningSearch:
             state.grasp,
             (ox, oy, ot),
             (rx, ry, rt),
-            spent,
-            spent + float(self._passage.beyond(part.robot_poses[-1:])[0]),
-            state.energy + energy,
+            float(sweep.spent[last]),
+            float(sweep.least[last]),
+            state.energy + float(sweep.motion.energy[last]),
             (*state.parts, part),
             left < math.inf,
             left,
@@ -349,44 +349,6 @@ class OpeningSearch:
 
     def _reward(self, cost: float) -> float:
         return self.scale / (self.scale + max(cost, 0.0))
-
-
-def open_way(search_of: OpeningSearch, settings: Settings, seed: int) -> Opening | None:
-    """The best way found, judged over all draws of the belief; None if none succeeded."""
-    found = search(search_of, settings, seed)
-    judged = [_judged(search_of, candidate) for candidate in found[:_JUDGED]]
-    possible = [opening for opening in judged if opening is not None]
-    return min(possible, key=lambda one: one.cost / one.probability) if possible else None
-
-
-def _judged(search_of: OpeningSearch, candidate: Found) -> Opening | None:
-    ends = []
-    for draw in range(search_of.draws):
-        state = search_of.begin(draw)
-        for action in candidate.actions:
-            step = search_of.act(state, action)
-            state = step.state
-            if step.reward is not None:
-                break
-        if state.opened:
-            ends.append(state)
-    if not ends:
-        return None
-    first = ends[0]
-    grasp = search_of.grasps[first.grasp]
-    way = search_of.approach_path(grasp)
-    if way is None:
-        return None
-    return Opening(
-        search_of.name,
-        grasp,
-        way,
-        search_of.approach(first.grasp),
-        float(np.mean([end.spent + end.exit_length for end in ends])),
-        len(ends) / search_of.draws,
-        float(np.mean([end.energy for end in ends])),
-        first.parts,
-    )
 
 
 def _undoes(last: Primitive, primitive: Primitive) -> bool:

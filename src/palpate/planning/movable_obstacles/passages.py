@@ -48,25 +48,28 @@ class Passage:
 
     def beyond(self, poses: np.ndarray) -> np.ndarray:
         """At least how far it is from robot poses (steps, 3) to the aim, with the object gone."""
-        rows, columns = self._space.cells(poses)
-        rows, columns = rows - self._window[0].start, columns - self._window[1].start
         lengths = self._nearest
-        known = (rows >= 0) & (rows < lengths.shape[0])
-        known &= (columns >= 0) & (columns < lengths.shape[1])
-        rows, columns = np.where(known, rows, 0), np.where(known, columns, 0)
-        return np.where(known, np.maximum(lengths[rows, columns], 0.0), np.inf)
+        down, right = self._window[0].start, self._window[1].start
+        corner = self._space.origin + self._space.cell * np.array([right, down])
+        place = (poses[:, :2] - corner) / self._space.cell
+        known = np.all((place >= 0) & (place < lengths.shape[::-1]), axis=1)
+        columns, rows = np.where(known[:, None], place, 0).astype(int).T
+        return np.where(known, lengths[rows, columns], np.inf)
 
-    def first_open(self, motion: Motion, begin: int, stop: int) -> int | None:
-        """The first step from `begin` to `stop` at which the way is open, as far as looks show."""
+    def first_open(self, motion: Motion, limits: np.ndarray, begin: int, stop: int) -> int | None:
+        """The first step from `begin` to `stop` at which the way is open, as far as looks show.
+
+        Open is a way of no more than `limits` (steps,), m.
+        """
         looks = np.arange(begin + _STRIDE - 1, stop, _STRIDE)
         if stop > begin and (not len(looks) or looks[-1] != stop - 1):
             looks = np.append(looks, stop - 1)
-        open_at = self._opened(motion, looks)
+        open_at = self._opened(motion, limits, looks)
         if open_at is None:
             return None
-        between = np.arange(max(begin, looks[open_at] - _STRIDE + 1), looks[open_at])
-        earlier = self._opened(motion, between)
-        return int(looks[open_at] if earlier is None else between[earlier])
+        between = np.arange(max(begin, open_at - _STRIDE + 1), open_at)
+        earlier = self._opened(motion, limits, between)
+        return open_at if earlier is None else earlier
 
     def onward(self, object_pose: np.ndarray, robot_pose: np.ndarray, limit: float) -> float:
         """How far it is to the aim from where the robot lets go, m; infinite beyond `limit`.
@@ -75,9 +78,7 @@ class Passage:
         """
         space, window = self._space, self._window
         after = space.moved(self._name, object_pose)
-        xs, ys = space.xs[window[1]], space.ys[window[0]]
-        apart = np.hypot(xs[None, :] - robot_pose[0], ys[:, None] - robot_pose[1])
-        near = self._nearest + apart <= limit + 2 * space.cell
+        near = self._worth(robot_pose, limit)
         rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
         if not len(rows):
             return math.inf
@@ -90,11 +91,19 @@ class Passage:
         ways = distances(after, part, robot_pose, free, self._held, standing=True, limit=limit)
         return ways.to(self._towards, self._passed)
 
-    def _opened(self, motion: Motion, looks: np.ndarray) -> int | None:
+    def _opened(self, motion: Motion, limits: np.ndarray, looks: np.ndarray) -> int | None:
         """The first of the steps `looks` at which free cells join the robot's place to the aim."""
         if not len(looks):
             return None
-        poses, robots = motion.object_poses[looks], motion.robot_poses[looks]
+        poses = motion.object_poses[looks]
+        x, y = self._towards
+        blocked = self._footprint.at(poses, np.array([x]), np.array([y]))[:, 0, 0]
+        if self._keep_out is not None:
+            bodies = polygons(placed(self._movable.outline, poses))
+            blocked |= shapely.intersects(bodies, self._keep_out)
+        looks, poses = looks[~blocked], poses[~blocked]
+        if not len(looks):
+            return None
         (left, bottom), (right, top) = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
         grown = self._footprint.extent
         rows, columns = (
@@ -112,25 +121,28 @@ class Passage:
         )
         aim = self._around(self._towards, 1)
         own = math.ceil(self._space.map.margin / self._space.cell) + 2
-        x, y = self._towards
-        blocked = self._footprint.at(poses, np.array([x]), np.array([y]))[:, 0, 0]
-        if self._keep_out is not None:
-            bodies = polygons(placed(self._movable.outline, poses))
-            blocked |= shapely.intersects(bodies, self._keep_out)
-        for index in np.flatnonzero(~blocked):
-            free = self._base.copy()
-            free[local] &= ~covered[index]
+        for look, cover in zip(looks, covered, strict=True):
+            robot = motion.robot_poses[look]
+            free = self._base & self._worth(robot, float(limits[look]))
+            free[local] &= ~cover
             labels, _ = ndimage.label(free, _EIGHT)
-            beside = labels[self._around(robots[index], own)]
-            if np.intersect1d(labels[aim][labels[aim] > 0], beside).size:
-                return int(index)
+            beside = set(labels[self._around(robot, own)].ravel().tolist())
+            if not beside.isdisjoint(labels[aim][labels[aim] > 0].tolist()):
+                return int(look)
         return None
+
+    def _worth(self, robot_pose: np.ndarray, limit: float) -> np.ndarray:
+        """(rows, columns) of the window: where a way to the aim of less than `limit` m may lead."""
+        x, y = robot_pose[:2]
+        xs, ys = self._space.xs[self._window[1]], self._space.ys[self._window[0]]
+        apart = np.sqrt((xs - x) ** 2 + ((ys - y) ** 2)[:, None])
+        return self._nearest + apart <= limit + 2 * self._space.cell
 
     @cached_property
     def _nearest(self) -> np.ndarray:
         """Lengths to the aim from each cell, or from one beside it, at least."""
         around = 2 * self._space.cell * math.sqrt(2)
-        return ndimage.minimum_filter(self._lengths, 3) * 0.92 - around
+        return np.maximum(ndimage.minimum_filter(self._lengths, 3) * 0.92 - around, 0.0)
 
     def _around(self, point: np.ndarray, cells: int) -> Window:
         """The cells within so many of a place, as a window in this one."""

@@ -1,6 +1,7 @@
 """Ways of the base: shortest over the grid, then pulled straight with exact distances."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -108,7 +109,8 @@ def distances(
     weights = np.array([math.hypot(*step) for step in _STEPS]) * space.cell
     at = np.flatnonzero(neighbours)
     node, step = np.divmod(at, len(_STEPS))
-    joined = links(space, window, source, free, nearby, standing=standing)
+    allowed = allowed_at(space, source, nearby, standing=standing)
+    joined = _links(space, window, source, free, allowed)
     columns = np.concatenate([node + offsets[step], np.array([n for n, _ in joined], int)])
     values = np.concatenate([weights[step], np.array([max(gap, 1e-9) for _, gap in joined])])
     ends = np.zeros(size + 2, np.int64)
@@ -124,7 +126,7 @@ def distances(
         np.asarray(source, float)[:2],
         lengths[:-1].reshape(height, width),
         predecessors,
-        allowed_at(space, source, nearby, standing=standing),
+        allowed,
     )
 
 
@@ -141,6 +143,12 @@ def links(
 
     The nearest ones, with the exceptions of `allowed_at`.
     """
+    return _links(space, window, point, free, allowed_at(space, point, nearby, standing=standing))
+
+
+def _links(
+    space: Space, window: Window, point: np.ndarray, free: np.ndarray, allowed: "Allowed"
+) -> list[tuple[int, float]]:
     point = np.asarray(point, float)[:2]
     around = math.ceil((space.map.margin + 1e-9) / space.cell) + 2
     row, column = space.cell_at(point)
@@ -160,7 +168,6 @@ def links(
     straight = lines(
         np.stack([np.broadcast_to(point, (len(nearest), 2)), middles[nearest]], axis=1)
     )
-    allowed = allowed_at(space, point, nearby, standing=standing)
     open_ways = nearest[clear(space, straight, allowed)][:_LINKS]
     return [
         (int(r * width + c), float(gaps[k]))
@@ -194,17 +201,24 @@ def allowed_at(
     place = shapely.Point(*np.asarray(point, float)[:2])
     clearance, radius = space.map.clearance, space.map.robot.radius
     walls, objects = {}, dict(nearby or {})
-    for index in space.wall_tree.query(place, predicate="dwithin", distance=clearance):
-        gap = float(shapely.distance(space.wall_tree.geometries[index], place))
+    for index, gap in _within(space.wall_tree, place, clearance):
         if gap >= radius - _SLACK:
-            walls[int(index)] = gap
+            walls[index] = gap
     if standing:
-        for index in space.movable_tree.query(place, predicate="dwithin", distance=clearance):
-            gap = float(shapely.distance(space.movable_tree.geometries[index], place))
+        for index, gap in _within(space.movable_tree, place, clearance):
             if gap >= radius - _SLACK:
                 name = space.names[index]
                 objects[name] = min(gap, objects.get(name, gap))
     return Allowed(walls, objects)
+
+
+def _within(
+    tree: shapely.STRtree, place: shapely.Point, most: float
+) -> Iterator[tuple[int, float]]:
+    """What is nearer to a place than `most` m, by index, and how near."""
+    found = tree.query(place, predicate="dwithin", distance=most)
+    gaps = shapely.distance(tree.geometries[found], place) if len(found) else found
+    return zip(found.tolist(), gaps.tolist(), strict=True)
 
 
 def clear(space: Space, ways: np.ndarray, allowed: Allowed = _NOTHING) -> np.ndarray:
@@ -249,6 +263,7 @@ def straightened(space: Space, points: np.ndarray, first: Allowed, last: Allowed
 
 
 def _joined(one: Allowed, other: Allowed) -> Allowed:
+    """What either of them allows."""
     walls, objects = dict(one.walls), dict(one.objects)
     for index, gap in other.walls.items():
         walls[index] = min(gap, walls.get(index, gap))

@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.planning.movable_obstacles.judgement import open_way
 from palpate.planning.movable_obstacles.manipulation import ManipulationModel, RigidCarry
 from palpate.planning.movable_obstacles.map import Map, Pose
 from palpate.planning.movable_obstacles.occupancy import Space, Window
-from palpate.planning.movable_obstacles.openings import OpeningSearch, open_way
+from palpate.planning.movable_obstacles.openings import OpeningSearch
 from palpate.planning.movable_obstacles.plan import TRANSIT, Plan, timed
 from palpate.planning.movable_obstacles.policy import Move, PolicyGraph
 from palpate.planning.movable_obstacles.regrasps import stops_of

@@ -93,12 +93,12 @@ def search(domain: Domain, settings: Settings, seed: int) -> list[Found]:
     for iteration in range(settings.iterations):
         worlds = min(domain.draws, _width(settings, iteration + 1))
         draw = iteration % worlds
-        best = max((np.mean(rewards) for rewards in ends.values()), default=0.0)
+        best = max((sum(rewards) / len(rewards) for rewards in ends.values()), default=0.0)
         if best > highest * 1.001:
-            highest, since = float(best), iteration
+            highest, since = best, iteration
         if highest and iteration - since >= settings.patience * math.sqrt(domain.draws):
             break
-        bound = float(best) if domain.draws == 1 else 0.0  # a mean of few draws bounds nothing
+        bound = best if domain.draws == 1 else 0.0  # a mean of few draws bounds nothing
         _simulate(domain, settings, root, draw, bound, random, ends)
         if root.closed:
             break

@@ -111,7 +111,7 @@ class Space:
 
     def cover_of(self, movable: Movable) -> Cover:
         """The cells that an object covers where it stands."""
-        grown = movable.polygon.buffer(self.inflation * _OUTSIDE, quad_segs=_ARC)
+        grown = shapely.buffer(movable.polygon, self.inflation * _OUTSIDE, quad_segs=_ARC)
         window = self.window_of(*grown.bounds)
         return Cover(window, inside(grown, self.xs[window[1]], self.ys[window[0]]))
 
@@ -202,22 +202,18 @@ def inside(geometry: BaseGeometry, xs: np.ndarray, ys: np.ndarray) -> np.ndarray
 
     By the parity of edges to the left, a row at a time: linear in edges x rows + cells.
     """
+    rings = shapely.get_parts(shapely.boundary(geometry))
+    points, ring = shapely.get_coordinates(rings, return_index=True)
+    same = ring[1:] == ring[:-1]
+    (x0, y0), (x1, y1) = points[:-1][same].T, points[1:][same].T
+    low, high = np.searchsorted(ys, np.minimum(y0, y1)), np.searchsorted(ys, np.maximum(y0, y1))
+    counts = high - low  # rows that an edge crosses
+    edge = np.repeat(np.arange(len(counts)), counts)
+    row = np.arange(len(edge)) + np.repeat(low - np.cumsum(counts) + counts, counts)
+    x0, y0, x1, y1 = x0[edge], y0[edge], x1[edge], y1[edge]
+    crossing = x0 + (ys[row] - y0) * (x1 - x0) / (y1 - y0)
     flips = np.zeros((len(ys), len(xs) + 1), np.int32)
-    for polygon in shapely.get_parts(geometry):
-        for ring in (polygon.exterior, *polygon.interiors):
-            points = np.asarray(ring.coords)
-            begin, end = points[:-1], points[1:]
-            low = np.searchsorted(ys, np.minimum(begin[:, 1], end[:, 1]))
-            high = np.searchsorted(ys, np.maximum(begin[:, 1], end[:, 1]))
-            counts = high - low  # rows that an edge crosses
-            if not counts.any():
-                continue
-            edge = np.repeat(np.arange(len(begin)), counts)
-            row = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-            row += np.repeat(low, counts)
-            (x0, y0), (x1, y1) = begin[edge].T, end[edge].T
-            crossing = x0 + (ys[row] - y0) * (x1 - x0) / (y1 - y0)
-            np.add.at(flips, (row, np.searchsorted(xs, crossing)), 1)
+    np.add.at(flips, (row, np.searchsorted(xs, crossing)), 1)
     return np.cumsum(flips[:, :-1], axis=1) % 2 == 1
 
 

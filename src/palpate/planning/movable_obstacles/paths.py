@@ -14,6 +14,7 @@ from palpate.planning.movable_obstacles.geometry import lines
 from palpate.planning.movable_obstacles.occupancy import Space, Window
 
 _STEPS = [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
+_LENGTHS = np.array([math.hypot(*step) for step in _STEPS])  # cells
 _SLACK = 1e-6  # m: of distances that are compared
 _LINKS = 6  # cells nearest to a place that it may be joined to
 
@@ -99,23 +100,23 @@ def distances(
         free = space.free[window]
     height, width = free.shape
     size = free.size
-    padded = np.pad(free, 1)
-    neighbours = np.empty((height, width, len(_STEPS) + 1), bool)
-    for index, (down, right) in enumerate(_STEPS):
-        beside = padded[1 + down : 1 + down + height, 1 + right : 1 + right + width]
-        neighbours[:, :, index] = free & beside
-    neighbours = neighbours.reshape(size, -1)[:, :-1]
+    # row by row of the graph, on a grid with a border that is never free
+    across = width + 2
+    padded = np.zeros((height + 2, across), bool)
+    padded[1:-1, 1:-1] = free
+    node = np.flatnonzero(free)
+    at = (node // width + 1) * across + node % width + 1
+    beside = padded.ravel()[at[:, None] + [down * across + right for down, right in _STEPS]]
     offsets = np.array([down * width + right for down, right in _STEPS])
-    weights = np.array([math.hypot(*step) for step in _STEPS]) * space.cell
-    at = np.flatnonzero(neighbours)
-    node, step = np.divmod(at, len(_STEPS))
+    counts = np.zeros(size, np.int32)
+    counts[node] = beside.sum(axis=1)
     allowed = allowed_at(space, source, nearby, standing=standing)
     joined = _links(space, window, source, free, allowed)
-    columns = np.concatenate([node + offsets[step], np.array([n for n, _ in joined], int)])
-    values = np.concatenate([weights[step], np.array([max(gap, 1e-9) for _, gap in joined])])
-    ends = np.zeros(size + 2, np.int64)
-    np.cumsum(neighbours.sum(axis=1), out=ends[1 : size + 1])
-    ends[-1] = len(columns)
+    columns = (node[:, None] + offsets)[beside]
+    lengths = np.broadcast_to(_LENGTHS * space.cell, beside.shape)[beside]
+    columns = np.concatenate([columns, np.array([n for n, _ in joined], int)])
+    values = np.concatenate([lengths, np.array([max(gap, 1e-9) for _, gap in joined])])
+    ends = np.concatenate([[0], np.cumsum(counts), [len(columns)]])
     graph = csr_matrix((values, columns, ends), shape=(size + 1, size + 1))
     lengths, predecessors = dijkstra(
         graph, indices=size, return_predecessors=True, limit=max(limit, 0.0)
@@ -153,26 +154,20 @@ def _links(
     around = math.ceil((space.map.margin + 1e-9) / space.cell) + 2
     row, column = space.cell_at(point)
     row, column = row - window[0].start, column - window[1].start
-    height, width = free.shape
-    rows = np.arange(max(0, row - around), min(height, row + around + 1))
-    columns = np.arange(max(0, column - around), min(width, column + around + 1))
-    if not (len(rows) and len(columns)):
+    low, left = max(0, row - around), max(0, column - around)
+    found = free[low : max(0, row + around + 1), left : max(0, column + around + 1)]
+    rows, columns = np.nonzero(found)
+    if not len(rows):
         return []
-    found = np.argwhere(free[np.ix_(rows, columns)])
-    if not len(found):
-        return []
-    at = found + np.array([rows[0], columns[0]])
-    middles = space.centres(at[:, 0] + window[0].start, at[:, 1] + window[1].start)
-    gaps = np.linalg.norm(middles - point, axis=1)
+    rows, columns = rows + low, columns + left
+    middles = space.centres(rows + window[0].start, columns + window[1].start)
+    gaps = np.hypot(*(middles - point).T)
     nearest = np.argsort(gaps)[: 4 * _LINKS]
-    straight = lines(
-        np.stack([np.broadcast_to(point, (len(nearest), 2)), middles[nearest]], axis=1)
-    )
-    open_ways = nearest[clear(space, straight, allowed)][:_LINKS]
-    return [
-        (int(r * width + c), float(gaps[k]))
-        for k, (r, c) in zip(open_ways, at[open_ways], strict=True)
-    ]
+    ends = np.empty((len(nearest), 2, 2))
+    ends[:, 0], ends[:, 1] = point, middles[nearest]
+    joined = nearest[clear(space, lines(ends), allowed)][:_LINKS]
+    nodes = rows[joined] * free.shape[1] + columns[joined]
+    return list(zip(nodes.tolist(), gaps[joined].tolist(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -198,14 +193,13 @@ def allowed_at(
     A wall may stay as near as it is there, because it cannot be moved; so may objects if the robot
     is `standing` there. Nothing may come nearer than the robot's radius.
     """
-    place = shapely.Point(*np.asarray(point, float)[:2])
     clearance, radius = space.map.clearance, space.map.robot.radius
     walls, objects = {}, dict(nearby or {})
-    for index, gap in _within(space.wall_tree, place, clearance):
+    for index, gap in _within(space.wall_tree, point, clearance):
         if gap >= radius - _SLACK:
             walls[index] = gap
     if standing:
-        for index, gap in _within(space.movable_tree, place, clearance):
+        for index, gap in _within(space.movable_tree, point, clearance):
             if gap >= radius - _SLACK:
                 name = space.names[index]
                 objects[name] = min(gap, objects.get(name, gap))
@@ -213,9 +207,10 @@ def allowed_at(
 
 
 def _within(
-    tree: shapely.STRtree, place: shapely.Point, most: float
+    tree: shapely.STRtree, point: np.ndarray, most: float
 ) -> Iterator[tuple[int, float]]:
     """What is nearer to a place than `most` m, by index, and how near."""
+    place = shapely.points(np.asarray(point, float)[:2])
     found = tree.query(place, predicate="dwithin", distance=most)
     gaps = shapely.distance(tree.geometries[found], place) if len(found) else found
     return zip(found.tolist(), gaps.tolist(), strict=True)

@@ -207,6 +207,25 @@ def test_evidence_tells_what_is_joined_from_what_only_may_be(are_joined, monkeyp
     assert abs(together - apart) > 100.0
 
 
+def test_what_stands_is_bolted_and_not_hinged():
+    time = PERIOD * np.arange(200)
+    random = np.random.default_rng(0)
+    poses = np.array([[1.0, -0.5, np.pi]]) + NOISE * random.standard_normal((len(time), 1, 3))
+    poses[..., 2] = (poses[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    wrench = np.stack([30.0 * np.sin(2.1 * time), 0.0 * time, 9.0 * np.sin(time)], axis=-1)[:, None]
+    channels = {
+        POSE: Channel(POSE, Role.OBSERVATION, time, poses, "m, m, rad"),
+        WRENCH: Channel(WRENCH, Role.COMMAND, time[:-1], wrench[:-1], "N, N, N m"),
+    }
+    told = {"bodies": '["desk"]', "outlines": json.dumps({"desk": BOX.tolist()})}
+    seen = Recording((Trial("one", channels),), told)
+    models = structures(seen, PERIOD)
+    at = np.asarray(models["bolted"].bolted_pose)[0]
+    assert np.all(np.abs(at[:2] - [1.0, -0.5]) < 4 * NOISE[:2] / np.sqrt(len(time)))
+    assert abs(abs(at[2]) - np.pi) < 4 * NOISE[2] / np.sqrt(len(time))
+    assert evidence_of(models["bolted"], seen) > evidence_of(models["hinge"], seen) + 3.0
+
+
 def evidence_of(model, recording):
     """At the top of one climb: the search from many starts is tested elsewhere, and takes long."""
     target = posterior_of(model, recording.align(PERIOD, POSE, WRENCH))

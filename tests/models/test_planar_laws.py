@@ -385,3 +385,19 @@ def test_what_is_bolted_stays_where_it_is_seen_whatever_holds_it(float64):
     np.testing.assert_array_equal(state.pose[1], seen[1])
     everything = dataclasses.replace(model, bolted=jnp.ones(2))
     np.testing.assert_allclose(everything.initial_state(jnp.asarray(seen)[None]).pose, seen)
+
+
+def test_what_is_bolted_at_a_known_pose_stands_there_wherever_it_is_seen(float64):
+    at = np.array([[np.nan, np.nan, np.nan], [1.2, 0.1, 3.1]])
+    model = dataclasses.replace(furniture([BOX, BOX], bolted=[1]), bolted_pose=at)
+    frames = np.array(
+        [[[0.0, 0.0, 0.0], [1.21, 0.1, -3.18]], [[0.1, 0.0, 0.0], [1.23, 0.1, -3.19]]]
+    )
+    state = model.initial_state(jnp.asarray(frames))
+    np.testing.assert_array_equal(state.pose, [frames[1, 0], at[1]])
+    assert state.velocity[0, 0] > 0.0
+    np.testing.assert_array_equal(state.velocity[1], 0.0)
+    after = model.step(state, jnp.full((2, 3), 50.0))
+    np.testing.assert_allclose(after.pose[1], at[1], atol=1e-6)
+    loose = dataclasses.replace(model, bolted=jnp.zeros(2))
+    np.testing.assert_array_equal(loose.initial_state(jnp.asarray(frames)).pose, frames[1])

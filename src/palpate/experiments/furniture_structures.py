@@ -25,7 +25,7 @@ from palpate.experiments.furniture_recording import (
 from palpate.experiments.identify_bayesian import explore, posterior_of, shares
 from palpate.experiments.options import Hypotheses
 from palpate.models.model import Model
-from palpate.models.planar import Planar
+from palpate.models.planar import Planar, wrapped
 from palpate.parameters import declare, parameters_of, value_of, with_values
 from palpate.recording import Recording
 from palpate.runs import progress
@@ -65,6 +65,7 @@ def structures(
     """
     bodies = range(len(names_of(recording)))
     free = starting_furniture(recording, period, size, wheels=wheels, law=law)
+    free = _with_bolts(free, recording)
     held = starting_furniture(recording, period, size, wheels=0, pivots=dict.fromkeys(bodies))
     held = declare(held, link_other_anchor={"fixed": True})  # a pivot's follows from its own
     held = _with_pivots(held, {body: _hinge(recording, body) for body in bodies})
@@ -180,7 +181,7 @@ def _together(
         # Where both were seen, not where each was seen first: the one may have moved before.
         first = _seen(recording, [owner, other])[0]
         held[owner] = Held(own, place, first[0, 2] - first[1, 2])
-    return _masked(_with_pivots(model, held), being, set(others))
+    return _masked(_with_bolts(_with_pivots(model, held), recording), being, set(others))
 
 
 def _hinge(recording: Recording, body: int) -> Held:
@@ -201,6 +202,21 @@ def _seen(recording: Recording, bodies: Sequence[int]) -> Float[np.ndarray, "fra
     poses = np.concatenate([np.asarray(trial[POSE].values, float) for trial in recording.trials])
     poses = poses[:, bodies]
     return poses[np.isfinite(poses).all(axis=(1, 2))]
+
+
+def _with_bolts(model: Planar, recording: Recording) -> Planar:
+    """The model in which what may be bolted stands at the mean of all poses.
+
+    One place for all that is predicted: were it where it is seen first in each piece, it would have
+    three freedoms more than a hinge, which has one, and evidence would call all that stands hinged.
+    """
+    standing = []
+    for body in range(model.bodies):
+        seen = _seen(recording, [body])[:, 0]
+        apart = seen - seen[0]
+        apart[:, 2] = wrapped(jnp.asarray(apart[:, 2]))
+        standing.append(seen[0] + apart.mean(axis=0))
+    return dataclasses.replace(model, bolted_pose=np.array(standing))
 
 
 def _with_pivots(model: Planar, held: Mapping[int, Held]) -> Planar:

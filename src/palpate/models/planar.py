@@ -71,8 +71,8 @@ class Planar(Model):
     others are the wheel's own forces; `turned_wheel` has those of one that is not.
 
     Which wheels and links there are, their law, what a link leads to (-1: the world) and which
-    bodies are bolted down is data: hypotheses about it are a batch axis. Batch axes of parameters
-    and structure lead, as those of states and actions do.
+    bodies are bolted down (at `bolted_pose`; if that is NaN, where they are seen) is data, so that
+    hypotheses can be a batch axis. Batch axes lead, as those of states and actions do.
 
     Raises `PalpateError` for arrays that do not fit each other, and links or contacts of bodies,
     parts or walls that do not exist.
@@ -160,6 +160,7 @@ class Planar(Model):
     half_extent: Float[Array, "*batch bodies 2"] = _data()
     even_gyration: Float[Array, "*batch bodies"] = _data()
     bolted: Float[Array, "*batch bodies"] = _data()
+    bolted_pose: Float[Array, "*batch bodies 3"] = _data()
     wheel: Float[Array, "*batch bodies wheels"] = _data()
     dry: Float[Array, "*batch bodies wheels"] = _data()
     pivot: Float[Array, "*batch bodies links"] = _data()
@@ -213,8 +214,7 @@ class Planar(Model):
         """The state at the last of a few frames: on the straight line that fits them best.
 
         With one frame at rest. Angles may be wrapped or not. Noise s of a pose becomes
-        sqrt(12 / n^3) s / period in the velocity of n frames. Where there are links it is the
-        nearest state that they allow.
+        sqrt(12 / n^3) s / period in the velocity of n frames. It is the nearest that is allowed.
         """
         frames = observations.shape[-3]
         last = observations[..., -1, :, :]
@@ -321,7 +321,10 @@ class Planar(Model):
         return _one_by_one(step, self, state, action)
 
     def _allowed(self, state: PlanarState) -> PlanarState:
-        """The nearest state that the links allow, if there are any."""
+        """The nearest state that bolts and links allow."""
+        stands = (self.bolted[..., None] > 0.0) & jnp.isfinite(self.bolted_pose)
+        pose = jnp.where(stands, self.bolted_pose, state.pose)
+        state = PlanarState(pose, jnp.where(stands, 0.0, state.velocity))
 
         def nearest(model: Planar, state: PlanarState) -> tuple[Array, Array]:
             links, loose = links_of(model), 1.0 - model.bolted

@@ -36,7 +36,7 @@ def furniture(
     `walls` are polygons in the world. Polygons may be concave: they are cut into convex parts.
     Each body gets `wheels` wheels under the given `law`. `pivots` and `distances` map a body to
     the body that a point of it is joined to, None for the world, as it stands at `poses`
-    (bodies, 3). Bodies in `bolted` do not move.
+    (bodies, 3). Bodies in `bolted` do not move from where they are seen.
 
     `fields` are values of parameters by name, broadcast to all bodies, and `control_period` (s),
     `substeps`, `iterations`; a parameter that is not given has the centre of its prior.
@@ -74,6 +74,7 @@ def furniture(
         "half_extent": extent,
         "even_gyration": gyration,
         "bolted": bolts,
+        "bolted_pose": np.full((count, 3), np.nan),
         "wheel": np.ones((count, wheels)),
         "dry": np.full((count, wheels), LAWS[law]),
         "pairs": _pairs([len(pieces) for pieces in parts], len(wall_parts), pivots or {}),

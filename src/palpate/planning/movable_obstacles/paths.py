@@ -206,9 +206,7 @@ def allowed_at(
     return Allowed(walls, objects)
 
 
-def _within(
-    tree: shapely.STRtree, point: np.ndarray, most: float
-) -> Iterator[tuple[int, float]]:
+def _within(tree: shapely.STRtree, point: np.ndarray, most: float) -> Iterator[tuple[int, float]]:
     """What is nearer to a place than `most` m, by index, and how near."""
     place = shapely.points(np.asarray(point, float)[:2])
     found = tree.query(place, predicate="dwithin", distance=most)

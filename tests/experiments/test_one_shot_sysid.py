@@ -9,13 +9,13 @@ import pytest
 from mujoco import sysid
 
 from palpate.errors import PalpateError
-from palpate.experiments import one_shot_sysid
-from palpate.experiments.one_shot_sysid import (
-    SysidFit,
+from palpate.experiments.one_shot_sysid import KNOWN, SysidFit, fit_scene, predict_pieces
+from palpate.experiments.told_scene import (
     ToldScene,
     caster_angles,
-    fit_scene,
-    predict_pieces,
+    caster_tracks,
+    rolling_state,
+    settled_positions,
 )
 from palpate.identification.segments import cut
 from palpate.models.planar_shapes import furniture
@@ -55,8 +55,8 @@ def test_a_caster_beside_a_hinge_need_not_show_where_it_points():
     true = world.truth().parameters[0]
     scene = ToldScene(KINDS["hinged"], true.locked, true.anchor, (0.0, 0.0, 0.0))
     aligned = recording.align(CONTROL_PERIOD)
-    known = [known for _, known in one_shot_sysid._tracks(scene, aligned.observation[0, :, 0])]
-    assert max(known[2]) < one_shot_sysid.KNOWN
+    known = [known for _, known in caster_tracks(scene, aligned.observation[0, :, 0])]
+    assert max(known[2]) < KNOWN
     fit = fit_scene(recording, KINDS["hinged"], true.locked, true.anchor)
     assert fit.pieces > 0
     assert fit.parameters.mass == pytest.approx(true.mass, rel=0.1)
@@ -117,7 +117,7 @@ def test_casters_of_the_world_point_where_the_way_says():
     recording = record_handling(world, seed=3, duration=6.0)
     true = world.truth().parameters[0]
     scene = ToldScene(KINDS["table"], true.locked, None, (0.0, 0.0, 0.0))
-    tracks = one_shot_sysid._tracks(scene, recording.trials[0]["pose"].values[:, 0])
+    tracks = caster_tracks(scene, recording.trials[0]["pose"].values[:, 0])
     running = world._now()
     for number, (angle, known) in zip(scene.free, tracks, strict=True):
         # Casters that start anywhere are where they were seen to be dragged to.
@@ -138,9 +138,9 @@ def test_wheels_begin_to_roll_without_slipping():
     velocity = turn * np.array([0.9, -back])
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     rate = np.array([*(np.array([[cosine, -sine], [sine, cosine]]) @ velocity), turn])
-    settled = one_shot_sysid._settled(model)
+    settled = settled_positions(model)
     angles = np.array([0.4, -1.1])
-    state = one_shot_sysid._state(sysid, scene, model, settled, pose, rate, angles)
+    state = rolling_state(sysid, scene, model, settled, pose, rate, angles)
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     mujoco.mj_forward(model, data)

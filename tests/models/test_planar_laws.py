@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from palpate.errors import PalpateError
 from palpate.models.model import rollout
 from palpate.models.planar import Planar, PlanarState, turned_wheel
 from palpate.models.planar_friction import STICTION, Tensor, exponential
@@ -134,7 +135,7 @@ def test_a_body_pushed_above_its_friction_accelerates_by_the_rest(float64):
 
 
 def test_a_bolted_body_does_not_move():
-    model = body(bolted=[0])
+    model = body(bolted=[0], poses=np.zeros((1, 3)))
     poses, velocities = pushed(model, at(velocity=(1.0, 0.0, 1.0)), 2.0, (300.0, -50.0, 80.0))
     np.testing.assert_allclose(poses[-1, 0], 0.0, atol=1e-3)
     np.testing.assert_allclose(velocities[-1, 0], 0.0, atol=1e-3)
@@ -374,30 +375,25 @@ def test_what_is_hinged_and_seen_a_little_off_does_not_begin_to_turn(float64):
     assert np.ptp(poses[:, 0, 2]) < 1e-4
 
 
-def test_what_is_bolted_stays_where_it_is_seen_whatever_holds_it(float64):
-    poses = np.array([[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
+def test_what_is_bolted_stands_there_whatever_holds_it_and_wherever_it_is_seen(float64):
+    poses = np.array([[0.0, 0.0, 0.0], [1.2, 0.0, 3.1]])
     model = furniture(
         [BOX, BOX], wheels=0, pivots={0: 1}, poses=poses, link_anchor=[1.0, 0.0], bolted=[1],
     )  # fmt: skip
-    seen = poses + np.array([[2e-3, 1e-3, 0.0], [0.0, 0.0, 0.0]])
-    state = model.initial_state(jnp.asarray(seen)[None])
-    np.testing.assert_allclose(state.pose, poses, atol=2e-3)
-    np.testing.assert_array_equal(state.pose[1], seen[1])
-    everything = dataclasses.replace(model, bolted=jnp.ones(2))
-    np.testing.assert_allclose(everything.initial_state(jnp.asarray(seen)[None]).pose, seen)
-
-
-def test_what_is_bolted_at_a_known_pose_stands_there_wherever_it_is_seen(float64):
-    at = np.array([[np.nan, np.nan, np.nan], [1.2, 0.1, 3.1]])
-    model = dataclasses.replace(furniture([BOX, BOX], bolted=[1]), bolted_pose=at)
-    frames = np.array(
-        [[[0.0, 0.0, 0.0], [1.21, 0.1, -3.18]], [[0.1, 0.0, 0.0], [1.23, 0.1, -3.19]]]
-    )
-    state = model.initial_state(jnp.asarray(frames))
-    np.testing.assert_array_equal(state.pose, [frames[1, 0], at[1]])
-    assert state.velocity[0, 0] > 0.0
+    seen = poses + np.array([[2e-3, 1e-3, 0.0], [3e-3, 1e-3, 4e-3 - 2 * np.pi]])
+    frames = jnp.asarray([seen - 1e-3, seen])
+    state = model.initial_state(frames)
+    np.testing.assert_allclose(state.pose[0], poses[0], atol=3e-3)
+    np.testing.assert_array_equal(state.pose[1], poses[1])
     np.testing.assert_array_equal(state.velocity[1], 0.0)
     after = model.step(state, jnp.full((2, 3), 50.0))
-    np.testing.assert_allclose(after.pose[1], at[1], atol=1e-6)
-    loose = dataclasses.replace(model, bolted=jnp.zeros(2))
-    np.testing.assert_array_equal(loose.initial_state(jnp.asarray(frames)).pose, frames[1])
+    np.testing.assert_allclose(after.pose[1], poses[1], atol=1e-6)
+    everything = dataclasses.replace(model, bolted=jnp.ones(2))
+    np.testing.assert_array_equal(everything.initial_state(frames).pose, poses)
+    nothing = dataclasses.replace(model, bolted=jnp.zeros(2), pivot=jnp.zeros_like(model.pivot))
+    np.testing.assert_array_equal(nothing.initial_state(frames).pose, seen)
+
+
+def test_bolts_need_the_poses_at_which_they_hold():
+    with pytest.raises(PalpateError, match="poses"):
+        furniture([BOX], bolted=[0])

@@ -36,12 +36,13 @@ def handled(kind: str, seed: int = 0, frames: int = 200, grasp=(-0.2, -0.25)):
     model = furniture(
         [OUTLINE],
         bolted=[0] if kind == STATIC else [],
+        poses=[(1.0, 2.0, 0.3)],
         mass=50.0,
         floor_friction=0.02,
         control_period=0.02,
         **TRUTHS[kind],
     )
-    state = PlanarState(jnp.array([[1.0, 2.0, 0.3]]), jnp.zeros((1, 3)))
+    state = model.initial_state(jnp.array([[[1.0, 2.0, 0.3]]]))
     poses, wrenches = [np.array(state.pose[0])], [np.zeros(3)]
     for frame in range(frames):
         x, y, theta = np.array(state.velocity[0])

@@ -71,8 +71,8 @@ class Planar(Model):
     others are the wheel's own forces; `turned_wheel` has those of one that is not.
 
     Which wheels and links there are, their law, what a link leads to (-1: the world) and which
-    bodies are bolted down (at `bolted_pose`; if that is NaN, where they are seen) is data, so that
-    hypotheses can be a batch axis. Batch axes lead, as those of states and actions do.
+    bodies are bolted down, at `bolted_pose`, is data: hypotheses about it are a batch axis. Batch
+    axes of parameters and structure lead, as those of states and actions do.
 
     Raises `PalpateError` for arrays that do not fit each other, and links or contacts of bodies,
     parts or walls that do not exist.
@@ -322,7 +322,7 @@ class Planar(Model):
 
     def _allowed(self, state: PlanarState) -> PlanarState:
         """The nearest state that bolts and links allow."""
-        stands = (self.bolted[..., None] > 0.0) & jnp.isfinite(self.bolted_pose)
+        stands = self.bolted[..., None] > 0.0
         pose = jnp.where(stands, self.bolted_pose, state.pose)
         state = PlanarState(pose, jnp.where(stands, 0.0, state.velocity))
 

@@ -36,7 +36,7 @@ def furniture(
     `walls` are polygons in the world. Polygons may be concave: they are cut into convex parts.
     Each body gets `wheels` wheels under the given `law`. `pivots` and `distances` map a body to
     the body that a point of it is joined to, None for the world, as it stands at `poses`
-    (bodies, 3). Bodies in `bolted` do not move from where they are seen.
+    (bodies, 3). Bodies in `bolted` do not move from there.
 
     `fields` are values of parameters by name, broadcast to all bodies, and `control_period` (s),
     `substeps`, `iterations`; a parameter that is not given has the centre of its prior.
@@ -74,7 +74,7 @@ def furniture(
         "half_extent": extent,
         "even_gyration": gyration,
         "bolted": bolts,
-        "bolted_pose": np.full((count, 3), np.nan),
+        "bolted_pose": np.zeros((count, 3)) if poses is None else poses,
         "wheel": np.ones((count, wheels)),
         "dry": np.full((count, wheels), LAWS[law]),
         "pairs": _pairs([len(pieces) for pieces in parts], len(wall_parts), pivots or {}),
@@ -90,12 +90,10 @@ def furniture(
             raise PalpateError(
                 f"{name} must fit the shape {shape}, got {np.shape(value)}"
             ) from error
-    model = Planar(**fields)
-    if not fields["pivot"].size:
-        return model
-    if poses is None:
-        raise PalpateError("pivots and distances need the poses (bodies, 3) at which they hold")
-    return model.linked_at(as_floating(poses))
+    model, linked = Planar(**fields), fields["pivot"].size
+    if poses is None and (linked or bolts.any()):
+        raise PalpateError("links and bolts need the poses (bodies, 3) at which they hold")
+    return model.linked_at(as_floating(poses)) if linked else model
 
 
 def rectangle(width: float, depth: float) -> Float[np.ndarray, "4 2"]:

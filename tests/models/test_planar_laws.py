@@ -392,6 +392,9 @@ def test_what_is_bolted_stands_there_whatever_holds_it_and_wherever_it_is_seen(f
     np.testing.assert_array_equal(everything.initial_state(frames).pose, poses)
     nothing = dataclasses.replace(model, bolted=jnp.zeros(2), pivot=jnp.zeros_like(model.pivot))
     np.testing.assert_array_equal(nothing.initial_state(frames).pose, seen)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), everything, nothing)
+    together = both.initial_state(jnp.stack([frames, frames]))
+    np.testing.assert_array_equal(together.pose, [poses, seen])
 
 
 def test_bolts_need_the_poses_at_which_they_hold():

@@ -10,18 +10,22 @@ from hypothesis import strategies as st
 
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.planning.movable_obstacles.abstract import Actions, iterate
+from palpate.planning.movable_obstacles.collisions import Clearance
 from palpate.planning.movable_obstacles.geometry import length_of, placed, polygons
 from palpate.planning.movable_obstacles.manipulation import (
     FORWARD,
     PRIMITIVES,
     TURN_LEFT,
+    Motion,
     RigidCarry,
     carried,
     outline_grasps,
 )
 from palpate.planning.movable_obstacles.occupancy import Footprint, Space, inside
+from palpate.planning.movable_obstacles.passages import Passage
 from palpate.planning.movable_obstacles.paths import distances
 from palpate.planning.movable_obstacles.regions import regions_of
+from palpate.planning.movable_obstacles.situation import whole
 from palpate.planning.movable_obstacles.tree_search import Settings, Step, search
 
 # --- value iteration --------------------------------------------------------------------------
@@ -200,6 +204,67 @@ def test_a_footprint_at_many_poses_is_the_cover_at_each():
         exact = np.zeros(space.shape, bool)
         exact[cover.window] = cover.mask
         assert (mask != exact).sum() <= 0.03 * exact.sum()
+
+
+def test_an_object_hits_what_is_nearer_than_the_margin_and_its_robot_what_is_nearer_than_its_own():
+    world = two_rooms({"a": (1.6, 1.2, 2.2, 1.6), "b": (2.5, 2.0, 3.0, 2.5)})
+    space, step = Space(world), 0.04
+    random = np.random.default_rng(0)
+    objects, robots = (
+        np.column_stack([random.uniform(-0.2, 8.2, 400), random.uniform(-0.2, 3.2, 400), angles])
+        for angles in random.uniform(-4.0, 4.0, (2, 400))
+    )
+    others = shapely.union(world.walls, world.movables["b"].polygon)
+    bodies = polygons(placed(world.movables["a"].outline, objects))
+    inside_of = shapely.box(*world.bounds)
+    room = inside_of.buffer(-world.robot.radius, join_style="mitre")
+    points = shapely.points(robots[:, :2])
+    near = shapely.distance(bodies, others) < math.hypot(world.margin, step / 2)
+    near |= shapely.distance(points, others) < math.hypot(world.clearance, step / 2)
+    expected = near | ~shapely.covers(inside_of, bodies) | ~shapely.covers(room, points)
+    clearance = Clearance.at_start(space, "a", step)
+    assert 50 < expected.sum() < 350
+    np.testing.assert_array_equal(clearance.hits(objects, robots), expected)
+    assert clearance.steps(objects, robots) == np.argmax(expected)
+    assert not clearance.hits(objects[:0], robots[:0]).size
+
+
+def opened_door() -> tuple[Space, Passage, Motion]:
+    """An object that stands in a door, pushed out of it and on."""
+    space = Space(two_rooms({"a": IN_DOOR}))
+    passage = Passage(space, whole(space), "a", np.array([7.0, 1.5]), (), None)
+    movable = space.movables["a"]
+    robot = np.array([3.3, 1.5, 0.0])
+    lengths = 0.05 * np.arange(1, 61)
+    motion = RigidCarry().motion(movable, np.array(movable.pose), robot, FORWARD, lengths, 0)
+    return space, passage, motion
+
+
+def test_a_way_is_found_open_at_the_first_step_that_is_allowed_wherever_one_begins_to_look():
+    space, passage, motion = opened_door()
+    steps = len(motion.energy)
+    first = passage.first_open(motion, np.full(steps, np.inf), 0, steps)
+    assert first is not None
+    assert 3 < first < steps - 4
+    for step, is_open in ((first, True), (first - 3, False)):
+        after, robot = space.moved("a", motion.object_poses[step]), motion.robot_poses[step]
+        ways = distances(after, whole(after), robot, standing=True)
+        assert (ways.to(np.array([7.0, 1.5])) < 6.0) == is_open
+    limits = np.where(np.arange(steps) <= first, np.inf, -1.0)
+    assert [passage.first_open(motion, limits, begin, steps) for begin in range(4)] == [first] * 4
+    assert passage.first_open(motion, np.full(steps, -1.0), 0, steps) is None
+    near = np.full(steps, 1.0)  # m: when the robot is as near, the object stands on the aim
+    assert passage.first_open(motion, near, 0, steps) is None
+
+
+def test_what_lies_beyond_is_no_longer_than_the_way_and_infinite_outside_of_the_window():
+    space = Space(two_rooms({"a": IN_DOOR}))
+    part = slice(5, space.shape[0] - 5), slice(20, space.shape[1])
+    passage = Passage(space, part, "a", np.array([7.0, 1.5]), (), None)
+    places = np.array([[1.0, 1.5, 0.0], [5.0, 1.5, 0.0], [9.0, 1.5, 0.0], [5.0, 0.2, 0.0]])
+    beyond = passage.beyond(places)
+    assert np.isinf(beyond).tolist() == [True, False, True, True]
+    assert 1.4 < beyond[1] <= 2.0  # m: a lower bound
 
 
 def test_moving_an_object_there_and_back_changes_nothing():

@@ -207,8 +207,8 @@ def _seen(recording: Recording, bodies: Sequence[int]) -> Float[np.ndarray, "fra
 def _with_bolts(model: Planar, recording: Recording) -> Planar:
     """The model in which what may be bolted stands at the mean of all poses.
 
-    One place for all that is predicted: were it where it is seen first in each piece, it would have
-    three freedoms more than a hinge, which has one, and evidence would call all that stands hinged.
+    One place for all that is predicted: were it where each piece of motion begins, it would have
+    three freedoms in each, where a hinge has one, and evidence would call all that stands hinged.
     """
     standing = []
     for body in range(model.bodies):

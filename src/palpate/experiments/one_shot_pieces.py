@@ -51,7 +51,7 @@ class Pushes:
     error: np.ndarray
     displacement: np.ndarray
     inside: float
-    drift: float  # m, the farthest that a piece was predicted to go
+    drift: float  # m, the farthest from where it is seen first that a piece is predicted to be
 
     def to_dict(self) -> dict[str, Any]:
         """For a stage's `result.json`."""

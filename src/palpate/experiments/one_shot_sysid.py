@@ -9,7 +9,7 @@ as a prior and a place to begin. It yields one point and no posterior.
 
 Both begin at starts that are smoothed alike (`segments.cut`): here of pieces of a second, ours of
 pieces of two. What a start does not show is where free casters point: that follows from the way
-they were dragged before (`caster_angles`), and pieces that begin before it is known are left out.
+they were dragged before (`told_scene`), and pieces that begin before it is known are left out.
 """
 
 import contextlib

@@ -59,8 +59,11 @@ class Passage:
     def first_open(self, motion: Motion, limits: np.ndarray, begin: int, stop: int) -> int | None:
         """The first step from `begin` to `stop` at which the way is open, as far as looks show.
 
-        Open is a way of no more than `limits` (steps,), m.
+        Ways that are certainly longer than `limits` (steps,), m, are not looked for.
         """
+        # a look stands for the steps before it as well, of which some may be allowed more
+        padded = np.concatenate([np.full(_STRIDE - 1, -np.inf), limits])
+        limits = np.lib.stride_tricks.sliding_window_view(padded, _STRIDE).max(axis=1)
         looks = np.arange(begin + _STRIDE - 1, stop, _STRIDE)
         if stop > begin and (not len(looks) or looks[-1] != stop - 1):
             looks = np.append(looks, stop - 1)

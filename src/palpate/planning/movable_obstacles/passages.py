@@ -61,9 +61,6 @@ class Passage:
 
         Ways that are certainly longer than `limits` (steps,), m, are not looked for.
         """
-        # a look stands for the steps before it as well, of which some may be allowed more
-        padded = np.concatenate([np.full(_STRIDE - 1, -np.inf), limits])
-        limits = np.lib.stride_tricks.sliding_window_view(padded, _STRIDE).max(axis=1)
         looks = np.arange(begin + _STRIDE - 1, stop, _STRIDE)
         if stop > begin and (not len(looks) or looks[-1] != stop - 1):
             looks = np.append(looks, stop - 1)
@@ -126,7 +123,9 @@ class Passage:
         own = math.ceil(self._space.map.margin / self._space.cell) + 2
         for look, cover in zip(looks, covered, strict=True):
             robot = motion.robot_poses[look]
-            free = self._base & self._worth(robot, float(limits[look]))
+            # a look stands for the steps before it as well, of which some may be allowed more
+            limit = float(limits[max(0, look - _STRIDE + 1) : look + 1].max())
+            free = self._base & self._worth(robot, limit)
             free[local] &= ~cover
             labels, _ = ndimage.label(free, _EIGHT)
             beside = set(labels[self._around(robot, own)].ravel().tolist())

@@ -42,7 +42,7 @@ def furniture(
     `substeps`, `iterations`; a parameter that is not given has the centre of its prior.
 
     Raises `PalpateError` for outlines that cross themselves, have no area or are not about their
-    centroid, and for links or bolts of bodies that do not exist.
+    centroid, for links or bolts of bodies that do not exist, and for any without `poses`.
     """
     shapes = [_shape(outline, f"outline {index}") for index, outline in enumerate(outlines)]
     barriers = [_shape(wall, f"wall {index}") for index, wall in enumerate(walls)]

@@ -113,9 +113,9 @@ def distances(
     allowed = allowed_at(space, source, nearby, standing=standing)
     joined = _links(space, window, source, free, allowed)
     columns = (node[:, None] + offsets)[beside]
-    lengths = np.broadcast_to(_LENGTHS * space.cell, beside.shape)[beside]
+    weights = np.broadcast_to(_LENGTHS * space.cell, beside.shape)[beside]
     columns = np.concatenate([columns, np.array([n for n, _ in joined], int)])
-    values = np.concatenate([lengths, np.array([max(gap, 1e-9) for _, gap in joined])])
+    values = np.concatenate([weights, np.array([max(gap, 1e-9) for _, gap in joined])])
     ends = np.concatenate([[0], np.cumsum(counts), [len(columns)]])
     graph = csr_matrix((values, columns, ends), shape=(size + 1, size + 1))
     lengths, predecessors = dijkstra(
@@ -150,6 +150,7 @@ def links(
 def _links(
     space: Space, window: Window, point: np.ndarray, free: np.ndarray, allowed: "Allowed"
 ) -> list[tuple[int, float]]:
+    """`links` with the exceptions worked out."""
     point = np.asarray(point, float)[:2]
     around = math.ceil((space.map.margin + 1e-9) / space.cell) + 2
     row, column = space.cell_at(point)

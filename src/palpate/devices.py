@@ -5,8 +5,10 @@ import functools
 import inspect
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
+from queue import SimpleQueue
 from typing import Any
 
 # Measured with JAX 0.10 on CPUs: models are loops over small arrays, and these let XLA compile
@@ -128,7 +130,9 @@ def over_devices(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], An
 
     def call(shared: Any, each: Any) -> Any:
         arrays, static = eqx.partition(shared, eqx.is_array)
-        count, devices = jax.tree.leaves(each)[0].shape[0], jax.devices()
+        own = jax.config.jax_default_device
+        count = jax.tree.leaves(each)[0].shape[0]
+        devices = [own] if own else jax.devices()
         used = max(n for n in range(1, len(devices) + 1) if count % n == 0)
         divided = jax.shard_map(
             lambda arrays, part: function(eqx.combine(arrays, static), part),
@@ -140,6 +144,35 @@ def over_devices(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], An
         return divided(arrays, each)
 
     return call
+
+
+def one_on_each(function: Callable[[Any], Any], work: Iterable[Any]) -> list[Any]:
+    """`function` of every piece of work, as many at a time as there are devices, each on its own.
+
+    Small batches are better whole on one device each than one after another on all: a posterior's
+    16 chains take but a sixth less time on two cores than on one. What is raised by one piece is
+    raised when those that have begun are done, and no others begin.
+    """
+    import jax
+
+    free: SimpleQueue[Any] = SimpleQueue()
+    for device in jax.devices():
+        free.put(device)
+    settings = jax.config.jax_enable_x64  # of a thread, as is the device
+
+    def one(piece: Any) -> Any:
+        device = free.get()
+        try:
+            with jax.enable_x64(settings), jax.default_device(device):
+                return function(piece)
+        finally:
+            free.put(device)
+
+    pool = ThreadPoolExecutor(len(jax.devices()))
+    try:
+        return list(pool.map(one, work))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def everywhere(tree: Any) -> Any:

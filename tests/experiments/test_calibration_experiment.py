@@ -14,7 +14,7 @@ def drawn(problem, key, simulations, draws):
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     size = simulations, problem.target.dimension
     rank = rng.integers(0, draws + 1, size) if right else rng.integers(16, 48, size)
-    return Ranks(rank=rank, size=np.full(size, 60.0), draws=draws)
+    return Ranks(rank=rank, size=np.full(size, 300.0), rhat=np.full(size, 1.01), draws=draws)
 
 
 @pytest.fixture
@@ -28,6 +28,8 @@ def test_figures_and_resumption(tmp_path, quickly, monkeypatch):
     assert set(figures) >= {"p_min", "p_min_wrong_sigma", "simulations"}
     assert figures["p_min"].met
     assert figures["p_min_wrong_sigma"].met
+    assert figures["ess_min"].value == 300.0
+    assert figures["rhat_max"].value == pytest.approx(1.01)
     assert (tmp_path / "whole" / calibration.FIGURE).exists()
 
     calls = []

@@ -12,21 +12,18 @@ Whether it would notice is tested by a likelihood with the wrong noise (`sigma_f
 """
 
 import dataclasses
-from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.stats import chi2
 
+from palpate.devices import one_on_each
 from palpate.errors import PalpateError
-from palpate.identification.diagnostics import bulk_size
-from palpate.identification.draws import pooled
-from palpate.identification.hamiltonian import BLOCK, GAIN, chain
-from palpate.identification.laplace import STARTS, Modes, search
+from palpate.identification.bayesian import sample
+from palpate.identification.diagnostics import bulk_size, rhat
 from palpate.identification.likelihood import (
     MotionPosterior,
     from_start,
@@ -36,9 +33,8 @@ from palpate.identification.likelihood import (
 from palpate.identification.segments import known_start
 from palpate.models.model import Model
 
-WARM_UP = 12  # blocks; the metric is learnt after each but the first and the last
-LEAPS = 12  # of a trajectory: more than a quarter turn, with the metric of the posterior
-THIN = 16  # draws for each that is kept: curved posteriors are explored slowly
+CHAINS = 16  # of each posterior, as are usual
+THIN = 5  # draws of a chain for each that is kept: those that are kept are then independent
 
 
 class Problem(eqx.Module):
@@ -55,12 +51,13 @@ class Problem(eqx.Module):
 class Ranks:
     """Of each simulation's true coordinates among its posterior's draws.
 
-    `rank` counts the draws below the truth, 0 to `draws`; `size` is the bulk effective size of
-    the draws that were kept, for each coordinate.
+    `rank` counts the draws below the truth, 0 to `draws`. `size` is the bulk effective size, of
+    all draws that they were taken from, and `rhat` the R-hat of the chains, of each coordinate.
     """
 
     rank: Int[np.ndarray, "simulations free"]
     size: Float[np.ndarray, "simulations free"]
+    rhat: Float[np.ndarray, "simulations free"]
     draws: int
 
 
@@ -80,31 +77,30 @@ def problem(
     nothing = jnp.zeros((len(pose), horizon, *pose.shape[1:]), pose.dtype)
     segments = known_start(pose, jnp.zeros_like(pose), action, nothing)
     scales = known_scales(model, sigma_factor * np.asarray(noise))
-    return Problem(motion_posterior(model, segments, scales), jnp.asarray(noise, pose.dtype))
+    target = motion_posterior(model, segments, scales).with_one_rotation()
+    return Problem(target, jnp.asarray(noise, pose.dtype))
 
 
 def ranks_of(given: Problem, key: PRNGKeyArray, simulations: int, draws: int = 63) -> Ranks:
-    """Simulate, sample and rank, all simulations side by side.
+    """Simulate all side by side; sample each posterior as `bayesian.sample` does, and rank.
 
-    Every posterior begins at the best of several climbs that do not know the truth, with a metric
-    of its own. Raises `PalpateError` when a chain of draws is not finite.
+    What is tested is all of what a user's recording meets: the search for modes, which does not
+    know the truth, the chains, and which draws they end with. Raises as `sample`.
     """
-    first, second, third = jax.random.split(key, 3)
-    truth, observed = _simulated(given, jax.random.split(first, simulations))
-    size = truth.shape[1]
-    noise = np.array(jax.random.normal(second, (simulations, STARTS, size)))
-    noise[:, 0] = 0.0
-    parameters = np.arange(size) < given.target.parameters
-    modes = search(partial(_look, given.target, observed), noise, parameters)
-    position = _sampled(given.target, observed, modes, third, draws)
-    if not np.all(np.isfinite(position)):
-        raise PalpateError("a posterior draw is not finite: expected a model that stays finite")
-    kept = position[:, THIN - 1 :: THIN][:, :draws]
-    return Ranks(
-        rank=(kept < np.asarray(truth)[:, None]).sum(axis=1),
-        size=np.stack([bulk_size(chain[None]) for chain in kept]),
-        draws=draws,
-    )
+    first, second = jax.random.split(key)
+    truth, observed = jax.device_get(_simulated(given, jax.random.split(first, simulations)))
+    seeds = np.asarray(jax.random.randint(second, (simulations,), 0, np.iinfo(np.int32).max))
+    length = THIN * -(-draws // CHAINS)
+
+    def one(of: tuple[np.ndarray, np.ndarray, int]) -> tuple[np.ndarray, ...]:
+        true, data, seed = of
+        target = eqx.tree_at(lambda t: t.segments.target, given.target, jnp.asarray(data))
+        posterior = sample(target, chains=CHAINS, draws=length, seed=seed)
+        rank = (posterior.thinned(draws) < true).sum(axis=0)
+        return rank, bulk_size(posterior.draws.position), rhat(posterior.draws.position)
+
+    found = one_on_each(one, zip(truth, observed, seeds.tolist(), strict=True))
+    return Ranks(*(np.stack(of) for of in zip(*found, strict=True)), draws)
 
 
 def p_values(
@@ -133,10 +129,6 @@ def histogram(
     return np.stack([np.bincount(column, minlength=bins) for column in of.T])
 
 
-def _with(target: MotionPosterior, observed: Array) -> MotionPosterior:
-    return eqx.tree_at(lambda t: t.segments.target, target, observed)
-
-
 @eqx.filter_jit
 def _simulated(given: Problem, keys: Array) -> tuple[Array, Array]:
     """True coordinates (simulations, free), and what was observed of the motions they make."""
@@ -148,62 +140,3 @@ def _simulated(given: Problem, keys: Array) -> tuple[Array, Array]:
         return truth, motion + given.noise * jax.random.normal(seen, motion.shape, motion.dtype)
 
     return jax.vmap(one)(keys)
-
-
-@eqx.filter_jit
-def _look(
-    target: MotionPosterior, observed: Array, position: Float[Array, "simulations starts free"]
-) -> tuple[Array, Array, Array]:
-    one = lambda data, here: jax.vmap(_with(target, data).curvature)(here)  # noqa: E731
-    return _divided(jax.vmap(one))(observed, position)
-
-
-def _sampled(
-    target: MotionPosterior, observed: Array, modes: Modes, key: PRNGKeyArray, draws: int
-) -> Float[np.ndarray, "simulations steps free"]:
-    """One chain for each data set, warm-up left out."""
-    count, size = len(observed), target.dimension
-    covariance = np.asarray(modes.covariance[:, 0], np.float64)
-    state = tuple(np.asarray(x[:, 0]) for x in (modes.position, modes.density, modes.slope))
-    step = np.full(count, np.log(1.2 * size**-0.25), np.float32)
-    kept, recent = [], []
-    for index in range(WARM_UP + -(-draws * THIN // BLOCK)):
-        root = np.linalg.cholesky(covariance).astype(np.float32)
-        keys = jax.random.split(jax.random.fold_in(key, index), count)
-        gain = np.float32(GAIN if index < WARM_UP else 0.0)
-        state, block = jax.device_get(_block(target, observed, state, root, step, keys, gain))
-        if index < WARM_UP:
-            step = np.median(block.step[:, BLOCK // 2 :], axis=1)
-            recent = [*recent[-1:], block.position]
-            if 0 < index < WARM_UP - 1:
-                last = np.concatenate(recent, axis=1)
-                covariance = np.stack(
-                    [pooled(m[None], c) for m, c in zip(last, covariance, strict=True)]
-                )
-        else:
-            kept.append(block.position)
-    return np.concatenate(kept, axis=1)
-
-
-@eqx.filter_jit
-def _block(target, observed, state, root, step, keys, gain):
-    def one(data, state, root, step, key):
-        return chain(_with(target, data), state, root, step, key, gain, LEAPS)
-
-    return _divided(jax.vmap(one))(observed, state, root, step, keys)
-
-
-def _divided(function):
-    """The function of batches with the simulations divided over the devices, if they can be."""
-
-    def call(*batches):
-        devices = jax.devices()
-        if len(jax.tree.leaves(batches)[0]) % len(devices):
-            return function(*batches)
-        each = PartitionSpec("simulations")
-        mesh = Mesh(devices, ("simulations",))
-        return jax.shard_map(function, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(
-            *batches
-        )
-
-    return call

@@ -27,7 +27,6 @@ BLOCK = 50  # draws between two looks at the chains: one compiled piece of work
 WARM_UP = 4  # blocks
 LEARNED = 2  # from this block of the warm-up on the metric is learnt from the draws of the last
 ACCEPTANCE = 0.9  # high: the longer steps of .8 diverge where a posterior narrows, and chains stick
-ACCEPTANCE_FIXED = 0.8  # of trajectories of fixed length
 DOUBLINGS = 6
 GAIN = 0.15  # of the step size's logarithm per draw, at first; falls as the root of the draws
 
@@ -110,31 +109,25 @@ def _block(
     def part(shared, each) -> tuple[State, _Block]:
         target, root, gain = shared
         # One after another: side by side each would wait for the longest trajectory.
-        return jax.lax.map(lambda c: chain(target, c[0], root, c[1], c[2], gain), each)
+        return jax.lax.map(lambda c: _chain(target, c[0], root, c[1], c[2], gain), each)
 
     return over_devices(part)((target, root, gain), (state, step, keys))
 
 
-def chain(
+def _chain(
     target: Target,
     state: State,
     root: Array,
     step: Array,
     key: PRNGKeyArray,
     gain: Array,
-    leaps: int | None = None,
 ) -> tuple[State, _Block]:
     """One block of one chain. In the coordinates y of x = root y the metric is the identity.
-
-    With `leaps` trajectories have that length (Duane et al. 1987), their steps varied by a fifth
-    so that none returns to where it began: among many chains side by side none waits for the
-    longest trajectory.
 
     It begins with the density and slope that the block before it ended with: to compute them here
     would compile the model's derivatives twice.
     """
-    turning, fixed = blackjax.nuts.build_kernel(), blackjax.hmc.build_kernel()
-    acceptance = ACCEPTANCE if leaps is None else ACCEPTANCE_FIXED
+    kernel = blackjax.nuts.build_kernel()
     position, value, slope = state
     unit = jnp.ones_like(position)
 
@@ -144,13 +137,8 @@ def chain(
     def advance(carry, inputs):
         state, step = carry
         key, index = inputs
-        if leaps is None:
-            state, info = turning(key, state, density, jnp.exp(step), unit, DOUBLINGS)
-        else:
-            moving, varying = jax.random.split(key)
-            varied = jnp.exp(step) * jax.random.uniform(varying, (), step.dtype, 0.8, 1.2)
-            state, info = fixed(moving, state, density, varied, unit, leaps)
-        step += gain / jnp.sqrt(1.0 + index / 5.0) * (info.acceptance_rate - acceptance)
+        state, info = kernel(key, state, density, jnp.exp(step), unit, DOUBLINGS)
+        step += gain / jnp.sqrt(1.0 + index / 5.0) * (info.acceptance_rate - ACCEPTANCE)
         out = _Block(
             position=root @ state.position,
             density=state.logdensity,

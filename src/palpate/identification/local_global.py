@@ -112,9 +112,11 @@ def compiled_meanwhile(target: Target, chains: int = 16) -> Iterator[None]:
     within is raised when this compiler is done.
     """
     dtype, size = jnp.zeros(()).dtype, target.dimension
+    device = jax.config.jax_default_device
 
     def work() -> None:
-        with jax.enable_x64(dtype == jnp.float64):  # a context is of one thread
+        # A context is of one thread.
+        with jax.enable_x64(dtype == jnp.float64), jax.default_device(device):
             some = np.zeros((chains, size), dtype)
             nowhere = np.zeros((2, size))  # what a covariance needs at least
             none, root = some[:, 0], np.eye(size, dtype=dtype)

@@ -86,20 +86,21 @@ def fit_mixture(
     used = int(np.clip(count // (DRAWN * size), 1, COMPONENTS))
     centre = flat.mean(axis=0)
     whole = np.linalg.cholesky(pooled(flat, covariance))
-    white = np.linalg.solve(whole, (flat - centre).T).T
+    white = np.linalg.solve(whole, (flat - centre).T)
     begin = np.random.default_rng(seed).choice(count, used, replace=False)
-    weight, mean = np.full(used, 1.0 / used), white[begin]
+    weight, mean = np.full(used, 1.0 / used), white[:, begin].T
     spread = np.tile(0.5 * np.eye(size), (used, 1, 1))
     prior = SHRINKAGE * size
     for _ in range(ROUNDS if used > 1 else 1):
-        each = _logarithms(white, weight, mean, spread)
-        share = np.exp(each - each.max(axis=0))
+        share = _logarithms(white, weight, mean, spread)
+        share = np.exp(share - share.max(axis=0))
         share /= share.sum(axis=0)
         of = share.sum(axis=1) + 1e-9
         weight = (of + 1.0) / (of.sum() + used)
-        mean = (share @ white) / of[:, None]
-        off = white - mean[:, None]
-        scatter = np.swapaxes(off, 1, 2) @ (share[..., None] * off)
+        mean = (share @ white.T) / of[:, None]
+        second = (share[:, None] * white).reshape(-1, count) @ white.T
+        # About its mean: the draws are white, so that nothing cancels.
+        scatter = second.reshape(spread.shape) - of[:, None, None] * _squared(mean)
         diagonal = np.einsum("kii->ki", scatter) / of[:, None] + NARROWEST
         spread = scatter + prior * np.einsum("ki,ij->kij", diagonal, np.eye(size))
         spread = spread / (of + prior)[:, None, None]
@@ -113,9 +114,21 @@ def fit_mixture(
     return Mixture(*(jnp.asarray(part, jnp.zeros(()).dtype) for part in parts))
 
 
+def _squared(vectors: Float[np.ndarray, "components free"]) -> np.ndarray:
+    """Their outer products with themselves."""
+    return vectors[:, :, None] * vectors[:, None, :]
+
+
 def _logarithms(white: np.ndarray, weight, mean, covariance) -> np.ndarray:
-    """Logarithms of weight times density, (components, draws), but for what all have in common."""
+    """Logarithms of weight times density, (components, draws), but for what all have in common.
+
+    `white` is (free, draws): one product of matrices is for all components, and sums run over
+    whole rows.
+    """
     root = np.linalg.cholesky(covariance)
-    off = (white - mean[:, None]) @ np.swapaxes(np.linalg.inv(root), 1, 2)
+    whitening = np.linalg.inv(root)
     volume = np.log(np.einsum("kii->ki", root)).sum(axis=1)
-    return (np.log(weight) - volume)[:, None] - 0.5 * np.square(off).sum(axis=2)
+    off = whitening.reshape(-1, len(white)) @ white
+    off -= (whitening @ mean[..., None]).reshape(-1, 1)
+    squared = np.square(off, out=off).reshape(*mean.shape, -1).sum(axis=1)
+    return (np.log(weight) - volume)[:, None] - 0.5 * squared

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 FOUNDATION = (
     *("networks", "recording", "parameters", "small_systems"),
-    *("runs", "result", "storage", "errors", "devices", "__init__"),
+    *("runs", "loops", "result", "storage", "errors", "devices", "__init__"),
 )
 # From the top of the house to its foundation: a row imports rows below it and its own, never one
 # above. A new file or folder directly under palpate/ is given its place here; recording_csv.py

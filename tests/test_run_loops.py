@@ -9,8 +9,8 @@ import time
 import jax.numpy as jnp
 import pytest
 
-from palpate import runs
-from palpate.runs import interruptible, progress
+from palpate import loops
+from palpate.loops import interruptible, progress
 
 
 @pytest.fixture
@@ -74,8 +74,8 @@ def watched(monkeypatch, steps, seconds_per_step, terminal=False, done=0, **metr
     """The lines on stderr from a loop whose steps take so long by a clock of our own."""
     stream, now = io.StringIO(), 0.0
     monkeypatch.setattr(stream, "isatty", lambda: terminal, raising=False)
-    monkeypatch.setattr(runs.sys, "stderr", stream)
-    monkeypatch.setattr(runs.time, "monotonic", lambda: now)
+    monkeypatch.setattr(loops.sys, "stderr", stream)
+    monkeypatch.setattr(loops.time, "monotonic", lambda: now)
     bar = progress(steps, "training", done=done)
     for _ in bar:
         now += seconds_per_step

@@ -130,7 +130,7 @@ def over_devices(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], An
 
     def call(shared: Any, each: Any) -> Any:
         arrays, static = eqx.partition(shared, eqx.is_array)
-        own = jax.config.jax_default_device
+        own = own_device()
         count = jax.tree.leaves(each)[0].shape[0]
         devices = [own] if own else jax.devices()
         used = max(n for n in range(1, len(devices) + 1) if count % n == 0)
@@ -146,6 +146,13 @@ def over_devices(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], An
     return call
 
 
+def own_device() -> Any:
+    """The device that this thread computes on by its own, None where it has all of them."""
+    import jax
+
+    return jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def one_on_each(function: Callable[[Any], Any], work: Iterable[Any]) -> list[Any]:
     """`function` of every piece of work, as many at a time as there are devices, each on its own.
 
@@ -154,16 +161,17 @@ def one_on_each(function: Callable[[Any], Any], work: Iterable[Any]) -> list[Any
     raised when those that have begun are done, and no others begin.
     """
     import jax
+    import jax.numpy as jnp
 
     free: SimpleQueue[Any] = SimpleQueue()
     for device in jax.devices():
         free.put(device)
-    settings = jax.config.jax_enable_x64  # of a thread, as is the device
+    wide = jnp.zeros(()).dtype == jnp.float64  # a setting of one thread, as is the device
 
     def one(piece: Any) -> Any:
         device = free.get()
         try:
-            with jax.enable_x64(settings), jax.default_device(device):
+            with jax.enable_x64(wide), jax.default_device(device):
                 return function(piece)
         finally:
             free.put(device)

@@ -21,12 +21,13 @@ from palpate.identification.calibration import (
     problem,
     ranks_of,
 )
+from palpate.loops import interruptible, progress
 from palpate.models.planar import Planar
 from palpate.models.planar_shapes import furniture, rectangle
 from palpate.parameters import LogNormal, Normal, declare
 from palpate.report.posterior_chart import rank_figure
 from palpate.result import Figure, Result
-from palpate.runs import RESULT, Run, interruptible, progress
+from palpate.runs import RESULT, Run
 from palpate.storage import read_json
 
 NAME = "calibration"

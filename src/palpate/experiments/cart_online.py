@@ -29,9 +29,10 @@ from palpate.experiments.cart_tasks import DECISION, CartTask, apartment, shoppi
 from palpate.experiments.cart_trials import HANDLED, PRACTISED, Planning, Trial, best_scene
 from palpate.experiments.names import suffix
 from palpate.experiments.rope_stabilization import announce, finish, wall_time
+from palpate.loops import progress
 from palpate.report.style import STYLES
 from palpate.result import Figure, Result, two_standard_errors
-from palpate.runs import Run, progress
+from palpate.runs import Run
 from palpate.storage import write_bytes
 
 NAME = "cart-online"

@@ -24,11 +24,11 @@ from palpate.experiments.furniture_recording import (
 )
 from palpate.experiments.identify_bayesian import explore, posterior_of, shares
 from palpate.experiments.options import Hypotheses
+from palpate.loops import progress
 from palpate.models.model import Model
 from palpate.models.planar import Planar, wrapped
 from palpate.parameters import declare, parameters_of, value_of, with_values
 from palpate.recording import Recording
-from palpate.runs import progress
 
 Law = Literal["coulomb", "viscous"]
 Pair = tuple[int, int]

@@ -13,6 +13,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.experiments import folders
+from palpate.experiments.identify_data import Data, read
 from palpate.experiments.names import check_name
 from palpate.experiments.options import Identify
 from palpate.identification.gradient import Settings, check_shapes, identify
@@ -33,29 +34,14 @@ from palpate.parameters import (
     format_value,
     parameters_of,
 )
-from palpate.recording import Aligned, Recording, join
-from palpate.recording_files import read_recording
-from palpate.recording_markers import repair_markers
 from palpate.report import write_evidence
 from palpate.report.charts import quantiles
 from palpate.result import Figure, Result, read_result
 from palpate.runs import RESULT, Run
 
-HELD_OUT = 0.25  # of the trials, where no recording for validation is given
 RESIDUAL = "residual"  # the folder of its run
 CORRECTION = "correction"  # what the result's settings say of it
 UNITS = {"m": (100.0, "cm")}  # a person reads these errors in another unit
-
-
-@dataclasses.dataclass(frozen=True)
-class Data:
-    """What there is to fit and to score: aligned trials, and the observation's unit."""
-
-    fitted: Recording
-    validation: Recording | None
-    fitted_aligned: Aligned
-    validation_aligned: Aligned
-    unit: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,36 +95,6 @@ def run(options: Identify) -> Path:
             notes.append(_told_of(result.settings[CORRECTION]))
         folders.hand_over(options, run, title, folders.MODEL, notes)
         return run.path
-
-
-def read(options: Identify) -> Data:
-    """The recordings, prepared by the family, repaired where they are fitted, and split by trial.
-
-    What is scored is scored as it was recorded: only what is fitted is repaired.
-    """
-    if not options.recordings:
-        raise PalpateError("no recording is named: expected at least one file or log")
-    raw = _read(options.recordings, options)
-    if options.validate:
-        fitted, validation = raw, _read(options.validate, options)
-    elif len(raw.trials) > 1:
-        fitted, validation = raw.split(HELD_OUT, options.seed)
-    else:
-        fitted, validation = raw, None
-    observation = options.observation
-    if fitted.trials[0][observation].values.ndim == 3:
-        fitted = repair_markers(fitted, observation)
-    fitted = _prepared(fitted, options, "")
-    action = options.action(fitted)
-    period = _period(fitted, observation, options.rate)
-    aligned = fitted.align(period, observation, action)
-    if validation is None:
-        scored = aligned
-    else:
-        validation = _prepared(validation, options, "validation, ")
-        scored = validation.align(period, observation, action)
-    unit = fitted.trials[0][observation].unit
-    return Data(fitted, validation, aligned, scored, unit)
 
 
 def with_declarations(
@@ -261,37 +217,6 @@ def rows(identified: Identified) -> list[dict[str, Any]]:
 
 def _listed(value: Any) -> Any:
     return None if value is None else np.asarray(value).tolist()
-
-
-def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
-    return join(
-        [
-            read_recording(
-                path,
-                rate=options.rate,
-                unit=options.unit,
-                up=options.up,
-                topics=options.topics or (),
-            )
-            for path in paths
-        ]
-    )
-
-
-def _prepared(recording: Recording, options: Identify, where: str) -> Recording:
-    """The recording as the family needs it; what was put right before and thereby is printed."""
-    prepared = options.prepare(recording)
-    for note in dict.fromkeys((*recording.notes, *prepared.notes)):
-        print(f"note: {where}{note}")
-    return prepared
-
-
-def _period(recording: Recording, observation: str, rate: float | None) -> float:
-    """The control period: that of the sensor, free of the last digits of its clock."""
-    if rate is not None:
-        return 1.0 / rate
-    periods = [trial[observation].nominal_period for trial in recording.trials]
-    return float(f"{np.median(periods):.5g}")
 
 
 def _settings(options: Identify) -> Settings:

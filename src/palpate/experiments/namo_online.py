@@ -37,11 +37,12 @@ from palpate.experiments.namo_episode import (
 from palpate.experiments.namo_execution import FORCE
 from palpate.experiments.namo_rooms import Room, generated_room, scenes
 from palpate.experiments.rope_trials import wilson_interval
+from palpate.loops import interruptible, progress
 from palpate.planning.movable_obstacles.plan import timed
 from palpate.planning.movable_obstacles.primitives import FREE, Constraint
 from palpate.report.namo_picture import plan_picture, scene_animation
 from palpate.result import Figure, Result
-from palpate.runs import Run, interruptible, progress, read_metrics
+from palpate.runs import Run, read_metrics
 
 NAME = "namo-online"
 SOLVED_BAR, ALL_MOVABLE_BAR = 0.95, 0.60

@@ -41,8 +41,9 @@ from palpate.experiments.one_shot_sampling import OURS as SAMPLER
 from palpate.experiments.one_shot_sampling import Pace, race
 from palpate.experiments.rope_stabilization import announce, finish
 from palpate.identification.bayesian import sample
+from palpate.loops import progress
 from palpate.result import Figure, Result, two_standard_errors
-from palpate.runs import RESULT, Run, progress
+from palpate.runs import RESULT, Run
 from palpate.storage import read_json
 from palpate.worlds.furniture import FurnitureWorld
 from palpate.worlds.furniture_pieces import KINDS, Piece

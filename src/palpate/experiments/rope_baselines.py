@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from palpate.experiments.rope_trials import Seen, Trial, run_trials, settling_time
+from palpate.loops import progress
 from palpate.perception.velocity import VelocityEstimator
-from palpate.runs import progress
 from palpate.worlds.rope import START_POSES, RopeConfiguration, sample_configurations
 
 TUNING_STEPS = 500  # control periods of each trial: 5 s

@@ -34,13 +34,14 @@ from palpate.experiments.rope_trials import (
     run_trials,
     settling_time,
 )
+from palpate.loops import interruptible, progress
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
 from palpate.planning.open_loop import POPULATION, CommandSequence, Found, cma_package, search
 from palpate.report.evidence import write_evidence
 from palpate.result import Figure, Result
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 from palpate.tasks import RopeStabilization
 from palpate.tasks.rope_stabilization import STABILISED, STAY
 from palpate.tasks.task import Start

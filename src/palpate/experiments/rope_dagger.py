@@ -53,11 +53,12 @@ from palpate.experiments.rope_trials import (
 from palpate.learning import Training
 from palpate.learning.dagger import Outcome, dagger, go_on
 from palpate.learning.loss_monitor import Observed
+from palpate.loops import interruptible, progress
 from palpate.models.rope import RopeState
 from palpate.networks import CommandPolicy
 from palpate.parameters import describe
 from palpate.result import Figure, Result
-from palpate.runs import RESULT, Run, interruptible, progress
+from palpate.runs import RESULT, Run
 from palpate.storage import read_json
 from palpate.tasks import RopeStabilization
 from palpate.worlds.rope import RopeConfiguration, sample_configurations

@@ -16,9 +16,10 @@ from palpate.experiments.rope_trials import (
     settling_time,
     wilson_interval,
 )
+from palpate.loops import interruptible, progress
 from palpate.report.evidence import write_evidence
 from palpate.result import Figure
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 from palpate.tasks.rope_stabilization import STABILISED, STAY
 from palpate.worlds.rope import START_POSES, RopeConfiguration, sample_configurations
 

@@ -33,11 +33,12 @@ from palpate.experiments.rope_stabilization import (
     wall_time,
 )
 from palpate.experiments.rope_trials import Episodes, LearnedController, Trial, run_trials
+from palpate.loops import interruptible, progress
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
 from palpate.report.evidence import write_evidence
 from palpate.result import Figure, Result, two_standard_errors
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 from palpate.tasks import RopeStabilization
 from palpate.worlds.camera import Sensor
 from palpate.worlds.filmed_rope import TRIPOD, Background

@@ -21,10 +21,11 @@ from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMis
 
 from palpate.experiments.rope_environment import Actor, Episodes
 from palpate.learning import Training
+from palpate.loops import interruptible, progress
 from palpate.models.rope import Rope
 from palpate.parameters import describe
 from palpate.result import machine
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 from palpate.storage import load_arrays, save_arrays
 from palpate.tasks import RopeStabilization
 

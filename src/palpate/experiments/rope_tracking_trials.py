@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from palpate.experiments.rope_trials import Controller, Trial, run_trials
+from palpate.loops import interruptible, progress
 from palpate.report.evidence import write_evidence
 from palpate.report.style import STYLES
 from palpate.result import Figure
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 from palpate.storage import write_bytes
 from palpate.tasks.paths import CURVES, named_path, read_path
 from palpate.tasks.rope_tracking import PREVIEW

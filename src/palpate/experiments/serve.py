@@ -23,9 +23,9 @@ from palpate.errors import PalpateError
 from palpate.experiments import folders, rope_robot
 from palpate.experiments.options import Serve
 from palpate.experiments.rope_trials import settling_time
+from palpate.loops import Stop, interruptible
 from palpate.networks import CommandPolicy, load_policy
 from palpate.result import Figure, Result
-from palpate.runs import Stop, interruptible
 from palpate.storage import write_json
 
 TASK = "rope-stabilization"

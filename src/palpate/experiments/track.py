@@ -9,6 +9,7 @@ from palpate.errors import PalpateError
 from palpate.experiments import folders
 from palpate.experiments.rope_options import TrackRope
 from palpate.experiments.rope_recording import GRIPPER, MARKERS
+from palpate.loops import progress
 from palpate.models.files import load_model
 from palpate.models.rope import Rope
 from palpate.perception.image_folder import read_image_folder
@@ -17,7 +18,6 @@ from palpate.perception.rope_tracking import RopeTracker
 from palpate.recording import Channel, Recording, Role, Trial
 from palpate.recording_files import write_recording
 from palpate.result import Figure, Result
-from palpate.runs import progress
 from palpate.storage import write_bytes
 from palpate.worlds.pinhole import Frame, Pinhole
 

@@ -100,7 +100,8 @@ def ranks_of(given: Problem, key: PRNGKeyArray, simulations: int, draws: int = 6
         return rank, bulk_size(posterior.draws.position), rhat(posterior.draws.position)
 
     found = one_on_each(one, zip(truth, observed, seeds.tolist(), strict=True))
-    return Ranks(*(np.stack(of) for of in zip(*found, strict=True)), draws)
+    rank, size, mixed = (np.stack(of) for of in zip(*found, strict=True))
+    return Ranks(rank, size, mixed, draws)
 
 
 def p_values(

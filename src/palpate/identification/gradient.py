@@ -24,10 +24,11 @@ from palpate.identification.prediction import (
     WindowSource,
     observation_scale,
 )
+from palpate.loops import interruptible, progress
 from palpate.models.model import Model
 from palpate.parameters import FreeParameters
 from palpate.recording import Aligned
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 
 SomeModel = TypeVar("SomeModel", bound=Model)
 Free = dict[str, Array]

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from palpate.devices import compiled_sooner, over_devices
+from palpate.devices import compiled_sooner, over_devices, own_device
 from palpate.identification.draws import Draws, begun, pooled, time_to_compile
 from palpate.identification.laplace import Modes
 from palpate.identification.mixture import DEGREES, Mixture, fit_mixture, one_of
@@ -112,7 +112,7 @@ def compiled_meanwhile(target: Target, chains: int = 16) -> Iterator[None]:
     within is raised when this compiler is done.
     """
     dtype, size = jnp.zeros(()).dtype, target.dimension
-    device = jax.config.jax_default_device
+    device = own_device()
 
     def work() -> None:
         # A context is of one thread.

@@ -29,10 +29,11 @@ from palpate.identification.prediction import (
     prediction_error,
     residuals,
 )
+from palpate.loops import interruptible, progress
 from palpate.models.model import Model, rollout
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.recording import Aligned
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 
 CHECK = 20  # iterations between looks at the held-out trials
 CONFIDENCE = 0.95  # that the gain on held-out trials is not chance, one-sided

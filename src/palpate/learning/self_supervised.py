@@ -18,10 +18,11 @@ from jaxtyping import Array, PRNGKeyArray
 from palpate.devices import data_parallel, everywhere
 from palpate.errors import PalpateError
 from palpate.learning.closed_loop import simulate
+from palpate.loops import interruptible, progress
 from palpate.models.model import Model
 from palpate.networks.policy import CommandPolicy
 from palpate.parameters import randomise
-from palpate.runs import Run, interruptible, progress
+from palpate.runs import Run
 from palpate.tasks.task import Start, Task
 
 MOST_SKIPPED = 20  # updates in a row without a finite gradient: more will not help

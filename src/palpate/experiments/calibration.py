@@ -88,8 +88,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     values = [p_values(each, DRAWS, size.bins) for each in ranks]
     labels = ("right sigma", f"sigma {WRONG:g} times too large")
     counts = {
-        label: histogram(each, DRAWS, size.bins)
-        for label, each in zip(labels, found["rank"], strict=True)
+        label: histogram(each, DRAWS, size.bins) for label, each in zip(labels, ranks, strict=True)
     }
     rank_figure(out / FIGURE, names, counts)
     for name, right, wrong in zip(names, *values, strict=True):

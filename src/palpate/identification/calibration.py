@@ -84,8 +84,8 @@ def problem(
 def ranks_of(given: Problem, key: PRNGKeyArray, simulations: int, draws: int = 63) -> Ranks:
     """Simulate all side by side; sample each posterior as `bayesian.sample` does, and rank.
 
-    What is tested is all of what a user's recording meets: the search for modes, which does not
-    know the truth, the chains, and which draws they end with. Raises as `sample`.
+    But for the noise, which is known, all is tested that a recording meets: the search for modes,
+    which does not know the truth, the chains, and the draws they end with. Raises as `sample`.
     """
     first, second = jax.random.split(key)
     truth, observed = jax.device_get(_simulated(given, jax.random.split(first, simulations)))

@@ -38,11 +38,11 @@ class Modes(eqx.Module):
     Laplace's logarithm of the data's density by each mode alone.
     """
 
-    position: Float[Array, "*batch modes free"]
-    density: Float[Array, "*batch modes"]
-    slope: Float[Array, "*batch modes free"]
-    covariance: Float[np.ndarray | Array, "*batch modes free free"]
-    evidence: Float[Array, "*batch modes"]
+    position: Float[Array, "modes free"]
+    density: Float[Array, " modes"]
+    slope: Float[Array, "modes free"]
+    covariance: Float[np.ndarray | Array, "modes free free"]
+    evidence: Float[Array, " modes"]
 
     def draw(self, key: PRNGKeyArray, count: int) -> Array:
         """Draws (count, free) from the mixture, modes weighted by their evidence."""
@@ -79,7 +79,7 @@ def _found(target: Target, modes: Modes) -> Modes:
 
 def climb_each(
     curvature: Callable[[Array], tuple[ArrayLike, ...]],
-    position: Float[np.ndarray, "*batch starts free"],
+    position: Float[np.ndarray, "starts free"],
     steps: int = 40,
     moving: Bool[np.ndarray, " free"] | None = None,
 ) -> Modes:
@@ -111,26 +111,22 @@ def climb_each(
         for kept, new in zip((value, slope, information), after, strict=True):
             kept[better] = new[better]
     _, volume = np.linalg.slogdet(information / (2.0 * np.pi))
-    order = np.argsort(-value, axis=-1)
+    order = np.argsort(-value)
     dtype = jnp.zeros(()).dtype
 
-    def sorted_by_density(part: np.ndarray) -> np.ndarray:
-        index = order.reshape(*order.shape, *(1,) * (part.ndim - order.ndim))
-        return np.take_along_axis(part, index, axis=order.ndim - 1)
-
     def rounded(part: np.ndarray) -> Array:
-        return jnp.asarray(sorted_by_density(part), dtype)
+        return jnp.asarray(part[order], dtype)
 
     return Modes(
         position=rounded(here),
         density=rounded(value),
         slope=rounded(slope),
-        covariance=sorted_by_density(_inverse(information)),
+        covariance=_inverse(information)[order],
         evidence=rounded(value - 0.5 * volume),
     )
 
 
-def _inverse(information: Float[np.ndarray, "*batch free free"]) -> np.ndarray:
+def _inverse(information: Float[np.ndarray, "starts free free"]) -> np.ndarray:
     """Of what is at least the prior's identity; positive definite however far eigenvalues part."""
     values, vectors = np.linalg.eigh(information)
     inverse = (vectors / np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
@@ -139,7 +135,7 @@ def _inverse(information: Float[np.ndarray, "*batch free free"]) -> np.ndarray:
 
 def search(
     curvature: Callable[[Array], tuple[ArrayLike, ...]],
-    position: Float[np.ndarray, "*batch starts free"],
+    position: Float[np.ndarray, "starts free"],
     moving: Bool[np.ndarray, " free"],
 ) -> Modes:
     """Climb from many starts for a few steps, and from where the best of them are to the top.
@@ -149,7 +145,7 @@ def search(
     happened is the model's discrepancy, and leave most climbs there.
     """
     screened = climb_each(curvature, position, SCREENING, moving)
-    return climb_each(curvature, np.asarray(screened.position[..., :FOLLOWED, :]), CLIMBING)
+    return climb_each(curvature, np.asarray(screened.position[:FOLLOWED]), CLIMBING)
 
 
 def look(

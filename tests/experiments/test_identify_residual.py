@@ -9,7 +9,7 @@ import pytest
 
 from correctable_toys import CorrectableCart
 from palpate.errors import PalpateError
-from palpate.experiments import identify
+from palpate.experiments import identify, identify_data
 from palpate.experiments.options import Identify
 from palpate.identification.residual import ResidualSettings
 from palpate.models import files
@@ -109,7 +109,7 @@ def test_nothing_is_said_of_a_correction_that_was_not_asked_for(recording, tmp_p
 def test_too_few_trials_are_refused_before_anything_is_fitted(recording, tmp_path):
     options = IdentifyCart(recordings=(recording,), residual=True, out=tmp_path / "run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identify, "HELD_OUT", 0.9)
+        patch.setattr(identify_data, "HELD_OUT", 0.9)
         with pytest.raises(PalpateError, match=r"needs at least 3 trials.* the recording has 2$"):
             identify.run(options)
     assert not (tmp_path / "run").exists()

@@ -30,6 +30,15 @@ def test_the_right_likelihood_passes_and_a_wrong_sigma_fails():
     assert p_values(wrong.rank, DRAWS, BINS).min() < 1e-3
 
 
+@pytest.mark.slow
+def test_a_sigma_that_is_half_as_large_again_fails_among_more_simulations():
+    right, wrong = (
+        ranks_of(pushed(factor), jax.random.key(3), 160, DRAWS) for factor in (1.0, 1.5)
+    )
+    assert p_values(right.rank, DRAWS, BINS).min() > 0.01 / 3
+    assert p_values(wrong.rank, DRAWS, BINS).min() < 1e-3
+
+
 def test_the_same_key_gives_the_same_ranks_whichever_device_comes_to_them():
     first, second = (ranks_of(pushed(1.0), jax.random.key(4), 3, DRAWS) for _ in range(2))
     np.testing.assert_array_equal(first.rank, second.rank)

@@ -105,13 +105,18 @@ def test_told_the_truth_the_one_piece_that_gives_way_is_got_past(seed, kind):
     assert {truth[name].kind for name, _ in outcome.tried} == {kind}
 
 
-def test_the_flag_falls_after_one_failure():
+def test_the_flag_weighs_failures_against_what_came_along():
     flag = Flag(("a", "b"))
     assert not flag.immovable()
     flag.tried("a", 0.0)
     flag.tried("b", 1.0)
     assert flag.immovable() == {"a"}
-    assert flag.movability()["b"] == 1.0
+    assert flag.movability()["a"] == pytest.approx(0.7 * 0.1 / (0.7 * 0.1 + 0.3 * 0.9))
+    assert flag.movability()["b"] == pytest.approx(0.7 * 0.9 / (0.7 * 0.9 + 0.3 * 0.1))
+    flag.tried("b", 0.2)  # the one undoes the other
+    assert flag.movability()["b"] == pytest.approx(0.7)
+    flag.tried("b", 0.2)
+    assert flag.immovable() == {"a", "b"}
 
 
 def test_what_never_learns_tries_the_same_piece_until_its_attempts_are_over(monkeypatch):

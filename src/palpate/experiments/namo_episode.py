@@ -42,7 +42,7 @@ NEAR = 0.15  # m from the goal counts as there
 SEARCH = Settings(iterations=30)  # for every planner
 DRAWS = 8  # of the belief, for planning
 SEARCHES = 4  # with other seeds before there counts as no way
-MOVABLE, THRESHOLD, FAILS = 0.7, 0.5, 0.1  # flag: prior, and how often a movable object fails
+MOVABLE, THRESHOLD, ERRS = 0.7, 0.5, 0.1  # flag: prior, and how often a transfer tells it wrong
 # m: each is tried where there is no way with the one before (from rooms of development).
 MARGINS = (MARGIN, TIGHT, 0.0)
 
@@ -113,8 +113,8 @@ class Fixed:
 class Flag(Fixed):
     """Levihn, Scholz and Stilman (ICRA 2013): movable or not, by a thresholded probability.
 
-    An object that failed to come along counts as movable with Bayes' probability; below the
-    threshold it is a wall from then on.
+    An object that came along or failed to counts as movable with Bayes' probability; below the
+    threshold it is a wall.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
@@ -127,11 +127,9 @@ class Flag(Fixed):
 
     def tried(self, name: str, share: float) -> None:
         """See `Opinion`."""
-        if share >= DONE:
-            self._probability[name] = 1.0
-        else:
-            movable = self._probability[name] * FAILS
-            self._probability[name] = movable / (movable + 1 - self._probability[name] + 1e-9)
+        prior = self._probability[name]
+        told = 1 - ERRS if share >= DONE else ERRS  # of a movable object
+        self._probability[name] = prior * told / (prior * told + (1 - prior) * (1 - told))
 
     def movability(self) -> dict[str, float]:
         """See `Opinion`."""

@@ -21,7 +21,7 @@ from palpate.experiments.namo_episode import (
     ATTEMPTS,
     BUDGET,
     DRAWS,
-    FAILS,
+    ERRS,
     MARGINS,
     MOVABLE,
     SEARCH,
@@ -114,7 +114,7 @@ def configuration(first: int, count: int) -> dict[str, Any]:
         "iterations": SEARCH.iterations,
         "margins_m": MARGINS,
         "hand_N": FORCE,
-        "flag": {"prior": MOVABLE, "threshold": THRESHOLD, "movable_fails": FAILS},
+        "flag": {"prior": MOVABLE, "threshold": THRESHOLD, "errs": ERRS},
         "room": {name.lower(): getattr(namo_rooms, name) for name in constants},
     }
 

@@ -8,6 +8,8 @@ INTERPRETERS := $(or $(PYTHON),python3.12 python3.11 python3 python3.13)
 INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -c constraints.txt
 PINS := pyproject.toml constraints.txt
+# A process holds a gigabyte or two of compiled functions: more than four would fill a laptop.
+TESTS := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=4 --dist=loadfile
 
 .NOTPARALLEL:
 .PHONY: help demo test test-all lint format docs clean
@@ -19,10 +21,10 @@ demo: $(VENV)/.core ## identify a rope, train a controller, run it, write the re
 	@$(BIN)/palpate demo
 
 test: lint ## lint, types and every test that is not slow
-	@$(BIN)/python -m pytest
+	@$(TESTS)
 
 test-all: lint ## the same with the slow tests
-	@$(BIN)/python -m pytest -m ""
+	@$(TESTS) -m ""
 
 lint: $(VENV)/.test ## style and types
 	@$(BIN)/ruff check

@@ -19,12 +19,13 @@ def room_for_compiled_functions():
     """Forget what was compiled, before there is so much of it that the process is killed.
 
     Each function that XLA compiles takes a few mappings of memory; Linux grants a process 65,530.
+    An eighth of them goes with about two gigabytes, which several processes at once can have.
     """
     yield
     if MAPS.exists() and MOST.exists():
         with MAPS.open() as maps:
             count = sum(1 for _ in maps)
-        if count > int(MOST.read_text()) // 3:
+        if count > int(MOST.read_text()) // 8:
             jax.clear_caches()
             gc.collect()
 

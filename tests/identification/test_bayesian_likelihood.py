@@ -58,10 +58,11 @@ def test_the_likelihood_is_that_of_the_dense_normal_distribution():
         )
         return residuals(model, from_start(model, start), piece)[0].T.ravel()
 
+    centre, spread = eqx.filter_jit(moved), eqx.filter_jit(jax.jacfwd(moved))
     for index in range(segments.count):
         piece = segments.take([index])
-        mean = np.asarray(moved(jnp.zeros(6), piece))
-        starts = np.asarray(jax.jacfwd(moved)(jnp.zeros(6), piece))
+        mean = np.asarray(centre(jnp.zeros(6), piece))
+        starts = np.asarray(spread(jnp.zeros(6), piece))
         covariance = starts @ starts.T
         for channel in range(3):
             rows = slice(20 * channel, 20 * channel + 20)
@@ -87,8 +88,9 @@ def test_curvature_is_that_of_the_expected_information():
     position = initial_position(target)
     value, slope, curvature = target.curvature(position)
     assert value == pytest.approx(float(target.density(position)))
-    np.testing.assert_allclose(slope, jax.grad(target.density)(position), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(curvature, -jax.hessian(target.density)(position), rtol=1e-6)
+    gradient, hessian = jax.jit(jax.grad(target.density)), jax.jit(jax.hessian(target.density))
+    np.testing.assert_allclose(slope, gradient(position), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(curvature, -hessian(position), rtol=1e-6)
 
 
 @pytest.mark.usefixtures("float64")
@@ -99,11 +101,16 @@ def test_several_positions_side_by_side_are_each_by_itself():
     positions = jnp.asarray(np.random.default_rng(0).normal(size=(3, target.dimension))) * 0.3
     densities, curvatures = target.densities(positions), target.curvatures(positions)
     slopes = jax.grad(lambda p: jnp.sum(target.densities(p)))(positions)
+
+    @jax.jit
+    def alone(position):
+        return jax.value_and_grad(target.density)(position), target.curvature(position)
+
     for index, position in enumerate(positions):
-        value, slope = jax.value_and_grad(target.density)(position)
+        (value, slope), curvature = alone(position)
         assert densities[index] == pytest.approx(float(value), rel=1e-12)
         np.testing.assert_allclose(slopes[index], slope, rtol=1e-9, atol=1e-9)
-        for several, one in zip(curvatures, target.curvature(position), strict=True):
+        for several, one in zip(curvatures, curvature, strict=True):
             np.testing.assert_allclose(several[index], one, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(curvatures[1][index], slope, rtol=1e-8, atol=1e-8)
     assert np.ptp(densities) > 1.0

@@ -10,7 +10,7 @@ import pytest
 import shapely
 from shapely import affinity
 
-from palpate.experiments import cart_agents, cart_online, cart_trials
+from palpate.experiments import cart_agents, cart_online, cart_posterior, cart_trials
 from palpate.experiments.cart_agents import (
     FRAMES,
     Decision,
@@ -18,13 +18,13 @@ from palpate.experiments.cart_agents import (
     Handled,
     Knowing,
     PhysicsAgent,
-    PiecePosterior,
     RegressionAgent,
     around,
     due,
     piece_model,
     scene_model,
 )
+from palpate.experiments.cart_posterior import PiecePosterior
 from palpate.experiments.cart_tasks import (
     CLEAR,
     DONE,
@@ -164,11 +164,11 @@ def test_the_pieces_in_which_most_happened_are_compared(monkeypatch):
     target = way[:, None, None, None] * jnp.ones((4, 5, 1, 3))
     zero = jnp.zeros((4, 1, 3))
     pieces = Segments(zero, zero, zero, zero, target, target, jnp.ones(target.shape, bool))
-    monkeypatch.setattr(cart_agents, "MOST", 3)
-    picked = cart_agents._telling([pieces.take([0, 1]), pieces.take([2, 3])])
+    monkeypatch.setattr(cart_posterior, "MOST", 3)
+    picked = cart_posterior.telling([pieces.take([0, 1]), pieces.take([2, 3])])
     np.testing.assert_allclose(picked.target[:, 0, 0, 0], [0.3, 0.2, 0.1])
-    monkeypatch.setattr(cart_agents, "MOST", 6)
-    picked = cart_agents._telling([pieces])
+    monkeypatch.setattr(cart_posterior, "MOST", 6)
+    picked = cart_posterior.telling([pieces])
     assert picked.count == 6
     assert np.asarray(picked.seen).all(axis=(1, 2, 3)).tolist() == [True] * 4 + [False] * 2
 
@@ -267,7 +267,7 @@ def test_a_planner_is_asked_for_what_is_believed(monkeypatch):
 
 
 def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
-    updates, kept = [], []
+    updates, kept, searched = [], [], []
 
     class Posterior:
         def __init__(self, model, seed, told):
@@ -281,6 +281,9 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
             self.mass += 1
             return dataclasses.replace(self.model, mass=jnp.array([self.mass]))
 
+        def search(self):
+            searched.append(len(kept))
+
     monkeypatch.setattr(cart_agents, "PiecePosterior", Posterior)
     monkeypatch.setattr(
         SamplingPlanner, "__call__", lambda self, plan, *_: (plan, jnp.array([0.2, 0.0, 0.0]))
@@ -293,6 +296,13 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
     believed = agent.believed(0)
     assert isinstance(believed, Planar)
     assert float(believed.mass[0]) == 14.0
+    assert searched == [1]
+
+    searched.clear()
+    kept.clear()
+    task = dataclasses.replace(task, episode=1)
+    run(task, PhysicsAgent(task, 0), 3, 9)
+    assert searched == [1, 2, 4, 8]  # after so many episodes
 
 
 def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
@@ -303,7 +313,7 @@ def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
         begun.append(np.asarray(start))
         return SimpleNamespace(position=start)
 
-    monkeypatch.setattr(cart_agents, "climb", climb)
+    monkeypatch.setattr(cart_posterior, "climb", climb)
     task = shopping_cart()
     trial = Trial(task, Knowing(None), SMALL, 3)
     for _ in range(4):
@@ -319,6 +329,35 @@ def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
     assert 0.4 < kept.mean() < 1.0
 
 
+def test_a_search_compares_what_it_found_with_what_was_known(monkeypatch):
+    """Two of what a search of the whole prior finds, and the two modes known so far."""
+    begun = []
+
+    def climb(target, start, steps=40):
+        begun.append(np.asarray(start))
+        return SimpleNamespace(position=start[::-1])
+
+    def settle(target, key):
+        return target, SimpleNamespace(position=jnp.full((6, target.dimension), 7.0))
+
+    monkeypatch.setattr(cart_posterior, "climb", climb)
+    monkeypatch.setattr(cart_posterior, "settle", settle)
+    task = shopping_cart()
+    trial = Trial(task, Knowing(None), SMALL, 3)
+    for _ in range(4):
+        trial.decide()
+    posterior = PiecePosterior(piece_model(task, 0), 0)
+    assert posterior.search() is None
+    posterior.keep(trial.episodes[0].handling(0))
+    posterior.search()
+    known = begun[0][2:]
+    assert known.shape == (1, begun[0].shape[1])
+    np.testing.assert_array_equal(begun[0][:2], 7.0)
+    np.testing.assert_allclose(known[0, :-6], 0.0, atol=1e-6)  # the prior's centre, of parameters
+    posterior.search()
+    np.testing.assert_array_equal(begun[1][2:], begun[0][::-1][:2])  # the best of the last climb
+
+
 def test_who_is_told_a_model_climbs_from_it_first(monkeypatch):
     """From the hidden constants themselves, as a planar model has them."""
     begun, task = [], apartment()
@@ -327,7 +366,7 @@ def test_who_is_told_a_model_climbs_from_it_first(monkeypatch):
         begun.append(target.model(start[0]))
         return SimpleNamespace(position=start)
 
-    monkeypatch.setattr(cart_agents, "climb", climb)
+    monkeypatch.setattr(cart_posterior, "climb", climb)
     trial = Trial(task, Knowing(None), SMALL, 3)
     trial.decide()
     told, truth = cart_trials._told(task, 3), trial._world.truth()
@@ -350,8 +389,8 @@ def test_the_best_scene_is_learnt_from_handling_and_from_other_starts(monkeypatc
             assert len(told) == len(handled)
             seen.append([len(stretches) for stretches in handled])
 
-        def search(self, times):
-            seen.append(times)
+        def search(self):
+            seen.append("searched")
             return scene
 
         def learn(self, episodes):
@@ -364,8 +403,8 @@ def test_the_best_scene_is_learnt_from_handling_and_from_other_starts(monkeypatc
     monkeypatch.setattr(cart_trials, "HANDLED", 0.2)
     monkeypatch.setattr(cart_trials, "PRACTISED", 1)
     assert best_scene(task, SMALL, 3) is scene
-    assert seen[:2] == [[3], cart_trials.SEARCHES]
-    assert seen[4:] == [cart_trials.SEARCHES]
+    assert seen[:2] == [[3], "searched"]
+    assert seen[4:] == ["searched"]
     _, trial = run(task, Knowing(None), 3, 1)
     assert np.abs(trial.episodes[0].first - seen[2]).max() > 0.1
 

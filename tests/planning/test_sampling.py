@@ -114,6 +114,30 @@ def test_a_plan_without_any_finite_future_is_still_a_command() -> None:
         assert bool(jnp.isfinite(command).all())
 
 
+@dataclasses.dataclass(frozen=True)
+class Only:
+    """The sample of this number, whatever it loses."""
+
+    number: int
+    narrows = False
+
+    def weights(self, losses):
+        return jnp.zeros_like(losses).at[self.number].set(1.0)
+
+
+def test_samples_of_no_share_forget_the_plan_and_are_one_command() -> None:
+    """Sample 1 has the share 0, sample 2 is about the plan, sample 0 is the plan."""
+    for number, same in ((0, True), (1, True), (2, False)):
+        plans = planner(Only(number), samples=4, deviation=0.5, rate_limit=None, shares=(1.0, 0.0))
+        plan = plans.init(jnp.zeros(1), jax.random.key(0))
+        plan = dataclasses.replace(plan, knots=jnp.full_like(plan.knots, 30.0))
+        plan, _ = plans(plan, CartState(jnp.zeros(1), jnp.zeros(1)), jnp.zeros(20))
+        knots = np.asarray(plan.knots)
+        assert (np.ptp(knots) == 0.0) == same
+        np.testing.assert_allclose(knots, 0.0 if number == 1 else 30.0, atol=3.0)
+        assert number == 0 or np.abs(knots - 30.0).min() > 1e-3
+
+
 def test_samples_about_a_share_of_the_plan_let_go_of_what_achieves_nothing() -> None:
     """Where all plans are as good, the new one is the mean of the shares of the old."""
     for shares, left in (((1.0,), 1.0), ((1.0, 0.0, 1.0, 0.5), 0.625)):

@@ -2,9 +2,9 @@
 
 Each agent believes in some model of the scene whose step is a decision; the same planner plans
 through all of them (`cart_online`). Physics-based agents have a planar model of each piece, whose
-posterior is climbed anew as data arrive: Fisher scoring of the likelihood of the handling so far in
-which most happened, from the last modes and from others near the best. Regressions have the
-transitions of decisions.
+posterior (`cart_posterior`) is climbed anew as data arrive, and after 1, 2, 4, ... episodes
+searched all over, as that of a recording is: a climb may stay where a table is heavy that in truth
+is held by its caster. Regressions have the transitions of decisions.
 """
 
 import dataclasses
@@ -17,18 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from palpate.experiments.cart_posterior import PiecePosterior
 from palpate.experiments.cart_tasks import DECISION, CartTask
 from palpate.experiments.planar_features import body_features
-from palpate.identification.laplace import climb
-from palpate.identification.likelihood import (
-    MotionPosterior,
-    inferred_scales,
-    initial_position,
-    motion_posterior,
-)
 from palpate.identification.regression import LocallyWeighted, locally_weighted
 from palpate.identification.regression_model import Features, RegressedModel
-from palpate.identification.segments import Segments, cut
 from palpate.models.model import Model
 from palpate.models.planar import Planar, PlanarState
 from palpate.models.planar_shapes import furniture
@@ -37,12 +30,7 @@ from palpate.recording import Aligned
 from palpate.worlds.furniture import CONTROL_PERIOD
 
 FRAMES = round(DECISION / CONTROL_PERIOD)  # observed in a decision
-PIECE = 0.6  # s, of what is seen that is compared at a time
 SUBSTEPS = 2  # of a decision, in planning
-MOST = 32  # pieces that are compared
-STARTS, STEPS = 4, 5  # of the climb at each update
-REDRAWN = 0.25  # of the coordinates of some starts
-NOISE = np.array([1e-3, 1e-3, 2e-3])  # m, m, rad: of a tracker as agents expect it
 
 
 class Handled(Model):
@@ -206,53 +194,6 @@ def scene_model(task: CartTask, pieces: list[Planar]) -> Planar:
     return with_values(scene, values)
 
 
-class PiecePosterior:
-    """What handling has told of one piece: its motion, cut to pieces, and the posterior's modes.
-
-    The first climb begins at what is `told` of it, if anything, or at the prior's centre.
-    """
-
-    def __init__(self, model: Planar, seed: int, told: Planar | None = None):
-        self.model = model
-        self._told = told
-        self._key = jax.random.key(seed)
-        self._kept: list[Segments] = []
-        self._modes: Array | None = None
-
-    def keep(self, stretches: list[tuple[Aligned, bool]]) -> None:
-        """Remember handling that is over."""
-        self._kept += self._cut(stretches)
-
-    def update(self, stretches: list[tuple[Aligned, bool]]) -> Planar | None:
-        """The most probable model, given what is kept and handling that still goes on.
-
-        None as long as nothing has been seen.
-        """
-        parts = self._kept + self._cut(stretches)
-        if not parts:
-            return None
-        scales = inferred_scales(self.model, NOISE)
-        target = motion_posterior(self.model, _telling(parts), scales)
-        self._key, draw, choose = jax.random.split(self._key, 3)
-        start = jax.random.normal(draw, (STARTS, target.dimension)).at[0].set(0.0)
-        if self._told is not None:
-            start = start.at[0].set(_position(target, self._told))
-        if self._modes is not None:
-            target = target.linearised(self._modes[0])
-            # The last modes, and the best with some coordinates drawn anew: where sliding sets in
-            # the density has a kink at which a climb stays, and only that coordinate is wrong.
-            redrawn = jax.random.bernoulli(choose, REDRAWN, start.shape)
-            start = jnp.where(redrawn, start, self._modes[0])
-            start = start.at[: STARTS // 2].set(self._modes[: STARTS // 2])
-        self._modes = climb(target, start, STEPS).position
-        found = target.model(self._modes[0])
-        assert isinstance(found, Planar)
-        return found
-
-    def _cut(self, stretches: list[tuple[Aligned, bool]]) -> list[Segments]:
-        return [cut(aligned, self.model, PIECE, at_rest=rest) for aligned, rest in stretches]
-
-
 class PhysicsAgent:
     """Physics-based RL: plans through the most probable planar model of every piece so far.
 
@@ -277,11 +218,10 @@ class PhysicsAgent:
         self._scene = scene_model(task, self._models)
         self._learnt = [0] * len(self._pieces)  # decisions in which each was held
 
-    def search(self, times: int) -> Planar:
-        """Climb the posteriors so many times; the scene as they have it then."""
+    def search(self) -> Planar:
+        """Look for the modes of all pieces anew; the scene as they have it then."""
         for body, piece in enumerate(self._pieces):
-            for _ in range(times):
-                self._models[body] = piece.update([]) or self._models[body]
+            self._models[body] = piece.search() or self._models[body]
         self._scene = scene_model(self._task, self._models)
         return self._scene
 
@@ -298,6 +238,8 @@ class PhysicsAgent:
         if len(episode.decisions) == self._task.episode:
             for body, piece in enumerate(self._pieces):
                 piece.keep(episode.handling(body))
+            if len(episodes).bit_count() == 1:
+                self.search()
 
     def believed(self, held: int) -> Model | None:
         """See `Agent.believed`."""
@@ -358,25 +300,3 @@ def _datum(features: Features, before: PlanarState, wrench: Array, after: Planar
     if features.condition is not None:
         condition = features.condition(before)
     return inputs, features.change(before, after), condition
-
-
-def _position(target: MotionPosterior, model: Planar) -> Array:
-    """Where a model is among the coordinates of a posterior, the scales at their medians."""
-    told = motion_posterior(model, target.segments, target.scales)
-    return initial_position(told)
-
-
-def _telling(parts: list[Segments]) -> Segments:
-    """The `MOST` pieces in which most happened; padded by ones in which nothing is seen.
-
-    Most of the time of who is good at it passes at the goal, where next to nothing moves, and a
-    share of the pieces taken evenly would forget how the furniture rolls.
-    """
-    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    way = np.where(whole.seen, np.abs(np.asarray(whole.target) - whole.pose[:, None]), 0.0)
-    chosen = np.argsort(-way.max(axis=1).sum(axis=(1, 2)), kind="stable")[:MOST]
-    index = np.concatenate([chosen, np.zeros(MOST - len(chosen), int)])
-    picked = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), whole)
-    kept = jnp.arange(MOST) < len(chosen)
-    seen = picked.seen & kept.reshape(-1, *(1,) * (picked.seen.ndim - 1))
-    return dataclasses.replace(picked, seen=seen, target=jnp.where(seen, picked.target, 0.0))

@@ -32,7 +32,7 @@ ESTIMATED = 5  # frames that velocities are estimated from
 VISIBLE = 0.02  # m or rad, in a decision: what moves by more has moved
 SHARES = 1.0, 0.0, 1.0, 0.5  # of the plan that samples are about: forces may cancel
 CLOSE = 0.02  # m: what is nearer is taken as touching
-HANDLED, PRACTISED, SEARCHES = 15.0, 4, 15  # s, three times; episodes; and climbs: of TRUE
+HANDLED, PRACTISED = 15.0, 4  # s, three times; and episodes: of TRUE
 HANDLING, PRACTICE = 10_000, 20_000  # episodes' numbers, unlike those that count
 
 
@@ -193,11 +193,11 @@ def best_scene(task: CartTask, planning: Planning, seed: int) -> Planar:
     heavy to be moved, is believed, and so never seen to move.
     """
     agent = PhysicsAgent(task, seed, _wiggled(task, seed), _told(task, seed))
-    agent.search(SEARCHES)
+    agent.search()
     trial = Trial(task, agent, planning, seed, first_episode=PRACTICE)
     for _ in range(PRACTISED * task.episode):
         trial.decide()
-    return agent.search(SEARCHES)
+    return agent.search()
 
 
 def _told(task: CartTask, seed: int) -> list[Planar]:

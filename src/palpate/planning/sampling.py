@@ -67,9 +67,11 @@ class Cem:
 class SamplingPlanner(CurvePlanner):
     """MPPI or CEM through any model; see `CurvePlanner`.
 
-    `shares` say, in turn, about how much of the plan samples are drawn: 0 is about no command at
-    all. A plan has no reason to give up what achieves nothing, such as parts of a wrench that
-    cancel, and commands that are limited as a whole then leave no room for what is needed.
+    `shares` say, in turn, about how much of the plan samples are drawn. A plan has no reason to
+    give up what achieves nothing, such as parts of a wrench that cancel, and commands that are
+    limited as a whole then leave no room for what is needed. Samples of share 0 forget the plan and
+    are one command each, the same at all knots: what sticks is loosened by who pushes it one way
+    for long, which independent knots hardly ever do.
     """
 
     rule: Rule = eqx.field(static=True, kw_only=True)
@@ -98,7 +100,8 @@ class SamplingPlanner(CurvePlanner):
             noise = jax.random.normal(
                 jax.random.fold_in(key, iteration), (self.samples, *knots.shape), knots.dtype
             )
-            tried = share * knots + deviation * noise.at[0].set(0.0)
+            noise = jnp.where(share == 0, noise[:, :1], noise).at[0].set(0.0)
+            tried = share * knots + deviation * noise
             losses = self._losses(tried, plan.command, state, goals)
             weights = self.rule.weights(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
             knots = jnp.tensordot(weights, tried, axes=1)

@@ -8,8 +8,8 @@ INTERPRETERS := $(or $(PYTHON),python3.12 python3.11 python3 python3.13)
 INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -c constraints.txt
 PINS := pyproject.toml constraints.txt
-# A process holds a gigabyte or two of compiled functions: more than four would fill a laptop.
-TESTS := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=4 --dist=loadfile
+# A process grows to four or five gigabytes: more than two would fill a laptop.
+TESTS := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=2 --dist=loadfile
 
 .NOTPARALLEL:
 .PHONY: help demo test test-all lint format docs clean

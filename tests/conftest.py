@@ -19,7 +19,7 @@ def room_for_compiled_functions():
     """Forget what was compiled, before there is so much of it that the process is killed.
 
     Each function that XLA compiles takes a few mappings of memory; Linux grants a process 65,530.
-    An eighth of them goes with about two gigabytes, which several processes at once can have.
+    Well before that, as what is compiled takes memory too, and two processes run side by side.
     """
     yield
     if MAPS.exists() and MOST.exists():

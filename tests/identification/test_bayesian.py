@@ -48,7 +48,7 @@ def first():
     """A posterior, and what was compiled for it."""
     with compiled() as names:
         # Headed backwards: the camera's angle jumps by a turn within the pieces.
-        found = identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True)
+        found = identify(MODEL, pushes(TRUE, 1, heading=3.1), draws=200, at_rest=True)
     return found, names
 
 
@@ -91,7 +91,7 @@ def test_models_are_a_batch(posterior):
 
 
 def test_the_same_seed_gives_the_same_draws(posterior):
-    again = identify(MODEL, pushes(TRUE, 1, heading=3.1), at_rest=True)
+    again = identify(MODEL, pushes(TRUE, 1, heading=3.1), draws=200, at_rest=True)
     np.testing.assert_array_equal(again.draws.position, posterior.draws.position)
 
 

@@ -305,6 +305,15 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
     assert searched == [1, 2, 4, 8]  # after so many episodes
 
 
+def four_decisions():
+    """A cart's posterior that nothing was told yet, and handling to tell it."""
+    task = shopping_cart()
+    trial = Trial(task, Knowing(None), SMALL, 3)
+    for _ in range(4):
+        trial.decide()
+    return PiecePosterior(piece_model(task, 0), 0), trial.episodes[0].handling(0)
+
+
 def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
     """Beside the best: some of its coordinates drawn anew, the others as they are."""
     begun = []
@@ -314,14 +323,10 @@ def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
         return SimpleNamespace(position=start)
 
     monkeypatch.setattr(cart_posterior, "climb", climb)
-    task = shopping_cart()
-    trial = Trial(task, Knowing(None), SMALL, 3)
-    for _ in range(4):
-        trial.decide()
-    posterior = PiecePosterior(piece_model(task, 0), 0)
+    posterior, handling = four_decisions()
     assert posterior.update([]) is None
     for _ in range(2):
-        posterior.update(trial.episodes[0].handling(0))
+        posterior.update(handling)
     first, second = begun
     assert not first[0].any()
     np.testing.assert_array_equal(second[:2], first[:2])
@@ -342,13 +347,9 @@ def test_a_search_compares_what_it_found_with_what_was_known(monkeypatch):
 
     monkeypatch.setattr(cart_posterior, "climb", climb)
     monkeypatch.setattr(cart_posterior, "settle", settle)
-    task = shopping_cart()
-    trial = Trial(task, Knowing(None), SMALL, 3)
-    for _ in range(4):
-        trial.decide()
-    posterior = PiecePosterior(piece_model(task, 0), 0)
+    posterior, handling = four_decisions()
     assert posterior.search() is None
-    posterior.keep(trial.episodes[0].handling(0))
+    posterior.keep(handling)
     posterior.search()
     known = begun[0][2:]
     assert known.shape == (1, begun[0].shape[1])

@@ -10,6 +10,7 @@ from palpate.errors import PalpateError
 from palpate.identification.calibration import histogram, p_values, problem, ranks_of
 
 SIMULATIONS, DRAWS, BINS = 40, 31, 8
+LONG = 63  # draws where R-hat is asked for: of half as many some are above 1.1 by chance
 
 
 def pushed(sigma_factor):
@@ -21,15 +22,13 @@ def pushed(sigma_factor):
 
 def test_the_right_likelihood_passes_and_a_wrong_sigma_fails():
     right, wrong = (
-        ranks_of(pushed(factor), jax.random.key(3), SIMULATIONS, DRAWS) for factor in (1.0, 3.0)
+        ranks_of(pushed(factor), jax.random.key(3), SIMULATIONS, LONG) for factor in (1.0, 3.0)
     )
     assert right.rank.shape == (SIMULATIONS, 3)
-    assert right.size.min() > 2 * DRAWS  # of all draws, of which these are the fifth part
-    # Of ten draws of each chain: by chance a few of 120 are above 1.1, other ones on every machine.
-    assert np.quantile(right.rhat, 0.95) < 1.1
-    assert right.rhat.max() < 1.2
-    assert p_values(right.rank, DRAWS, BINS).min() > 0.01 / 3
-    assert p_values(wrong.rank, DRAWS, BINS).min() < 1e-3
+    assert right.size.min() > 2 * LONG  # of all draws, of which these are the fifth part
+    assert right.rhat.max() < 1.1
+    assert p_values(right.rank, LONG, BINS).min() > 0.01 / 3
+    assert p_values(wrong.rank, LONG, BINS).min() < 1e-3
 
 
 @pytest.mark.slow

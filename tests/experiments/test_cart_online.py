@@ -404,7 +404,7 @@ def test_the_best_scene_is_learnt_from_handling_and_from_other_starts(monkeypatc
     monkeypatch.setattr(cart_trials, "HANDLED", 0.2)
     monkeypatch.setattr(cart_trials, "PRACTISED", 1)
     assert best_scene(task, SMALL, 3) is scene
-    assert seen[:2] == [[3], "searched"]
+    assert seen[:2] == [[3 + cart_trials.TOSSED], "searched"]  # wiggled, and pushed anyhow
     assert seen[4:] == ["searched"]
     _, trial = run(task, Knowing(None), 3, 1)
     assert np.abs(trial.episodes[0].first - seen[2]).max() > 0.1
@@ -425,6 +425,12 @@ def test_regret_is_a_share_of_what_there_is_to_learn():
     assert figures["cart.regret"].value == pytest.approx(0.01, abs=2e-3)
     assert figures["cart.regret"].met is True
     assert figures["cart.regret"].rival == pytest.approx(0.5, abs=0.01)
+    rewards["PBRL"][3] -= 0.2  # in one world; and in another TRUE falls short
+    rewards["TRUE"][1] -= 0.6
+    worst = {one.name: one.value for one in cart_online.figures("cart", rewards)}
+    assert worst["cart.regret"] < 0.05
+    assert worst["cart.regret_worst_world"] == pytest.approx(0.22 / 1.88, abs=5e-3)
+    rewards = earned(5, 200)
     assert figures["cart.regret.doing_nothing"].value == pytest.approx(0.5, abs=0.01)
     assert cart_online.regret(rewards, "random", slice(None)).mean() == pytest.approx(1.0)
     assert cart_online.regret(rewards, "TRUE", slice(None)).tolist() == [0.0] * 5

@@ -63,13 +63,23 @@ def test_the_same_configuration_resumes_however_it_was_written(tmp_path):
     ],
 )
 def test_another_configuration_is_refused_by_its_keys(tmp_path, asked, message):
-    Run.open(tmp_path, CONFIGURATION).close()
+    with Run.open(tmp_path, CONFIGURATION) as run:
+        run.log(1, loss=1.0)
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
     with pytest.raises(PalpateError, match=message) as caught:
         Run.open(tmp_path, asked)
     assert str(caught.value).endswith("give another --out, or --fresh to start over")
     assert all(file.read_bytes() == content for file, content in before.items())
     Run.open(tmp_path, CONFIGURATION).close()  # the refusal let go of the lock
+
+
+def test_a_run_that_came_to_nothing_keeps_no_other_out(tmp_path):
+    Run.open(tmp_path, CONFIGURATION).close()
+    Run.open(tmp_path, {"seed": 7}).close()
+    assert read_json(tmp_path / "configuration.json") == {"seed": 7}
+    (tmp_path / "plan.json").write_text("{}")  # a product
+    with pytest.raises(PalpateError, match="another configuration"):
+        Run.open(tmp_path, CONFIGURATION)
 
 
 def test_fresh_removes_what_a_run_wrote_and_nothing_else(tmp_path):

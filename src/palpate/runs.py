@@ -81,7 +81,8 @@ class Run:
 
         `configuration` is everything the outcome depends on, the seed included; what `plain`
         accepts. `command` is kept for the reader, by default the one this process was started
-        with. `fresh` first removes what an earlier run wrote, and nothing else.
+        with. `fresh` first removes what an earlier run wrote, and nothing else. A run that ended
+        before it wrote anything does not keep another configuration out.
 
         Raises `PalpateError` when the folder holds a run of another configuration (naming the
         keys that differ), when another process works in it, or when it cannot be used.
@@ -103,7 +104,7 @@ class Run:
         lock = _locked(path)
         try:
             _remove_unfinished_writes(path)
-            if fresh and _is_run(path):
+            if _is_run(path) and (fresh or _came_to_nothing(path, asked)):
                 _remove_run(path)
             if _is_run(path):
                 _check_same(path, asked)
@@ -266,6 +267,12 @@ def read_metrics(path: str | Path) -> list[dict[str, Any]]:
 
 def _is_run(path: Path) -> bool:
     return (path / CONFIGURATION).exists() and (path / ENVIRONMENT).exists()
+
+
+def _came_to_nothing(path: Path, configuration: dict[str, Any]) -> bool:
+    """Whether a run of another configuration began in the folder, and nothing has come of it."""
+    wrote = {one.name for one in path.iterdir()} - {CONFIGURATION, ENVIRONMENT, _LOCK}
+    return not wrote and bool(_differences(read_json(path / CONFIGURATION), configuration))
 
 
 def _checkpoints(path: Path) -> list[tuple[int, Path]]:

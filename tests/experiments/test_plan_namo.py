@@ -1,6 +1,7 @@
 """`palpate plan namo`: what is written and said."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -62,11 +63,26 @@ def test_what_stands_beside_a_map_decides_whether_a_plan_is_another(tmp_path):
         run(PlanNamo(map=tmp_path / "room.yaml", out=tmp_path / "out"))
 
 
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"goal": (50.0, 50.0, 0.0)}, "would not be inside"),
+        ({"goal": (math.nan, 1.0, 0.0)}, "the goal"),
+        ({"immovable": ("door",)}, "no movable 'door'"),
+        ({"immovable": ("a",)}, "no way to the goal"),
+    ],
+)
+def test_what_was_refused_can_be_asked_again_in_the_same_folder(tmp_path, map_file, wrong, says):
+    with pytest.raises(PalpateError, match=says):
+        run(PlanNamo(map=map_file, out=tmp_path / "out", **wrong))
+    assert read_plan(run(PlanNamo(map=map_file, out=tmp_path / "out"))).transfers == 1
+
+
 def test_another_goal_and_fixed_objects_are_heard(tmp_path, map_file):
     path = run(PlanNamo(map=map_file, out=tmp_path / "near", goal=(2.0, 2.0, 0.5)))
     assert json.loads(path.read_text())["goal"] == [2.0, 2.0, 0.5]
     assert read_plan(path).transfers == 0
-    with pytest.raises(PalpateError, match="walls alone"):
+    with pytest.raises(PalpateError, match="walls and what may not be moved"):
         run(PlanNamo(map=map_file, out=tmp_path / "fixed", immovable=("a",)))
     with pytest.raises(PalpateError, match="no file"):
         run(PlanNamo(map=tmp_path / "absent.svg", out=tmp_path / "none"))

@@ -22,6 +22,7 @@ from palpate.planning.movable_obstacles.openings import CARRYING, HANDLING, TURN
 from palpate.planning.movable_obstacles.paths import distances
 from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, Segment, read_plan, write_plan
 from palpate.planning.movable_obstacles.planner import NoWayError, Planner
+from palpate.planning.movable_obstacles.regions import regions_of
 from palpate.planning.movable_obstacles.tree_search import Settings
 from palpate.planning.movable_obstacles.verification import faults_of
 
@@ -200,10 +201,28 @@ def test_the_nearer_of_two_doors_is_taken_unless_its_object_may_not_be_moved():
     assert planned(world).moved == ["near"]
     plan = Planner().plan(world, immovable=["near"])
     assert plan.moved == ["far"]
-    with pytest.raises(NoWayError, match="walls alone"):
+    with pytest.raises(NoWayError, match=r"walls and what .* \('near', 'far'\) close"):
         Planner().plan(world, immovable=["near", "far"])
     with pytest.raises(PalpateError, match="no movable 'door'"):
         Planner().plan(world, immovable=["door"])
+
+
+def test_a_door_that_the_cells_miss_is_found_in_smaller_ones():
+    boxes = {"a": (3.7, 1.3, 4.5, 1.7)}
+    door = 1.16, 1.84  # 8 cm more than the robot and its margins
+    world = dataclasses.replace(two_rooms(boxes, doors=(door,)), cell_size=0.1, margin=0.1)
+    assert regions_of(Space(dataclasses.replace(world, movables={}))).free == 2
+    plan = Planner().plan(world)
+    assert plan.moved == ["a"]
+    assert not faults_of(plan, world)
+
+
+def test_who_only_pushes_moves_things_straight_ahead_and_nothing_else():
+    world = two_rooms({"a": IN_DOOR})
+    pusher = dataclasses.replace(world, robot=dataclasses.replace(world.robot, push_only=True))
+    plan = planned(pusher)
+    assert plan.moved == ["a"]
+    assert {name for one in plan.segments for name in one.primitives} == {"push"}
 
 
 def test_mirrored_maps_cost_the_same():
@@ -230,7 +249,7 @@ def test_the_same_seed_gives_the_same_plan(drive):
 
 
 def test_why_there_is_no_way_is_said():
-    with pytest.raises(NoWayError, match="walls alone close"):
+    with pytest.raises(NoWayError, match="walls close the robot's"):
         Planner().plan(two_rooms({}, doors=()))
     with pytest.raises(NoWayError, match=r"no grasp and motion .* past 'a'"):
         Planner().plan(

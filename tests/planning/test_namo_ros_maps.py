@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from PIL import Image
 
 from namo_grids import AGENT, BESIDE, CORNERS, LAYERS, SQUARE, namosim_map, room, ros_map
 from palpate.errors import PalpateError
@@ -48,6 +49,35 @@ def test_thresholds_negation_and_modes(tmp_path):
     raw = np.where(room() == 0, 100, 0).astype(np.uint8)
     raw[5, 5] = 255  # unknown
     assert read_map(ros_map(tmp_path, raw, mode="raw")).walls.area == pytest.approx(area + 0.01)
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+@pytest.mark.parametrize("palette", [False, True])
+def test_what_is_transparent_is_not_known_to_be_free(tmp_path, mode, palette):
+    white = np.zeros if mode == "raw" else lambda shape, dtype: np.full(shape, 255, dtype)
+    pixels = white((20, 40, 4), np.uint8)
+    pixels[..., 3] = 255
+    pixels[2:4, 2:5, 3] = 0
+    path = ros_map(tmp_path, pixels, ".png", mode=mode)
+    if palette:
+        indices = np.where(pixels[..., 3] == 0, 0, 1).astype(np.uint8)
+        picture = Image.fromarray(indices, "P")
+        picture.putpalette([*pixels[0, 0, :3].tolist()] * 2)
+        picture.save(path.with_suffix(".png"), transparency=0)
+    assert read_map(path).walls.bounds == pytest.approx((0.2, 1.6, 0.5, 1.8))
+
+
+@pytest.mark.parametrize("key", ["occupied_thresh", "free_thresh"])
+@pytest.mark.parametrize("value", [65, -0.1, 19.6])
+def test_thresholds_in_per_cent_are_refused(tmp_path, key, value):
+    with pytest.raises(PalpateError, match=f"the {key} .*expected a share, 0 to 1"):
+        read_map(ros_map(tmp_path, room(), **{key: value}))
+
+
+def test_suffixes_may_be_in_capitals(tmp_path):
+    path = ros_map(tmp_path, room())
+    (tmp_path / "place.movables.json").rename(tmp_path / "PLACE.movables.json")
+    assert read_map(path.rename(tmp_path / "PLACE.YAML")).name == "PLACE"
 
 
 def test_colours_are_averaged_and_sixteen_bits_understood(tmp_path):
@@ -231,6 +261,35 @@ def test_other_agents_and_drawn_walls_stand_in_the_way(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("keys", "margin"),
+    [
+        ({"collision_margin_cm": 20}, 0.2),
+        ({"collision_margin_cm": 0}, 0.1),  # namosim takes 0 as not given
+        ({"collision_margin_cm": None}, 0.1),
+        ({"collision_margin": 0.25}, 0.25),
+        ({}, 0.1),
+    ],
+)
+def test_the_margin_is_the_files_or_a_cell(tmp_path, keys, margin):
+    assert read_map(namosim_map(tmp_path, **keys)).margin == pytest.approx(margin)
+
+
+def test_an_agent_may_be_drawn_instead_of_having_a_pose(tmp_path):
+    drawn = f'<path id="r" agent_id="a" angle="90" d="{SQUARE.format(8, 8)}"/>'
+    other = f'<path id="q" agent_id="b" d="{SQUARE.format(2, 2)}"/>'
+    layers = f'{LAYERS}<g id="robots_layer">{other}{drawn}</g>'
+    world = read_map(namosim_map(tmp_path, layers, agents=[{"id": "a", "radius": 0.2}]))
+    assert world.start == pytest.approx((0.0, 3.0, math.pi / 2))
+
+
+@pytest.mark.parametrize("where", [{}, {"behavior": {"parameters": {"push_only": True}}}])
+def test_an_agent_may_only_push(tmp_path, where):
+    agent = AGENT | (where or {"push_only": True})
+    assert read_map(namosim_map(tmp_path, agents=[agent])).robot.push_only
+    assert not read_map(namosim_map(tmp_path)).robot.push_only
+
+
+@pytest.mark.parametrize(
     ("keys", "says"),
     [
         ({"agents": [AGENT | {"initial_pose": 3}]}, "initial_pose 3: expected"),
@@ -239,8 +298,11 @@ def test_other_agents_and_drawn_walls_stand_in_the_way(tmp_path):
         ({"agents": [AGENT | {"initial_pose": [1, 1e30]}]}, "initial_pose"),
         ({"agents": [AGENT | {"behavior": "stilman"}]}, "behavior .* is 'stilman'"),
         ({"agents": [AGENT | {"behavior": {"parameters": 3}}]}, "parameters .* is 3"),
-        ({"agents": [{"id": "a", "radius": 1}]}, "without id, initial_pose"),
-        ({"agents": [AGENT, 3]}, "without id, initial_pose"),
+        ({"agents": [{"id": "a", "radius": 1}]}, "'a' without an initial_pose: .* robots_layer"),
+        ({"agents": [{"id": "a", "initial_pose": [0, 3]}]}, "an agent without radius"),
+        ({"agents": [AGENT, 3]}, "an agent in .* is 3"),
+        ({"agents": [AGENT | {"push_only": "maybe"}]}, "push_only .* is 'maybe'"),
+        ({"collision_margin_cm": "oops"}, "collision_margin_cm .* is 'oops'"),
         ({"agents": {}}, "no agents"),
         ({"layers": LAYERS.replace("agent_id", 'angle="90deg" agent_id')}, "angle .* '90deg'"),
         ({"layers": LAYERS.replace("<path", "<rect")}, "Object to Path"),

@@ -57,6 +57,33 @@ def test_margin_drive_and_angle_are_read(tmp_path):
     assert world.goals[0][2] == pytest.approx(math.pi / 2)
 
 
+def test_a_margin_of_nothing_is_a_cell_as_namosim_takes_it(tmp_path):
+    assert read_svg(drawing(tmp_path, extra=' collision_margin_cm="0"')).margin == 0.1
+
+
+@pytest.mark.parametrize(("said", "only"), [("true", True), ("1", True), ("False", False)])
+def test_who_only_pushes_is_read(tmp_path, said, only):
+    assert read_svg(drawing(tmp_path, drive=f'push_only="{said}"')).robot.push_only is only
+    with pytest.raises(PalpateError, match=r"push_only .* 'perhaps'"):
+        read_svg(drawing(tmp_path, drive='push_only="perhaps"'))
+
+
+def test_a_layer_is_known_by_its_label_too(tmp_path):
+    layer = '<g id="layer3" label="movables_layer"><path id="box"'
+    body = BODY.replace('<path id="box" type="movable"', layer)
+    world = read_svg(drawing(tmp_path, body.replace('H 280 Z"/>', 'H 280 Z"/></g>')))
+    assert list(world.movables) == ["box"]
+
+
+def test_what_the_configuration_names_is_to_be_a_path(tmp_path):
+    body = BODY.replace(
+        '<path id="robot_0" type="shape" d="M 80 80 h 40 v 40 h -40 z"/>',
+        '<circle id="robot_0" r="20"/>',
+    )
+    with pytest.raises(PalpateError, match=r"circle 'robot_0' .* make it a path"):
+        read_svg(drawing(tmp_path, body))
+
+
 def test_prefixed_paths_groups_and_transforms_are_understood(tmp_path):
     body = BODY.replace("<path", "<svg:path")
     moved = f'<g transform="translate(100, 20)"><g transform="scale(0.5)">{body}</g></g>'
@@ -136,6 +163,19 @@ def test_an_arc_has_twelve_chords_for_every_quarter_of_a_circle(end, flags, degr
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 10, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("compact", "apart"),
+    [
+        ("A 5 5 0 01-20 20", "A 5 5 0 0 1 -20 20"),
+        ("A5,5,0,0120,20 5 5 0 1010-10", "A 5 5 0 0 1 20 20 5 5 0 1 0 10 -10"),
+        ("a 5 5 0 0,1.5 7 5 5 0 1.0 0 1 1", "a 5 5 0 0 1 .5 7 5 5 0 1 0 1 1"),
+    ],
+)
+def test_flags_of_arcs_may_stand_without_spaces(compact, apart):
+    (points,), (expected,) = (path_outlines(f"M 10 0 {d}", "it") for d in (compact, apart))
+    assert points == pytest.approx(expected)
+
+
 def test_a_small_arc_far_from_the_origin_is_drawn():
     (points,) = path_outlines("M 100000 0 a 0.2 0.2 0 0 1 0.4 0 z", "it")
     assert len(points) == 25
@@ -171,7 +211,7 @@ def test_entities_are_refused(tmp_path, head):
         (('type="movable"', 'type="movable" transform="spin(3)"'), "transform"),
         (('type="movable"', 'type="movable" transform="matrix(1 2)"'), "transform"),
         (("M 280 60 L 340 60 340 140 H 280 Z", "M 280 60 L 1e999 60 340 140 Z"), "number that"),
-        (("M 280 60 L 340 60 340 140 H 280 Z", "M 280 60 A 9 9 0 0110 340 60 9 Z"), "flags"),
+        (("M 280 60 L 340 60 340 140 H 280 Z", "M 280 60 A 9 9 0 2 0 340 60 Z"), "flags"),
         (('type="movable"', 'type="movable" transform="scale(nan)"'), "transform"),
         (('type="movable"', 'type="movable" transform="scale(1e8) scale(1e8)"'), "transform"),
         (('type="movable"', 'type="movable" transform="rotate(inf)"'), "transform"),
@@ -266,6 +306,21 @@ def test_outlines_too_many_are_refused(tmp_path, old, new, says):
     assert old in BODY
     with pytest.raises(PalpateError, match=says):
         read_svg(drawing(tmp_path, BODY.replace(old, new)))
+
+
+@pytest.mark.parametrize(
+    ("d", "degrees"),
+    [
+        ("M 103 92 V 40", 90),  # beside the middle, as namosim's own are
+        ("M 100 100 H 150 L 140 95 H 150 z", 0),
+        ("M 100 100 h 0 v 10", -90),
+    ],
+)
+def test_a_direction_is_that_of_its_first_line(tmp_path, d, degrees):
+    arrow = f'<path id="way" type="orientation" d="{d}"/></g>'
+    body = BODY.replace('<path id="robot_0"', '<g id="robot_0"><path id="shape"', 1)
+    body = body.replace('v 40 h -40 z"/>', f'v 40 h -40 z"/>{arrow}', 1)
+    assert read_svg(drawing(tmp_path, body)).start[2] == pytest.approx(math.radians(degrees))
 
 
 def test_a_direction_has_one_outline(tmp_path):

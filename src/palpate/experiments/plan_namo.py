@@ -25,6 +25,8 @@ def run(options: PlanNamo) -> Path:
     plan was found: the sentence says what keeps closed.
     """
     world = read_map(options.map)
+    world.check(options.goal)
+    world.check_names(options.immovable)
     configuration = folders.told(options, "plan namo")
     # A map may lie in several files; what was read from them decides.
     objects = [(name, movable.pose) for name, movable in world.movables.items()]

@@ -143,9 +143,12 @@ def scene_animation(
         figure, axes = _scene(world, dots=100)
         canvas = FigureCanvasAgg(figure)
         _draw_walls(axes, world)
-        axes.plot(*goal[:2], marker="*", ms=11, color=_ROBOT, mec=_INK, mew=0.6, ls="", zorder=9)
+        canvas.draw()  # with its layout, once: the rest is drawn over it
+        figure.set_layout_engine("none")
+        background = canvas.copy_from_bbox(figure.bbox)
+        star = {"marker": "*", "ms": 11, "color": _ROBOT, "mec": _INK, "mew": 0.6, "ls": ""}
         for index, robot in enumerate(robots):
-            drawn: list[Any] = []
+            drawn: list[Any] = axes.plot(*goal[:2], zorder=9, **star)
             drawn += axes.plot(*robots[: index + 1, :2].T, color=_ROBOT, lw=1.0, zorder=5)
             for name, movable in world.movables.items():
                 pose = np.asarray(objects[index].get(name, movable.pose))
@@ -156,11 +159,14 @@ def scene_animation(
                     x, y = float(pose[0]), float(pose[1])
                     drawn.append(axes.text(x, y, text, ha="center", va="center", zorder=8))
             drawn += _draw_robot(axes, world, robot)
-            canvas.draw()
-            picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-            pictures.append(picture.quantize(64, dither=Image.Dither.NONE))
-            for artist in drawn:
+            canvas.restore_region(background)
+            for artist in sorted(drawn, key=lambda one: one.get_zorder()):
+                axes.draw_artist(artist)
                 artist.remove()
+            picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+            pictures.append(
+                picture.quantize(64, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+            )
     buffer = io.BytesIO()
     milliseconds = [round(1000 * period)] * (len(pictures) - 1) + [1500]
     pictures[0].save(

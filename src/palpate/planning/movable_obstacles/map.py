@@ -6,7 +6,7 @@ so nothing goes there.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -86,13 +86,15 @@ class Robot:
 
     `radius` in m. `drive` is "differential" (drives where it looks, turns in place) or
     "holonomic". It holds an object with `reach` m between the disc and the face it holds; None
-    is the map's margin. `outline` is for pictures.
+    is the map's margin. With `push_only` it cannot hold on: it moves objects before it, straight
+    ahead. `outline` is for pictures.
     """
 
     radius: float
     drive: str = "differential"
     reach: float | None = None
     outline: np.ndarray | None = field(default=None, repr=False)
+    push_only: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.radius) and 0 < self.radius < 1e3):
@@ -188,12 +190,7 @@ class Map:
 
         Raises `PalpateError` for a name that is not on the map.
         """
-        unknown = sorted(set(poses) - set(self.movables))
-        if unknown:
-            raise PalpateError(
-                f"map {shown(self.name)} has no movable {shown(unknown[0])}; there are: "
-                + listed(self.movables)
-            )
+        self.check_names(poses)
         movables = {
             name: movable.moved(poses[name]) if name in poses else movable
             for name, movable in self.movables.items()
@@ -202,6 +199,24 @@ class Map:
         if "wall_edges" in self.__dict__:  # walls stay where they are
             changed.__dict__["wall_edges"] = self.wall_edges
         return changed
+
+    def check_names(self, names: Iterable[str]) -> None:
+        """Raises `PalpateError` for a name that is not on the map."""
+        unknown = sorted(set(names) - set(self.movables))
+        if unknown:
+            raise PalpateError(
+                f"map {shown(self.name)} has no movable {shown(unknown[0])}; there are: "
+                + listed(self.movables)
+            )
+
+    @property
+    def finer(self) -> "Map | None":
+        """The same in cells of half the size; None where there would be too many or too small."""
+        left, bottom, right, top = self.bounds
+        cells = (right - left) * (top - bottom) / (self.cell_size / 2) ** 2
+        if cells > MOST_CELLS or self.cell_size / 2 < LEAST_CELL:
+            return None
+        return dataclasses.replace(self, cell_size=self.cell_size / 2)
 
     def check(self, goal: Pose | None = None) -> Pose:
         """The goal pose to plan to, after a look at whether it and the start are possible at all.

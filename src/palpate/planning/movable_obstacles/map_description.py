@@ -8,7 +8,8 @@ occupancy grid cannot say. Every other key than these is refused:
     beside a grid       robot, start; maybe movables, goals, margin, cell_size
     beside a drawing    movables, and of them only hints: {name: {hints: {...}}}
 
-    robot:     {radius} or {footprint: [[x, y], ...]}; maybe drive, reach
+    robot:     {radius} or {footprint: [[x, y], ...]}; maybe drive, reach,
+               push_only
     movables:  {name: [[x, y], ...]} or {name: {polygon: [[x, y], ...]}}, maybe with pose, hints
     start, each of goals, pose:  [x, y, theta]
     bounds:    [left, bottom, right, top]
@@ -51,6 +52,7 @@ _DEEPEST = 50  # collections in collections
 GRID_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin"}
 _MAP_KEYS = GRID_KEYS | {"bounds", "walls", "format", "name"}
 _DRAWING_KEYS = {"movables"}
+_ROBOT_KEYS = {"radius", "footprint", "drive", "reach", "push_only"}
 _CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
 
 
@@ -94,6 +96,8 @@ def write_map(path: str | Path, world: Map) -> None:
     robot: dict[str, Any] = {"radius": world.robot.radius, "drive": world.robot.drive}
     if world.robot.reach is not None:
         robot["reach"] = world.robot.reach
+    if world.robot.push_only:
+        robot["push_only"] = True
     walls = [
         {
             "outline": np.asarray(part.exterior.coords)[:-1],
@@ -220,7 +224,9 @@ def checked_keys(content: Any, what: str, known: set[str]) -> dict[str, Any]:
 
 def robot_from(content: Any, what: str) -> Robot:
     """The robot that `content` describes; see the head of this file."""
-    item = checked_keys(content, f"robot of {what}", {"radius", "footprint", "drive", "reach"})
+    item = checked_keys(
+        content, f"robot of {what}", {"radius", "footprint", "drive", "reach", "push_only"}
+    )
     if ("radius" in item) == ("footprint" in item):
         raise PalpateError(f"robot of {what}: expected either a radius or a footprint")
     outline = None
@@ -230,7 +236,10 @@ def robot_from(content: Any, what: str) -> Robot:
     else:
         radius = number(item["radius"], f"the robot's radius in {what}")
     reach = None if item.get("reach") is None else number(item["reach"], f"reach in {what}")
-    return Robot(radius, str(item.get("drive", "differential")), reach, outline)
+    push_only = item.get("push_only", False)
+    if not isinstance(push_only, bool):
+        raise PalpateError(f"push_only in {what} is {shown(push_only)}: expected true or false")
+    return Robot(radius, str(item.get("drive", "differential")), reach, outline, push_only)
 
 
 def movables_from(content: Any, what: str) -> list[Movable]:

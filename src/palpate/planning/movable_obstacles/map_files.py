@@ -10,7 +10,8 @@ from palpate.planning.movable_obstacles.map_description import (
     read_yaml,
     with_hints,
 )
-from palpate.planning.movable_obstacles.map_ros import read_ros
+from palpate.planning.movable_obstacles.map_namosim import read_namosim
+from palpate.planning.movable_obstacles.map_ros import described, read_ros
 from palpate.planning.movable_obstacles.map_svg import read_svg
 
 SUFFIXES = (".svg", ".yaml", ".yml", ".json")
@@ -27,11 +28,12 @@ def read_map(path: str | Path) -> Map:
         raise PalpateError(f"{path} is a folder: expected a map, {_expected()}")
     if not path.exists():
         raise PalpateError(f"there is no file {path}")
-    if path.suffix == ".svg":
+    suffix = path.suffix.lower()
+    if suffix == ".svg":
         return with_hints(read_svg(path), path)
-    if path.suffix in (".yaml", ".yml"):
-        return read_ros(path)
-    if path.suffix == ".json":
+    if suffix in (".yaml", ".yml"):
+        return read_namosim(path) if "map_yaml" in described(path) else read_ros(path)
+    if suffix == ".json":
         return read_described(path)
     raise PalpateError(f"{path} has the suffix '{path.suffix}': expected {_expected()}")
 
@@ -49,11 +51,11 @@ def maps_in(folder: str | Path) -> list[Path]:
     found = [
         path
         for path in sorted(folder.rglob("*"))
-        if path.suffix in SUFFIXES and not path.stem.endswith(SIDE_CAR) and path.is_file()
+        if path.suffix.lower() in SUFFIXES and not path.stem.endswith(SIDE_CAR) and path.is_file()
     ]
     parts: set[Path] = set()
     for path in found:
-        if path.suffix in (".yaml", ".yml"):
+        if path.suffix.lower() in (".yaml", ".yml"):
             try:
                 content = read_yaml(path)
             except PalpateError:

@@ -2,12 +2,10 @@
 
 p = (255 - v) / 255 is how occupied a pixel is, p = v / 255 where `negate` is set; above
 `occupied_thresh` it is a wall, below `free_thresh` it is free, and what lies between is unknown: as
-a wall to a planner. The origin is the lower left corner; its yaw has to be 0. Robot, objects, start
-and goals come from a side-car file (`map_description`), or from namosim's `namo.yaml` and the
-layers of the drawing it names, which lies on the picture pixel by pixel.
+a wall to a planner, as is what a picture leaves transparent. The origin is the lower left corner;
+its yaw has to be 0. Robot, objects, start and goals come from a side-car file (`map_description`).
 """
 
-import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,8 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.geometry import checked_pose, shown
-from palpate.planning.movable_obstacles.map import MOST_CELLS, Map, Pose, Robot, map_of
+from palpate.planning.movable_obstacles.geometry import shown
+from palpate.planning.movable_obstacles.map import MOST_CELLS, Map, map_of
 from palpate.planning.movable_obstacles.map_description import (
     GRID_KEYS,
     goals_from,
@@ -27,35 +25,25 @@ from palpate.planning.movable_obstacles.map_description import (
     read_yaml,
     robot_from,
     side_car,
-    with_hints,
-)
-from palpate.planning.movable_obstacles.map_svg import (
-    drawn_walls,
-    goals_of,
-    movables_of,
-    read_drawing,
 )
 
 MODES = ("trinary", "scale", "raw")
 _BROKEN = (OSError, ValueError, SyntaxError)  # what Pillow raises for the middle of a picture
 _THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.25}
+_OPAQUE = 255
 _TRUTHS = {"yes": True, "on": True, "true": True, "no": False, "off": False, "false": False}
 _LEAST_YAW = 1e-3  # rad: less turns a map of 10 m by a centimetre
 Bounds = tuple[float, float, float, float]
 
 
 def read_ros(path: str | Path) -> Map:
-    """A map_server YAML or a namosim `namo.yaml` as a map.
+    """A map_server YAML as a map.
 
     Raises `PalpateError` for keys that are missing, a picture that cannot be read, and a map that
     nothing says the robot of.
     """
     path = Path(path)
-    content = read_yaml(path)
-    if not isinstance(content, dict):
-        raise PalpateError(f"{path} is no map: expected keys and values")
-    if "map_yaml" in content:
-        return _namosim(path, content)
+    content = described(path)
     walls, bounds, resolution = read_grid(path, content)
     beside = side_car(path, GRID_KEYS)
     for key in ("robot", "start"):
@@ -76,6 +64,14 @@ def read_ros(path: str | Path) -> Map:
         cell_size=number(beside.get("cell_size", resolution), f"cell_size of {path}"),
         margin=None if margin is None else number(margin, f"margin of {path}"),
     )
+
+
+def described(path: Path) -> dict[str, Any]:
+    """The keys and values of a YAML; raises `PalpateError` for a file that holds none."""
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise PalpateError(f"{path} is no map: expected keys and values")
+    return content
 
 
 def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds, float]:
@@ -101,24 +97,27 @@ def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds
     mode = content.get("mode", "trinary")
     if mode not in MODES:
         raise PalpateError(f"{path} has the mode {shown(mode)}: expected one of {', '.join(MODES)}")
-    negate = _truth(content.get("negate", 0), f"negate of {path}")
+    negate = truth(content.get("negate", 0), f"negate of {path}")
     occupied, free = (
         number(content.get(key, default), f"{key} of {path}")
         for key, default in _THRESHOLDS.items()
     )
-    value = _picture(path.parent / str(content["image"]))
+    for key, share in zip(_THRESHOLDS, (occupied, free), strict=True):
+        if not 0 <= share <= 1:  # in per cent every wall would be free
+            raise PalpateError(f"{path} has the {key} {share:g}: expected a share, 0 to 1")
+    value, opaque = _picture(path.parent / str(content["image"]))
     if mode == "raw":
         share = value / 100  # 0 to 100, and 255 for unknown
-        blocked = (share > free) | (share >= occupied)
+        blocked = (share > free) | (share >= occupied) | ~opaque
     else:
         share = value / 255 if negate else (255 - value) / 255
-        blocked = (share >= occupied) | ~(share < free)
+        blocked = (share >= occupied) | ~(share < free) | ~opaque
     height, width = blocked.shape
     bounds = (left, bottom, left + width * resolution, bottom + height * resolution)
     return walls_of(blocked[::-1], left, bottom, resolution), bounds, resolution
 
 
-def _truth(value: Any, what: str) -> bool:
+def truth(value: Any, what: str) -> bool:
     """0, 1, true or false; also the words that are truths in YAML 1.1 and strings in YAML 1.2."""
     if isinstance(value, str) and value.lower() in _TRUTHS:
         return _TRUTHS[value.lower()]
@@ -148,8 +147,8 @@ def walls_of(blocked: np.ndarray, left: float, bottom: float, resolution: float)
     return shapely.union_all(boxes)
 
 
-def _picture(path: Path) -> np.ndarray:
-    """Grey values (rows from the top, columns), 0 to 255, colours averaged."""
+def _picture(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Grey values (rows from the top, columns), 0 to 255, colours averaged, and what is opaque."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -163,6 +162,9 @@ def _picture(path: Path) -> np.ndarray:
                     f"{path} has {width} x {height} pixels: expected at most {MOST_CELLS:,}"
                 )
             deep = picture.mode.startswith("I")
+            opaque = np.ones((height, width), bool)
+            if picture.has_transparency_data:
+                opaque = np.asarray(picture.convert("RGBA"))[..., 3] == _OPAQUE
             values = np.asarray(picture if deep or picture.mode == "L" else picture.convert("RGB"))
     except PalpateError:
         raise
@@ -173,63 +175,4 @@ def _picture(path: Path) -> np.ndarray:
     values = values.astype(float)
     if values.ndim == 3:
         values = values.mean(axis=2)
-    return values / 257 if deep else values
-
-
-def _namosim(path: Path, content: dict[str, Any]) -> Map:
-    """namosim's own YAML: a map, a drawing over it in pixels, agents; the first is the robot."""
-    grid = path.parent / str(content["map_yaml"])
-    described = read_yaml(grid)
-    if not isinstance(described, dict):
-        raise PalpateError(f"{grid} is no map: expected keys and values")
-    walls, bounds, resolution = read_grid(grid, described)
-    agents = content.get("agents")
-    if not isinstance(agents, list) or not agents:
-        raise PalpateError(f"{path} has no agents: expected one with an id and a radius")
-    (robot, start), *others = (_agent(agent, str(path)) for agent in agents)
-    besides = [shapely.Point(pose[:2]).buffer(other.radius) for other, pose in others]
-    movables, goals = [], []
-    if "svg_file" in content:
-        corner = bounds[0], bounds[3]
-        drawing = read_drawing(path.parent / str(content["svg_file"]), resolution, corner)
-        movables, goals = movables_of(drawing), goals_of(drawing, str(agents[0]["id"]))
-        besides = [*besides, *drawn_walls(drawing)]
-    margin = content.get("collision_margin")
-    world = map_of(
-        grid.stem,
-        walls=shapely.union_all([walls, *besides]) if besides else walls,
-        movables=movables,
-        robot=robot,
-        start=start,
-        goals=goals,
-        bounds=bounds,
-        cell_size=resolution,
-        margin=None if margin is None else number(margin, f"collision_margin in {path}"),
-    )
-    return with_hints(world, path)
-
-
-def _agent(content: Any, what: str) -> tuple[Robot, Pose]:
-    """An agent of namosim's YAML, and where it stands; its angles are degrees."""
-    if not isinstance(content, dict) or not {"id", "initial_pose", "radius"} <= content.keys():
-        raise PalpateError(f"{what} has an agent without id, initial_pose and radius")
-    behaviour = _keys(content.get("behavior"), f"behavior in {what}")
-    parameters = _keys(behaviour.get("parameters"), f"parameters of the behavior in {what}")
-    drive = parameters.get("drive_type", "differential")
-    pose = content["initial_pose"]
-    if not isinstance(pose, list) or len(pose) not in (2, 3):
-        raise PalpateError(
-            f"{what} has the initial_pose {shown(pose)}: expected [x, y, angle] in m and degrees"
-        )
-    x, y, *degrees = (number(value, f"initial_pose in {what}") for value in pose)
-    theta = math.radians(degrees[0]) if degrees else 0.0
-    robot = Robot(number(content["radius"], f"radius in {what}"), str(drive))
-    return robot, checked_pose((x, y, theta), f"initial_pose in {what}")
-
-
-def _keys(content: Any, what: str) -> dict[str, Any]:
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise PalpateError(f"{what} is {shown(content)}: expected keys and values")
-    return content
+    return values / 257 if deep else values, opaque

@@ -36,7 +36,9 @@ _DIRECTIONS = {"orientation", "direction"}
 _TYPES = {"wall", "movable", "shape"} | _DIRECTIONS
 _DRAWN = {"path", "rect", "polygon", "circle", "ellipse", "polyline", "line", "use"}
 _NEVER_DRAWN = {"defs", "clipPath", "mask", "symbol", "marker", "pattern", "metadata"}
+_TRUTHS = {"true": True, "1": True, "false": False, "0": False}
 _DEEPEST = 60
+_LEAST_ARROW = 1e-9  # m
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class _Drawn:
 
 
 @dataclass
-class _Drawing:
+class Drawing:
     size: tuple[float, float]
     paths: list[_Drawn] = field(default_factory=list)
     config: Any = None
@@ -93,17 +95,14 @@ class _Drawing:
         shape = shapes[0]
         if "angle" in shape.attributes:
             return shape, _angle(shape)
-        for path in inside:
-            if path.type in _DIRECTIONS:
-                arrow = path.points - shape.points.mean(axis=0)
-                x, y = arrow[np.argmax(np.linalg.norm(arrow, axis=1))]
-                return shape, math.atan2(y, x)
-        return shape, 0.0
+        arrows = (path for path in inside if path.type in _DIRECTIONS)
+        arrow = next(arrows, None)
+        return shape, 0.0 if arrow is None else _direction(arrow)
 
 
 @dataclass(frozen=True)
 class _Meant:
-    """What says by a type or a layer that it is part of the map.
+    """What says by a type, a layer or its name in the namo_config that it is part of the map.
 
     `holders` are such elements and layers and all that they are in; `ids` are of them, and of all
     that is in a layer.
@@ -117,11 +116,16 @@ class _Meant:
         parents = {child: one for one in root.iter() for child in one}
         holders: set[Any] = set()
         inside: set[Any] = set()
+        named = {one.get(key) for one in root.iter() for key in ("agent_id", "goal_id")} - {
+            None,
+            "",
+        }
         for element in root.iter():
-            layer = element.get("id") in _LAYERS
+            layer = bool(_layers(element))
             if layer and element not in inside:
                 inside.update(element.iter())
-            one = element if layer or element.get("type") in _TYPES else None
+            typed = element.get("type") in _TYPES or element.get("id") in named
+            one = element if layer or typed else None
             while one is not None and one not in holders:
                 holders.add(one)
                 one = parents.get(one)
@@ -140,8 +144,9 @@ class _Meant:
             refused = refused or source.removeprefix("#") in self.ids
         if refused:
             raise PalpateError(
-                f"{called} says by its type or layer that it is part of the map, and only paths "
-                "in groups are read: make it a path, in Inkscape with 'Object to Path'"
+                f"{called} says by its type or layer, or is said by the namo_config, to be part of "
+                "the map, and only paths in groups are read: make it a path, in Inkscape with "
+                "'Object to Path'"
             )
 
 
@@ -168,7 +173,10 @@ def read_svg(path: str | Path) -> Map:
     shape, heading = drawing.of(agent.get("agent_id"), "agent")
     outline, (x, y) = centred(checked_polygon(shape.points, f"agent {shown(shape.name)}"))
     parameters = [element for element in agent.iter() if _local(element.tag) == "parameters"]
-    drive = parameters[0].get("drive_type", "differential") if parameters else "differential"
+    said = parameters[0].attrib if parameters else {}
+    push_only = said.get("push_only", "false").strip().lower()
+    if push_only not in _TRUTHS:
+        raise PalpateError(f"push_only in {path} is {shown(push_only)}: expected true or false")
     goals = []
     for element in agent:
         if _local(element.tag) == "goal":
@@ -180,21 +188,27 @@ def read_svg(path: str | Path) -> Map:
         path.stem,
         walls=shapely.union_all([*drawn_walls(drawing), *standing]),
         movables=movables_of(drawing),
-        robot=Robot(circumscribed_radius(outline), drive, outline=outline),
+        robot=Robot(
+            circumscribed_radius(outline),
+            said.get("drive_type", "differential"),
+            outline=outline,
+            push_only=_TRUTHS[push_only],
+        ),
         start=(x, y, heading),
         goals=goals,
         bounds=(0.0, 0.0, *drawing.size),
         cell_size=cell_size,
-        margin=None if margin is None else _number(margin, f"margin of {path}") / 100,
+        # namosim takes 0 as not given
+        margin=None if margin is None else _number(margin, f"margin of {path}") / 100 or None,
     )
 
 
-def drawn_walls(drawing: _Drawing) -> list[BaseGeometry]:
+def drawn_walls(drawing: Drawing) -> list[BaseGeometry]:
     """What each path of type wall covers."""
     return [_wall(drawn) for drawn in drawing.paths if drawn.type == "wall"]
 
 
-def movables_of(drawing: _Drawing) -> list[Movable]:
+def movables_of(drawing: Drawing) -> list[Movable]:
     """Paths of type movable; where no path has a type, those of the layer of movables."""
     return [
         Movable.from_corners(drawn.name, drawn.points)
@@ -203,7 +217,7 @@ def movables_of(drawing: _Drawing) -> list[Movable]:
     ]
 
 
-def goals_of(drawing: _Drawing, agent: str) -> list[tuple[float, float, float]]:
+def goals_of(drawing: Drawing, agent: str) -> list[tuple[float, float, float]]:
     """Poses of what lies in the layer of goals, but for what has the `agent_id` of another."""
     goals = []
     for drawn in drawing.paths:
@@ -211,6 +225,14 @@ def goals_of(drawing: _Drawing, agent: str) -> list[tuple[float, float, float]]:
         if "goals_layer" in drawn.groups and mine:
             goals.append((*_middle(drawn), _angle(drawn)))
     return goals
+
+
+def robot_pose(drawing: Drawing, agent: str) -> tuple[float, float, float] | None:
+    """Where the layer of robots has the path with that `agent_id`; None if it has none."""
+    for drawn in drawing.paths:
+        if "robots_layer" in drawn.groups and drawn.attributes.get("agent_id") == agent:
+            return (*_middle(drawn, "robot"), _angle(drawn))
+    return None
 
 
 def _wall(drawn: _Drawn) -> BaseGeometry:
@@ -236,8 +258,18 @@ def _wall(drawn: _Drawn) -> BaseGeometry:
     return shapely.union_all(parts[shapely.area(parts) >= LEAST_AREA])  # no slivers of rounding
 
 
-def _middle(drawn: _Drawn) -> tuple[float, float]:
-    return centred(checked_polygon(drawn.points, f"goal {shown(drawn.name)}"))[1]
+def _middle(drawn: _Drawn, what: str = "goal") -> tuple[float, float]:
+    return centred(checked_polygon(drawn.points, f"{what} {shown(drawn.name)}"))[1]
+
+
+def _direction(drawn: _Drawn) -> float:
+    """Of the first line of an arrow, rad, as namosim reads it."""
+    along = drawn.points - drawn.points[0]
+    longer = np.linalg.norm(along, axis=1) > _LEAST_ARROW
+    if not longer.any():
+        raise PalpateError(f"{drawn.called} has no direction: expected a line")
+    x, y = along[np.argmax(longer)]
+    return math.atan2(y, x)
 
 
 def _angle(drawn: _Drawn) -> float:
@@ -245,7 +277,7 @@ def _angle(drawn: _Drawn) -> float:
     return math.radians(_number(drawn.attributes.get("angle", "0"), f"angle of {drawn.called}"))
 
 
-def read_drawing(path: Path, scale: float, corner: tuple[float, float] | None = None) -> _Drawing:
+def read_drawing(path: Path, scale: float, corner: tuple[float, float] | None = None) -> Drawing:
     """Every path of an SVG in metres, y up; `scale` is metres per unit of the viewBox.
 
     The upper left corner of the viewBox comes to `corner` (x, y), m; without one the lower left
@@ -284,7 +316,7 @@ def read_drawing(path: Path, scale: float, corner: tuple[float, float] | None = 
     to_metres = np.array(
         [[scale, 0, left - scale * box[0]], [0, -scale, top + scale * box[1]], [0, 0, 1.0]]
     )
-    drawing = _Drawing((width, height))
+    drawing = Drawing((width, height))
     matrix = joined(to_metres, np.eye(3), f"the viewBox of {path}")
     _walk(root, matrix, (), drawing, _Meant.within(root), str(path))
     return drawing
@@ -294,7 +326,7 @@ def _walk(
     element: Any,
     matrix: np.ndarray,
     groups: tuple[str, ...],
-    drawing: _Drawing,
+    drawing: Drawing,
     meant: _Meant,
     what: str,
 ) -> None:
@@ -326,7 +358,14 @@ def _walk(
         elif tag not in _NEVER_DRAWN:
             meant.check(child, called, layer)
             if tag == "g":
-                _walk(child, here, (*groups, name), drawing, meant, what)
+                inner = (*groups, name, *(one for one in _layers(child) if one != name))
+                _walk(child, here, inner, drawing, meant, what)
+
+
+def _layers(element: Any) -> list[str]:
+    """Which of namosim's layers an element is, by its id or by the label that Inkscape shows."""
+    labels = (value for key, value in element.attrib.items() if _local(key) in ("id", "label"))
+    return [label for label in labels if label in _LAYERS]
 
 
 def _viewbox(root: Any, path: Path) -> str:

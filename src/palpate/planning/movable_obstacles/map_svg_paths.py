@@ -8,6 +8,8 @@ import numpy as np
 from palpate.errors import PalpateError
 
 _TOKEN = re.compile(r"([MmLlHhVvZzCcQqSsTtAa])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
+_ARC = re.compile(r"([Aa])([^MmLlHhVvZzCcQqSsTtAa]*)")
+_NEXT = re.compile(r"[\s,]*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
 _COUNTS = {"M": 2, "L": 2, "H": 1, "V": 1, "Z": 0, "C": 6, "Q": 4, "S": 4, "T": 2, "A": 7}
 _CHORDS = 12  # of a curve or a quarter circle: within 0.3 % of its radius
 _MOST = 200_000  # characters of a path
@@ -31,7 +33,7 @@ def path_outlines(d: str, what: str) -> list[np.ndarray]:
             f"{what} has {rest.strip()[:20]!r} in its path: expected the commands "
             "M L H V Z C S Q T A and numbers"
         )
-    tokens = _TOKEN.findall(d)
+    tokens = _TOKEN.findall(_ARC.sub(_flags_apart, d))
     if not tokens or tokens[0][0] not in ("M", "m"):
         raise PalpateError(f"{what} has a path that does not begin with M: {d[:30]!r}")
     outlines: list[list[np.ndarray]] = []
@@ -68,6 +70,21 @@ def path_outlines(d: str, what: str) -> list[np.ndarray]:
         here, closed = new[-1], False
     every = [np.array(points) for points in outlines]
     return [points for points in every if len(points) > 1] or every[:1]
+
+
+def _flags_apart(arc: re.Match[str]) -> str:
+    """An arc command whose flags stand apart: `a 5 5 0 01-20 20` may be written without spaces."""
+    rest, apart, position, count = arc[2], [arc[1]], 0, 0
+    while match := _NEXT.match(rest, position):
+        number = match[1]
+        flag = count % _COUNTS["A"] in (3, 4) and number[0] in "01"
+        if flag and (number.isdigit() or float(number) not in (0.0, 1.0)):  # not one written as 1.0
+            number = number[0]
+        apart.append(number)
+        position = match.start(1) + len(apart[-1])
+        count += 1
+    apart.append(rest[position:])
+    return " ".join(apart)
 
 
 def _numbers(texts: list[str], what: str) -> np.ndarray:

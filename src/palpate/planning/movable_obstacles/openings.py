@@ -17,6 +17,7 @@ from shapely.geometry.base import BaseGeometry
 from palpate.planning.movable_obstacles.collisions import Clearance
 from palpate.planning.movable_obstacles.geometry import placed
 from palpate.planning.movable_obstacles.manipulation import (
+    FORWARD,
     Grasp,
     ManipulationModel,
     Motion,
@@ -139,9 +140,10 @@ class OpeningSearch:
     def _carries(
         self, grasp: int, last: Primitive | None, final: bool
     ) -> list[tuple[Primitive, float]]:
-        primitives = self.model.primitives(
-            self.movable, self.grasps[grasp], self.space.map.robot.drive
-        )
+        robot = self.space.map.robot
+        primitives = self.model.primitives(self.movable, self.grasps[grasp], robot.drive)
+        if robot.push_only:
+            primitives = [one for one in primitives if one == FORWARD]
         return [
             (primitive, share)
             for share in (_SHARES[:1] if final else _SHARES)

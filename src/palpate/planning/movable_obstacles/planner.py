@@ -7,7 +7,7 @@ anew, until the whole policy consists of actions that have been worked out (the 
 LAO*, Hansen and Zilberstein 2001). Objects that the policy never needs are never simulated.
 
 An object is held once for each way that it opens. Only where no plan is found so, it may be put
-down halfway and held elsewhere.
+down halfway and held elsewhere. Where the cells leave no way at all, smaller ones are tried.
 """
 
 import dataclasses
@@ -41,11 +41,16 @@ _SEARCHES = 20, 6  # searches for an opening in one plan: some, and some more fo
 _STALE = 2  # times in a row that moving something has not led nearer
 _DEPTH = 2  # blockers of blockers that are cleared away
 _MOST_BLOCKING = 4  # objects in the way of one
+_HALVINGS = 2  # of cells that walls alone seem to close
 _GROWN = 2.5  # sizes of object and robot that a window reaches beyond what it holds
 
 
 class NoWayError(PalpateError):
     """There is no plan, as far as was searched; says which objects keep which regions closed."""
+
+
+class _WalledError(NoWayError):
+    """No way in these cells, whatever is moved."""
 
 
 @dataclass(frozen=True)
@@ -85,21 +90,11 @@ class Planner:
         began = timed()
         goal = world.check(goal)
         fixed = set(immovable)
-        unknown = sorted(fixed - set(world.movables))
-        if unknown:
-            raise PalpateError(f"map '{world.name}' has no movable '{unknown[0]}'")
+        world.check_names(fixed)
         if len(self._known) > _MOST_KNOWN:
             self._known.clear()
-        self._world = unmoved(world)
         sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
-        begin = Situation(Space(world, fixed), np.array(world.start))
-        try:
-            done = self._planned(begin, goal, sizes, regrasps=False)
-        except NoWayError as closed:
-            try:
-                done = self._planned(begin, goal, sizes, regrasps=True)
-            except NoWayError:
-                raise closed from None
+        done = self._found(world, goal, fixed, sizes, _HALVINGS)
         segments = tuple(done.segments)
         beliefs = {s.name: self.model.belief(s.name) for s in segments if s.name is not None}
         return Plan(world.name, goal, segments, timed() - began, sizes, beliefs)
@@ -128,6 +123,25 @@ class Planner:
 
     # --- above --------------------------------------------------------------------------------
 
+    def _found(
+        self, world: Map, goal: Pose, fixed: set[str], sizes: dict[str, int], halvings: int
+    ) -> Situation:
+        """The situation at the goal; raises `NoWayError`."""
+        self._world = unmoved(world)
+        begin = Situation(Space(world, fixed), np.array(world.start))
+        try:
+            return self._planned(begin, goal, sizes, regrasps=False)
+        except _WalledError:
+            finer = world.finer if halvings else None
+            if finer is None:
+                raise
+        except NoWayError as closed:
+            try:
+                return self._planned(begin, goal, sizes, regrasps=True)
+            except NoWayError:
+                raise closed from None
+        return self._found(finer, goal, fixed, sizes, halvings - 1)
+
     def _planned(
         self, now: Situation, goal: Pose, sizes: dict[str, int], regrasps: bool
     ) -> Situation:
@@ -143,7 +157,8 @@ class Planner:
                 sizes |= {"regions": graph.regions.free, "borders": len(graph.regions.borders)}
             reached = self._advance(graph, now, goal, sizes, regrasps)
             if reached is None or stale == _STALE:
-                raise NoWayError(graph.complaint(world.name))
+                error = NoWayError if graph.tried else _WalledError
+                raise error(graph.complaint(world.name))
             now = reached
             if len(now.segments) and now.segments[-1].kind == TRANSIT:
                 break
@@ -342,5 +357,5 @@ def unmoved(world: Map) -> Hashable:
     """All of a map that stays as it is while objects are moved."""
     robot = world.robot
     outlines = tuple((name, one.outline.tobytes()) for name, one in world.movables.items())
-    sizes = (world.bounds, world.cell_size, world.margin, robot.radius, robot.drive, world.reach)
-    return world.walls.wkb, outlines, sizes
+    sizes = (world.bounds, world.cell_size, world.margin, robot.radius, world.reach)
+    return world.walls.wkb, outlines, sizes, robot.drive, robot.push_only

@@ -204,10 +204,15 @@ class PolicyGraph:
         here = int(self.regions.node[self.space.cell_at(self._points[0])])
         size = f"region of {area[here]:.3g} square m" if here >= 0 else "start"
         if not self.tried:
+            fixed = [f"'{one}'" for one in self.space.fixed]
+            more = ", ..." if len(fixed) > 6 else ""
+            closing = f"walls and what may not be moved ({', '.join(fixed[:6])}{more})"
             return (
-                f"no way to the goal on map '{name}': walls alone close the robot's {size} "
-                "off from the goal, so that nothing movable could open it (seen in cells of "
-                f"{self.space.cell:.3g} m, which may miss a narrow way)"
+                f"no way to the goal on map '{name}': {closing if fixed else 'walls'} close the "
+                f"robot's {size} off from the goal, so that nothing that may be moved could open "
+                "it (other robots on the map count as walls; seen in cells of "
+                f"{self.space.cell:.3g} m, with a margin of {self.space.map.margin:.3g} m: smaller "
+                "ones may find a narrow way)"
             )
         kept = ", ".join(f"'{name}'" for name in list(self.tried)[:6])
         stuck = [f"'{name}'" for name in self.tried if self._overlaps(name)][:6]

@@ -202,13 +202,29 @@ def test_a_driven_state_with_a_long_gap_is_refused():
         with_gap(10).align(0.01)
 
 
-def test_a_command_is_in_force_from_its_stamp_until_the_next():
-    command = ordered([0.0, 0.02, 0.034, 0.036], [1.0, 2.0, 3.0, 4.0])
+def test_a_command_is_the_mean_of_what_is_in_force_in_a_period():
+    command = ordered([0.0, 0.02, 0.034, 0.036], [1.0, 2.0, 3.0, 5.0])
     aligned = recording(trial("a", observed(frames(8), np.zeros(8)), command)).align(0.01)
-    assert aligned.action[0].tolist() == [1, 1, 2, 2, 4, 4, 4]
+    mean = 0.4 * 2 + 0.2 * 3 + 0.4 * 5
+    np.testing.assert_allclose(aligned.action[0], [1, 1, 2, mean, 5, 5, 5], rtol=1e-12)
     late = ordered(1.7e9 + frames(8), np.arange(8.0))  # stamps off the grid by rounding alone
     aligned = recording(trial("a", observed(1.7e9 + frames(8), np.zeros(8)), late)).align(0.01)
     assert aligned.action[0].tolist() == [0, 1, 2, 3, 4, 5, 6]
+
+
+@given(
+    taps=st.lists(st.floats(0.02, 0.95), min_size=1, max_size=6),
+    rate=st.sampled_from([500.0, 333.0, 40.0]),
+)
+def test_short_taps_keep_their_impulse_whatever_the_clocks(taps, rate):
+    """What a force adds to the momentum is its integral: of frames, as of its own faster clock."""
+    time = np.arange(0, 1.0, 1 / rate)
+    force = 40.0 * sum((time >= tap) & (time < tap + 0.02) for tap in taps)[:, None]
+    held = np.append(np.diff(time), 31 / 30 - time[-1])
+    channels = observed(frames(32, 30.0), np.zeros(32)), ordered(time, force)
+    aligned = recording(trial("a", *channels)).align(1 / 30)
+    impulse = aligned.action[0].sum(axis=0) / 30
+    np.testing.assert_allclose(impulse, (force * held[:, None]).sum(axis=0), rtol=1e-6, atol=1e-9)
 
 
 def test_trials_of_unequal_length_are_padded():
@@ -265,7 +281,7 @@ def test_channels_are_chosen_by_name_where_there_are_several():
     with pytest.raises(PalpateError, match="as its action, which 'pose' is not; it has: markers"):
         rich.align(0.01, "pose", "pose")
     bare = recording(trial("a", observed(frames(5), zero)))
-    with pytest.raises(PalpateError, match="name the driven markers, or record one"):
+    with pytest.raises(PalpateError, match="record one whose role is driven or command"):
         bare.align(0.01)
 
 
@@ -334,3 +350,5 @@ def test_joining_keeps_names_apart_and_provenance_together():
     both = join([first, Recording(many(3).trials, {"file": "b", "unit": "m", "seed": 3})])
     assert names(both) == ["0", "1", "0 (2)", "1 (2)", "2"]
     assert both.provenance == {"file": "a; b", "unit": "m", "seed": 3}
+    spaced = [Recording(many(1).trials, {"outlines": text}) for text in ('{"a": [1]}', '{"a":[1]}')]
+    assert join(spaced).provenance == {"outlines": '{"a": [1]}'}

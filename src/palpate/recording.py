@@ -13,6 +13,7 @@ action of every trial on one uniform grid of control periods.
 from __future__ import annotations
 
 import enum
+import json
 import math
 import numbers
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.recording_alignment import in_order, interpolate, mean_in_force
 
 OBSERVATION_GAP = 3  # nominal periods over which an observation may be interpolated
 DRIVEN_GAP = 10  # nominal periods over which a driven state may be interpolated
@@ -84,7 +86,7 @@ class Channel:
                 f"{label} is a {self.role.value} input but NaN at {where}: an input has to be "
                 "known at each of its stamps, so fill short gaps and cut the trial at long ones"
             )
-        time, values, notes = _in_order(time, values)
+        time, values, notes = in_order(time, values)
         time.setflags(write=False)
         values.setflags(write=False)
         object.__setattr__(self, "time", time)
@@ -209,14 +211,18 @@ class Recording:
         An observation is interpolated linearly between its two neighbouring stamps where both
         were seen and lie at most 3 nominal periods apart, and is NaN otherwise. The action at
         frame t is, for a driven channel, its interpolated value at frame t + 1 (where the driven
-        thing has to be at the end of the period) and, for a command, the order in force at t.
+        thing has to be at the end of the period) and, for a command, the mean over the period of
+        the orders in force: what a force adds to the momentum, however much faster it is told.
 
         Raises `PalpateError` if a channel is missing or ambiguous, differs in role, unit or shape
         between trials, if a driven state has a gap of more than 10 nominal periods, or if a trial
         does not last one period.
         """
         if not (math.isfinite(period) and period > 0):
-            raise PalpateError(f"the period has to be a positive number of seconds, not {period}")
+            raise PalpateError(
+                f"the period has to be a positive number of seconds, not {period}: a channel of a "
+                "single stamp has none"
+            )
         seen = self._pick(observation, "observation", (Role.OBSERVATION,))
         acted = self._pick(action, "action", (Role.DRIVEN, Role.COMMAND))
         spans = [
@@ -247,7 +253,7 @@ class Recording:
         )
         for i, (trial, (start, length)) in enumerate(zip(self.trials, spans, strict=True)):
             grid = start + period * np.arange(length)
-            aligned.observation[i, :length] = _interpolate(
+            aligned.observation[i, :length] = _interpolated(
                 seen[i], grid, OBSERVATION_GAP, ON_STAMP * period
             )
             actions = _actions(acted[i], grid, trial, period)
@@ -271,7 +277,7 @@ class Recording:
                     f"trial '{trial.name}' needs one {kinds} channel as its {what}"
                     + (f", which '{name}' is not" if name else "")
                     + f"; it has: {there}; "
-                    + ("name one of them" if fitting else "name the driven markers, or record one")
+                    + ("name one of them" if fitting else f"record one whose role is {kinds}")
                 )
             channel = fitting[0]
             first = picked[0] if picked else channel
@@ -307,9 +313,20 @@ def join(recordings: Sequence[Recording]) -> Recording:
             taken.add(name)
             trials.append(replace(trial, name=name))
         for key, value in recording.provenance.items():
-            same = key not in provenance or provenance[key] == value
-            provenance[key] = value if same else f"{provenance[key]}; {value}"
+            told = provenance.setdefault(key, value)
+            if not _same_fact(told, value):
+                provenance[key] = f"{told}; {value}"
     return Recording(tuple(trials), provenance)
+
+
+def _same_fact(one: str | float | int, other: str | float | int) -> bool:
+    """Whether two facts are the same, as JSON if both are."""
+    if one == other:
+        return True
+    try:
+        return bool(json.loads(str(one)) == json.loads(str(other)))
+    except ValueError:
+        return False
 
 
 def _span(trial: Trial, sensor: Channel, source: Channel, period: float) -> tuple[float, int]:
@@ -327,35 +344,17 @@ def _span(trial: Trial, sensor: Channel, source: Channel, period: float) -> tupl
     return start, length
 
 
-def _interpolate(channel: Channel, grid: np.ndarray, gap: int, slack: float) -> np.ndarray:
-    """Values (len(grid), *shape) at `grid`, NaN where a neighbour is unseen or `gap` too wide.
-
-    A frame within `slack` seconds of a stamp stands on it and needs no other neighbour. `gap` is
-    in nominal periods.
-    """
-    time, values = channel.time, channel.values
-    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
-    left = right - 1
-    span = time[right] - time[left]
-    weight = np.clip((grid - time[left]) / span, 0.0, 1.0)
-    on_stamp = np.minimum(weight, 1 - weight) * span <= slack
-    nearest = values[np.where(weight < 0.5, left, right)]
-
-    def per_row(row: np.ndarray) -> np.ndarray:
-        return row.reshape(-1, *(1,) * (values.ndim - 1))
-
-    between = (1 - per_row(weight)) * values[left] + per_row(weight) * values[right]
-    too_wide = span > gap * channel.nominal_period * (1 + ON_STAMP)
-    between[too_wide & ~on_stamp] = np.nan
-    return np.where(per_row(on_stamp) & np.isnan(between), nearest, between)
+def _interpolated(channel: Channel, grid: np.ndarray, gap: int, slack: float) -> np.ndarray:
+    """See `interpolate`; `gap` is in nominal periods."""
+    seconds = gap * channel.nominal_period * (1 + ON_STAMP)
+    return interpolate(channel.time, channel.values, grid, seconds, slack)
 
 
 def _actions(channel: Channel, grid: np.ndarray, trial: Trial, period: float) -> np.ndarray:
     """What acts from each frame of `grid` to the next, (len(grid) - 1, *shape)."""
     if channel.role is Role.COMMAND:
-        in_force = np.searchsorted(channel.time, grid[:-1] + ON_STAMP * period, side="right") - 1
-        return channel.values[in_force]
-    actions = _interpolate(channel, grid[1:], DRIVEN_GAP, ON_STAMP * period)
+        return mean_in_force(channel.time, channel.values, grid, ON_STAMP * period)
+    actions = _interpolated(channel, grid[1:], DRIVEN_GAP, ON_STAMP * period)
     unknown = np.isnan(actions).reshape(len(actions), -1).any(axis=1)
     if unknown.any():
         raise PalpateError(
@@ -364,26 +363,6 @@ def _actions(channel: Channel, grid: np.ndarray, trial: Trial, period: float) ->
             f"{channel.nominal_period:.4g} s: cut the trial there"
         )
     return actions
-
-
-def _in_order(
-    time: np.ndarray, values: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Rows sorted by stamp, the last of equal stamps kept, and what was done to get there."""
-    notes = []
-    behind = np.maximum.accumulate(time) - time
-    if late := int((behind > 0).sum()):
-        notes.append(
-            f"{late} of {len(time)} rows were out of order, by up to {behind.max():.4g} s, "
-            "and were sorted"
-        )
-        order = np.argsort(time, kind="stable")
-        time, values = time[order], values[order]
-    last = np.append(np.diff(time) > 0, True)
-    if repeated := int((~last).sum()):
-        notes.append(f"{repeated} rows had the stamp of a later row and were dropped")
-        time, values = time[last], values[last]
-    return time, values, tuple(notes)
 
 
 def _floats(array: np.ndarray, what: str) -> np.ndarray:

@@ -17,7 +17,7 @@ from palpate.identification.likelihood import known_scales, motion_posterior
 from palpate.identification.predictive import Predicted, score
 from palpate.identification.segments import known_start
 from palpate.identification.settled import Settled
-from palpate.recording import Channel, Recording, Role, Trial
+from palpate.recording import Aligned, Channel, Recording, Role, Trial
 from palpate.recording_files import write_recording
 from palpate.result import Result
 
@@ -34,15 +34,15 @@ def test_fewer_draws_than_can_be_judged_are_refused_before_anything_is_read(few)
         identify_bayesian.identify({"sled": target}, **few)
 
 
-def still(path, seen=slice(None)):
+def still(path, seen=slice(None), count=150):
     """A recording of a box that stands still, and is seen in some frames only."""
-    pose = np.full((150, 1, 3), np.nan)
+    pose = np.full((count, 1, 3), np.nan)
     pose[seen] = 1e-3 * np.random.default_rng(0).standard_normal(pose[seen].shape)
     time = np.arange(len(pose)) / RATE
     corners = [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]
     channels = {
         POSE: Channel(POSE, Role.OBSERVATION, time, pose, "m, m, rad"),
-        WRENCH: Channel(WRENCH, Role.COMMAND, time[:-1], np.zeros((149, 1, 3)), "N, N, N m"),
+        WRENCH: Channel(WRENCH, Role.COMMAND, time[:-1], np.zeros((count - 1, 1, 3)), "N, N, N m"),
     }
     about = {"bodies": '["box"]', "outlines": json.dumps({"box": corners})}
     write_recording(path, Recording((Trial("one", channels),), about))
@@ -68,6 +68,19 @@ def test_what_cannot_be_scored_on_is_refused_before_anything_is_sampled(
     options = IdentifyFurniture(recordings=(fitted,), validate=(scored,), out=tmp_path / "out")
     with pytest.raises(PalpateError, match=sentence):
         identify_bayesian.run(options)
+
+
+def test_too_little_is_refused(tmp_path):
+    short = still(tmp_path / "R.npz", count=6)
+    with pytest.raises(PalpateError, match=r"last 0\.\d+ s in all: expected at least 0\.5 s"):
+        identify_bayesian.run(IdentifyFurniture(recordings=(short,)))
+
+
+def test_nobody_knows_whether_what_is_seen_twice_began_at_rest():
+    two = Aligned(0.05, np.zeros((1, 3, 3)), np.zeros((1, 2, 3)), np.array([3]))
+    assert not identify_bayesian.begins_at_rest(two, SLED)
+    long = Aligned(0.05, np.zeros((1, 9, 3)), np.zeros((1, 8, 3)), np.array([9]))
+    assert identify_bayesian.begins_at_rest(long, SLED)
 
 
 def unseen_angle():

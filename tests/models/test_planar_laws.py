@@ -10,10 +10,11 @@ import scipy.linalg
 
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
-from palpate.models.planar import Planar, PlanarState, turned_wheel
+from palpate.models.planar import Planar, PlanarState
 from palpate.models.planar_friction import STICTION, Tensor, exponential
 from palpate.models.planar_shapes import furniture, rectangle
 from palpate.models.planar_system import GRAVITY
+from palpate.models.planar_wheels import turned_wheel, wheel_axes
 
 run = jax.jit(rollout)
 BOX = rectangle(1.2, 0.6)
@@ -233,6 +234,17 @@ def test_a_wheel_has_the_symmetries_of_its_labels(float64):
     for other in (turned_wheel(0.3 + np.pi / 2, 9.0, 2.0), turned_wheel(0.3 - np.pi, 2.0, 9.0)):
         for name, value in one.items():
             np.testing.assert_allclose(other[name], value, rtol=1e-12)
+
+
+@pytest.mark.parametrize("direction", [-1.5, -0.4, 0.0, 0.3, 1.5])
+def test_where_a_wheel_rolls_and_how_hard_is_found_from_its_parameters(float64, direction):
+    for parameters in (
+        turned_wheel(direction, 2.0, 300.0),
+        turned_wheel(direction + np.pi / 2, 300.0, 2.0),
+    ):
+        np.testing.assert_allclose(
+            wheel_axes(**parameters), (direction, 2.0, 300.0), rtol=1e-9, atol=1e-15
+        )
 
 
 @pytest.mark.parametrize("law", ["coulomb", "viscous"])

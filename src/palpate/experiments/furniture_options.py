@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import arg
 
@@ -117,3 +117,11 @@ class IdentifyFurniture(IdentifyBayesian):
 
         assert isinstance(model, Planar)  # by `hypotheses`
         return meeting(model, *recordings)
+
+    def meanings(self, models: Model) -> list[dict[str, Any]]:
+        """See `IdentifyBayesian.meanings`."""
+        from palpate.experiments.furniture_wheels import wheel_rows
+        from palpate.models.planar import Planar
+
+        assert isinstance(models, Planar)  # by `hypotheses`
+        return wheel_rows(models, viscous=self.law == "viscous")

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ from palpate.models.planar import Planar
 from palpate.models.planar_geometry import Shapes, nearest
 from palpate.models.planar_shapes import furniture
 from palpate.parameters import as_floating
-from palpate.recording import Recording
+from palpate.recording import Channel, Recording, Role
 from palpate.worlds.furniture import FurnitureWorld
 from palpate.worlds.furniture_handling import record_handling, record_pushes
 from palpate.worlds.furniture_pieces import Piece
@@ -24,6 +25,8 @@ FRAMES = 256  # looked at together
 NEAR = 0.3  # m between outlines, beyond which nothing touches before it is seen again
 APART = 2.5  # m between pieces that are handled, so that they do not meet
 UNITS = {POSE: "m, m, rad", WRENCH: "N, N, N m"}
+SLOWEST = 0.25  # s between frames: of less nothing can be told from a push
+LARGEST = 50.0  # m of an outline
 
 
 def checked(recording: Recording) -> Recording:
@@ -33,7 +36,8 @@ def checked(recording: Recording) -> Recording:
     frames is between them.
 
     Raises `PalpateError` where the channel "pose" (frames, bodies, 3) or "wrench" of that shape is
-    missing, or their numbers of bodies differ.
+    missing, says that it is in other units or in a frame of its own, or is too slow, and where
+    their numbers of bodies differ.
     """
     bodies, trials = set(), []
     for trial in recording.trials:
@@ -46,11 +50,12 @@ def checked(recording: Recording) -> Recording:
                     f"trial '{trial.name}' has a channel '{name}' of shape (frames, "
                     f"{', '.join(map(str, shape))}): expected (frames, bodies, 3) in {unit}"
                 )
+            _check_meant(trial.name, channel, unit, trial[POSE].frame)
             bodies.add(shape[0] if len(shape) == 2 else 1)
             values = channel.values.reshape(len(channel.values), -1, 3)
             if name == POSE:
                 values = _unwrapped(values)
-            channels[name] = dataclasses.replace(channel, values=values, notes=())
+            channels[name] = dataclasses.replace(channel, values=values)
         trials.append(dataclasses.replace(trial, channels=channels))
     if len(bodies) > 1:
         raise PalpateError(
@@ -58,6 +63,27 @@ def checked(recording: Recording) -> Recording:
             "the same bodies in every channel of every trial"
         )
     return dataclasses.replace(recording, trials=tuple(trials))
+
+
+def _check_meant(trial: str, channel: Channel, unit: str, frame: str) -> None:
+    """Refuse what is said to be in another unit or frame, and clocks that are not in seconds."""
+    said, meant = (re.sub(r"[\s*·]", "", text) for text in (channel.unit, unit))
+    if said and said != meant:
+        raise PalpateError(
+            f"channel '{channel.name}' of trial '{trial}' is in '{channel.unit}': expected {unit}"
+        )
+    if channel.frame != frame:
+        raise PalpateError(
+            f"channel '{channel.name}' of trial '{trial}' is in the frame '{channel.frame}' and "
+            f"the poses are in '{frame}': expected both in the same"
+        )
+    if channel.role is Role.OBSERVATION and not channel.nominal_period <= SLOWEST:
+        count, apart = len(channel.time), f", {channel.nominal_period:.3g} s apart as a rule"
+        raise PalpateError(
+            f"channel '{channel.name}' of trial '{trial}' has "
+            f"{f'{count} frames{apart}' if count > 1 else 'one frame'}: expected many, at most "
+            f"{SLOWEST:g} s apart, with stamps in seconds"
+        )
 
 
 def names_of(recording: Recording) -> tuple[str, ...]:
@@ -76,7 +102,7 @@ def names_of(recording: Recording) -> tuple[str, ...]:
 
 
 def check_alike(*recordings: Recording) -> None:
-    """Raise `PalpateError` unless all recordings are of as many bodies, of the same names."""
+    """Raise `PalpateError` unless all are of as many bodies, of the same names and outlines."""
     names = [names_of(recording) for recording in recordings]
     named = {of for of, each in zip(names, recordings, strict=True) if "bodies" in each.provenance}
     if len(named) > 1 or len(set(map(len, names))) > 1:
@@ -85,6 +111,14 @@ def check_alike(*recordings: Recording) -> None:
             f"the recordings are of {told}: expected the same bodies in what is fitted and in what "
             "is scored"
         )
+    outlines = [told for each in recordings if (told := _told(each, "outlines")) is not None]
+    for name in names[0]:
+        drawn = [one[name] for one in outlines if isinstance(one, dict) and name in one]
+        if any(one != drawn[0] for one in drawn):
+            raise PalpateError(
+                f"'{name}' has another outline in what is scored than in what is fitted: expected "
+                "the same body"
+            )
 
 
 def starting_furniture(
@@ -105,7 +139,7 @@ def starting_furniture(
         x, y = size[0] / 2, size[1] / 2
         outlines = [[(-x, -y), (x, -y), (x, y), (-x, y)]] * len(names)
     elif isinstance(told, dict) and set(names) <= set(told):
-        outlines = [_polygon(told[name], f"outline of '{name}'") for name in names]
+        outlines = [_polygon(told[name], f"outline of '{name}'", LARGEST) for name in names]
     else:
         raise PalpateError(
             'the recording does not say how large the bodies are: expected "outlines" in its '
@@ -223,10 +257,15 @@ def _told(recording: Recording, key: str) -> Any:
     try:
         return json.loads(str(text))
     except ValueError as error:
+        if "; " in str(text):  # as `join` puts together what differs
+            raise PalpateError(
+                f'the recordings say different things of "{key}": expected recordings of the same '
+                "bodies"
+            ) from error
         raise PalpateError(f'the recording\'s "{key}" is not JSON: {error}') from error
 
 
-def _polygon(points: Any, what: str) -> np.ndarray:
+def _polygon(points: Any, what: str, most: float = math.inf) -> np.ndarray:
     try:
         polygon = np.asarray(points, float)
     except (TypeError, ValueError) as error:
@@ -234,6 +273,11 @@ def _polygon(points: Any, what: str) -> np.ndarray:
     if polygon.ndim != 2 or polygon.shape[1:] != (2,) or not np.isfinite(polygon).all():
         raise PalpateError(
             f"the {what} has shape {polygon.shape}: expected finite points (corners, 2) in m"
+        )
+    if len(polygon) and np.ptp(polygon, axis=0).max() > most:
+        raise PalpateError(
+            f"the {what} is {np.ptp(polygon, axis=0).max():.4g} m long: expected at most {most:g} "
+            "m, so its corners may not be in m"
         )
     return polygon
 

@@ -38,6 +38,7 @@ DRAWS = "posterior.npz"
 PIECE = 2.0  # s, of what is fitted, and of what is predicted open loop
 LEVEL = 0.9
 STILL = 0.1  # s
+SHORTEST = 0.5  # s of recordings, in all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,6 +149,12 @@ def _read(options: IdentifyBayesian, paths: tuple[Path, ...]) -> tuple[Recording
         print(f"note: {note}")
     periods = [trial[options.observation].nominal_period for trial in recording.trials]
     period = 1.0 / options.rate if options.rate else float(f"{np.median(periods):.5g}")
+    lasting = sum(float(np.ptp(trial[options.observation].time)) for trial in recording.trials)
+    if lasting < SHORTEST:
+        raise PalpateError(
+            f"{' and '.join(map(str, paths))} last {lasting:.3g} s in all: expected at least "
+            f"{SHORTEST:g} s of motion"
+        )
     return recording, period
 
 
@@ -157,8 +164,8 @@ def begins_at_rest(aligned: Aligned, model: Model) -> bool:
     noise = noise_scale(aligned, model)
     for observed in aligned.observation:
         early, late = observed[:frames], observed[frames : 2 * frames]
-        if not (np.isfinite(early).all() and np.isfinite(late).all()):
-            return False
+        if len(late) < frames or not (np.isfinite(early).all() and np.isfinite(late).all()):
+            return False  # nobody knows
         moved = difference(model, late.mean(axis=0), early.mean(axis=0))
         if np.any(np.abs(moved) > 4.0 * noise * np.sqrt(2.0 / frames)):
             return False
@@ -234,7 +241,7 @@ def _write(
                 else "none: errors and coverage are those on the fitted trials",
             },
             wall_time_s=run.elapsed,
-            parameters=rows(posterior),
+            parameters=[*rows(posterior), *options.meanings(posterior.models())],
             warnings=list(posterior.warnings),
         ).to_dict()
     )

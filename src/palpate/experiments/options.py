@@ -187,6 +187,10 @@ class IdentifyBayesian(Reading, ABC):
         """The model without what cannot show in these recordings, for less work."""
         return model
 
+    def meanings(self, models: Model) -> list[dict[str, Any]]:
+        """Rows for `result.json` of what follows from the parameters of draws, as one model."""
+        return []
+
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(Reading):

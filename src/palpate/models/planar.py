@@ -8,13 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from palpate.models import planar_step
 from palpate.models.model import Model
 from palpate.models.planar_checks import check_axes, check_indices, coupled
 from palpate.models.planar_links import allowed, turn
-from palpate.models.planar_system import WEAKEST, System, links_of, system_of
+from palpate.models.planar_system import System, links_of, system_of
 from palpate.parameters import (
     LogNormal,
     Normal,
@@ -68,7 +68,7 @@ class Planar(Model):
     a wheel has one name, although turned by a quarter with its two forces swapped it is the same,
     and one that resists alike in all directions is a point like any other, where an angle would be
     undefined and the posterior cut in two. Square to the body the shear is zero and the
-    others are the wheel's own forces; `turned_wheel` has those of one that is not.
+    others are the wheel's own forces; `planar_wheels` turns those of one that is not.
 
     Which wheels and links there are, their law, what a link leads to (-1: the world) and which
     bodies are bolted down, at `bolted_pose`, is data: hypotheses about it are a batch axis. Batch
@@ -128,8 +128,8 @@ class Planar(Model):
         "N",
         prior=LogNormal(5.0, 2.0),
         spread=0.3,
-        about="force at which a dry wheel gives way along the body's x axis; of a viscous one the "
-        "force at 1 m/s",
+        about="force at which a dry wheel that stands square gives way along the body's x axis; of "
+        "a viscous one the force at 1 m/s",
     )
     wheel_across: Float[Array, "*batch bodies wheels"] = parameter(
         "N",
@@ -376,25 +376,6 @@ def _side_by_side(arrays: Sequence[Array], axes: Sequence[int], lanes: int = 1) 
 def wrapped(angle: Array) -> Array:
     """The angle between -pi and pi that points the same way."""
     return angle - 2.0 * jnp.pi * jnp.round(angle / (2.0 * jnp.pi))
-
-
-def turned_wheel(
-    direction: Float[ArrayLike, "*#batch"],
-    along: Float[ArrayLike, "*#batch"],
-    across: Float[ArrayLike, "*#batch"],
-) -> dict[str, Array]:
-    """Parameters of a wheel that stands at an angle (rad) to the body's x axis, by their names.
-
-    `along` and `across` are its forces in N, or in N s/m, in its own axes.
-    """
-    log_along, log_across = (jnp.log(jnp.maximum(force, WEAKEST)) for force in (along, across))
-    mean, half = 0.5 * (log_along + log_across), 0.5 * (log_along - log_across)
-    turned = half * jnp.cos(2.0 * jnp.asarray(direction))
-    return {
-        "wheel_along": jnp.exp(mean + turned),
-        "wheel_across": jnp.exp(mean - turned),
-        "wheel_shear": half * jnp.sin(2.0 * jnp.asarray(direction)),
-    }
 
 
 _AXES = [*(len(axes) for kind in (Planar, PlanarState) for axes in axes_of(kind).values()), 2]

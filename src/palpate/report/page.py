@@ -34,6 +34,7 @@ from palpate.storage import write_text
 
 Section = tuple[str, str]  # title, HTML
 NAMED = 5  # stages that a page names; more are counted
+_FEW = 4  # elements of a parameter that are told one by one
 _OBSERVED = "observed"  # the label that predictions are held against
 
 
@@ -199,7 +200,8 @@ def _parameters(rows: Sequence[Parameter]) -> str:
     rows = [row for row in rows if row.value.size]  # a model may have none of a kind
     if not rows:
         return ""
-    free = sum(not row.fixed for row in rows)
+    untold = [str(row.verdict).startswith("not told by the data:") for row in rows]
+    free = sum(not row.fixed and not lost for row, lost in zip(rows, untold, strict=True))
     caption = f"{free} of {len(rows)} parameters were identified; a short whisker is one that the "
     caption += "data determine, a long or missing one is not to be trusted."
     chart = parameters(rows)
@@ -336,6 +338,8 @@ def _number(value: float | int | str | None, missing: str = "none") -> str:
 
 
 def _elements(values: np.ndarray) -> str:
+    if 1 < values.size <= _FEW:
+        return "; ".join(number(float(value)) for value in values.ravel())
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (math.nan, math.nan)
     if not known.size or math.isclose(low, high, rel_tol=5e-4):
@@ -348,8 +352,9 @@ def _interval(row: Parameter) -> str:
     known = np.isfinite(row.lower) & np.isfinite(row.upper) & (row.value != 0)
     if not known.any():
         return "–"
-    if row.value.size == 1:
-        return f"{number(row.lower[0])} to {number(row.upper[0])}"
+    if row.value.size <= _FEW:
+        edges = zip(row.lower.ravel(), row.upper.ravel(), strict=True)
+        return "; ".join(f"{number(low)} to {number(high)}" for low, high in edges)
     value = row.value[known]
     sides = (np.median((edge[known] - value) / np.abs(value)) for edge in (row.lower, row.upper))
     return "typically " + " to ".join(f"{side:+.0%}" for side in sides).replace("-", "−")

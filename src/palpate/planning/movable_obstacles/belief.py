@@ -22,9 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from palpate.models.planar import Planar, PlanarState, turned_wheel
+from palpate.models.planar import Planar, PlanarState
 from palpate.models.planar_shapes import centred, even_gyration, furniture, rectangle
 from palpate.models.planar_system import GRAVITY
+from palpate.models.planar_wheels import turned_wheel
 from palpate.parameters import LogNormal, Normal, Prior
 from palpate.planning.movable_obstacles.physics_manipulation import Drawn
 from palpate.planning.movable_obstacles.primitives import AXIS, FREE, PIVOT, STATIC, Constraint

@@ -63,8 +63,7 @@ def test_the_same_configuration_resumes_however_it_was_written(tmp_path):
     ],
 )
 def test_another_configuration_is_refused_by_its_keys(tmp_path, asked, message):
-    with Run.open(tmp_path, CONFIGURATION) as run:
-        run.log(1, loss=1.0)
+    Run.open(tmp_path, CONFIGURATION).close()
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
     with pytest.raises(PalpateError, match=message) as caught:
         Run.open(tmp_path, asked)
@@ -73,13 +72,27 @@ def test_another_configuration_is_refused_by_its_keys(tmp_path, asked, message):
     Run.open(tmp_path, CONFIGURATION).close()  # the refusal let go of the lock
 
 
-def test_a_run_that_came_to_nothing_keeps_no_other_out(tmp_path):
-    Run.open(tmp_path, CONFIGURATION).close()
-    Run.open(tmp_path, {"seed": 7}).close()
+def test_a_run_that_is_refused_before_it_wrote_anything_leaves_no_trace(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(PalpateError, match="no way"), Run.open(tmp_path, CONFIGURATION):
+        raise PalpateError("no way")
+    assert not (tmp_path / "configuration.json").exists()
+    with Run.open(tmp_path, {"seed": 7}):
+        pass  # it may be of use to whoever goes on
+    with pytest.raises(PalpateError, match="no way"), Run.open(tmp_path, {"seed": 7}):
+        raise PalpateError("no way")
     assert read_json(tmp_path / "configuration.json") == {"seed": 7}
-    (tmp_path / "plan.json").write_text("{}")  # a product
-    with pytest.raises(PalpateError, match="another configuration"):
-        Run.open(tmp_path, CONFIGURATION)
+    other = tmp_path / "other"
+
+    def diverging():
+        with Run.open(other, CONFIGURATION) as run:
+            run.log(1, loss=1.0)
+            run.log(2, loss=float("nan"))
+
+    with pytest.raises(PalpateError, match="finite"):
+        diverging()
+    assert (other / "configuration.json").exists()
+    assert (tmp_path / "thesis.txt").read_text() == "mine"
 
 
 def test_fresh_removes_what_a_run_wrote_and_nothing_else(tmp_path):

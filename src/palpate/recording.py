@@ -35,7 +35,8 @@ class Role(enum.Enum):
 
     `OBSERVATION` is what a sensor showed; NaN means not seen. `DRIVEN` is a measured state imposed
     on the system, such as the position of a gripped marker: it varies linearly between stamps.
-    `COMMAND` is an order in force from its stamp until the next one. NaN is refused in both.
+    `COMMAND` is an order in force from its stamp until the next one, of which a model gets the mean
+    over each of its periods: a force, a velocity, no switch and no angle. NaN is refused in both.
     """
 
     OBSERVATION = "observation"
@@ -320,13 +321,14 @@ def join(recordings: Sequence[Recording]) -> Recording:
 
 
 def _same_fact(one: str | float | int, other: str | float | int) -> bool:
-    """Whether two facts are the same, as JSON if both are."""
+    """Whether two facts are the same; of lists and objects in JSON however they are written."""
     if one == other:
         return True
     try:
-        return bool(json.loads(str(one)) == json.loads(str(other)))
-    except ValueError:
+        first, second = (json.loads(str(fact)) for fact in (one, other))
+    except (ValueError, RecursionError):
         return False
+    return isinstance(first, dict | list) and bool(first == second)
 
 
 def _span(trial: Trial, sensor: Channel, source: Channel, period: float) -> tuple[float, int]:

@@ -50,6 +50,7 @@ METRICS = "metrics.jsonl"
 RESULT = "result.json"
 CHECKPOINTS = "checkpoints"
 _LOCK = ".lock"
+_BEGUN = {CONFIGURATION, ENVIRONMENT}
 _KEPT_CHECKPOINTS = 2
 
 
@@ -61,10 +62,13 @@ class Run:
     and, once finished, `result.json`. Whatever else stands in it is not touched.
     """
 
-    def __init__(self, path: Path, configuration: dict[str, Any], lock: TextIO):
+    def __init__(
+        self, path: Path, configuration: dict[str, Any], lock: TextIO, before: set[str] | None
+    ):
         self.path = path
         self.configuration = configuration
         self._lock = lock
+        self._before = before  # names in the folder when this process began the run in it
         self._metrics: TextIO | None = None
         self._positioned = False  # whether metrics and checkpoints stop where the work goes on
         self._began = time.monotonic()
@@ -81,8 +85,8 @@ class Run:
 
         `configuration` is everything the outcome depends on, the seed included; what `plain`
         accepts. `command` is kept for the reader, by default the one this process was started
-        with. `fresh` first removes what an earlier run wrote, and nothing else. A run that ended
-        before it wrote anything does not keep another configuration out.
+        with. `fresh` first removes what an earlier run wrote, and nothing else. As a context, a
+        run that is refused by a `PalpateError` before it wrote anything leaves no trace.
 
         Raises `PalpateError` when the folder holds a run of another configuration (naming the
         keys that differ), when another process works in it, or when it cannot be used.
@@ -104,12 +108,14 @@ class Run:
         lock = _locked(path)
         try:
             _remove_unfinished_writes(path)
-            if _is_run(path) and (fresh or _came_to_nothing(path, asked)):
+            if fresh and _is_run(path):
                 _remove_run(path)
+            before = None
             if _is_run(path):
                 _check_same(path, asked)
                 _note_other_versions(path)
             else:
+                before = _names(path)
                 started = {
                     "command": shlex.join(sys.argv) if command is None else command,
                     "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -122,12 +128,15 @@ class Run:
         except BaseException:
             lock.close()
             raise
-        return cls(path, asked, lock)
+        return cls(path, asked, lock, before)
 
     def __enter__(self) -> "Run":
         return self
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        refused = kind is not None and issubclass(kind, PalpateError)
+        if refused and self._before is not None and _names(self.path) <= self._before | _BEGUN:
+            _remove_run(self.path)
         self.close()
 
     def close(self) -> None:
@@ -269,10 +278,8 @@ def _is_run(path: Path) -> bool:
     return (path / CONFIGURATION).exists() and (path / ENVIRONMENT).exists()
 
 
-def _came_to_nothing(path: Path, configuration: dict[str, Any]) -> bool:
-    """Whether a run of another configuration began in the folder, and nothing has come of it."""
-    wrote = {one.name for one in path.iterdir()} - {CONFIGURATION, ENVIRONMENT, _LOCK}
-    return not wrote and bool(_differences(read_json(path / CONFIGURATION), configuration))
+def _names(path: Path) -> set[str]:
+    return {one.name for one in path.iterdir()}
 
 
 def _checkpoints(path: Path) -> list[tuple[int, Path]]:

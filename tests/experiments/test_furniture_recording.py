@@ -56,7 +56,11 @@ def test_what_is_said_to_mean_something_else_is_refused(keys, says):
         checked(made(**keys))
 
 
-@pytest.mark.parametrize("unit", ["", "N,N,N m", "N, N, Nm", "N, N, N*m"])
+def test_a_frame_that_is_not_said_is_that_of_the_poses():
+    assert checked(made(**{WRENCH: {"frame": ""}})).trials
+
+
+@pytest.mark.parametrize("unit", ["", "N,N,N m", "N, N, Nm", "(N, N, N⋅m)", "N, N m"])
 def test_units_may_be_written_otherwise_or_not_at_all(unit):
     assert checked(made(**{WRENCH: {"unit": unit}})).trials[0][WRENCH].values.shape == (50, 1, 3)
 
@@ -75,6 +79,16 @@ def test_recordings_of_one_body_are_of_one_outline():
         starting_furniture(checked(join([made(), other])), 0.02)
     with pytest.raises(PalpateError, match="'box' has another outline in what is scored"):
         check_alike(made(), other)
+    check_alike(made(), other, sized=True)
+    assert starting_furniture(checked(join([made(), other])), 0.02, (1.0, 1.0)).bodies == 1
+    begun_elsewhere = [*np.roll(SQUARE, 1, axis=0).tolist(), SQUARE[3]]
+    check_alike(made(), made(outline=begun_elsewhere))
+
+
+def test_broken_json_is_not_taken_for_recordings_that_differ():
+    broken = dataclasses.replace(made(), provenance={"outlines": "0.5 0.5; 0.5 -0.5"})
+    with pytest.raises(PalpateError, match='"outlines" is not JSON'):
+        starting_furniture(checked(broken), 0.02)
 
 
 def test_what_was_put_right_in_a_channel_is_still_told():
@@ -84,23 +98,44 @@ def test_what_was_put_right_in_a_channel_is_still_told():
     assert "49 of 50 rows were out of order" in notes[0]
 
 
+def standing(angles, rolling, sideways, bodies=1):
+    """Draws of squares with a wheel each, at angles (draws, bodies) in rad; forces in N."""
+    wheels = (np.asarray(values)[..., None] for values in (angles, rolling, sideways))
+    model = furniture([np.array(SQUARE)] * bodies, wheels=1)
+    return with_values(model, turned_wheel(*wheels))
+
+
 def test_wheels_are_told_by_where_they_roll():
     """Draws about a wheel across the body: 89 degrees are next to -89."""
-    random = np.random.default_rng(0)
+    random, size = np.random.default_rng(0), (1000, 1)
+    anywhere, spread = random.uniform(-2, 2, size), np.exp(random.normal(1.0, 1.0, size))
+    prior = standing(anywhere, spread, 20.0 * spread)
     degrees = np.concatenate([random.normal(88.0, 4.0, 500), random.normal(-92.0, 4.0, 500)])
-    drawn = turned_wheel(np.radians(degrees)[:, None, None], 2.0, 300.0)
-    model = with_values(furniture([np.array(SQUARE)], wheels=1), drawn)
-    direction, rolling, sideways = wheel_rows(model, viscous=False)
+    models = standing(np.radians(degrees)[:, None], 2.0, 300.0)
+    direction, rolling, sideways = wheel_rows(models, prior, viscous=False)
     assert abs(direction["value"][0]) == pytest.approx(88.0, abs=0.6)
     assert direction["upper"][0] - direction["lower"][0] == pytest.approx(2 * 1.645 * 4.0, rel=0.1)
-    assert (direction["unit"], direction["verdict"]) == ("deg", None)
+    assert (direction["unit"], direction["verdict"], direction["derived"]) == ("deg", None, True)
     for row, force in ((rolling, 2.0), (sideways, 300.0)):
         told = [row["value"], row["lower"], row["upper"]]
         assert told == [pytest.approx([force], rel=1e-4)] * 3
-    anywhere = turned_wheel(random.uniform(-2, 2, (1000, 1, 1)), 2.0, 300.0)
-    row, *_ = wheel_rows(with_values(model, anywhere), viscous=True)
-    assert row["verdict"] == "not told by the data for 1 of 1 elements"
-    assert wheel_rows(furniture([np.array(SQUARE)], wheels=0), viscous=False) == []
+        assert row["verdict"] is None
+    untold = "not told by the data: the interval is the prior's"
+    verdicts = [row["verdict"] for row in wheel_rows(standing(anywhere, 2.0, 300.0), prior, True)]
+    assert verdicts == [untold, None, None]
+    assert [row["verdict"] for row in wheel_rows(prior, prior, viscous=True)] == [untold] * 3
+
+
+def test_only_wheels_that_there_are_are_told():
+    angles = np.tile([0.3, 1.1], (50, 1))
+    models = standing(angles, 2.0, 300.0, bodies=2)
+    second = dataclasses.replace(models, wheel=np.array([[0.0], [1.0]]))
+    (degrees,) = wheel_rows(second, models, viscous=False)[0]["value"]
+    assert degrees == pytest.approx(np.degrees(1.1))
+    none = dataclasses.replace(models, wheel=np.zeros((2, 1)))
+    assert wheel_rows(none, models, viscous=False) == []
+    fixed = furniture([np.array(SQUARE)], wheels=0)
+    assert wheel_rows(fixed, fixed, viscous=False) == []
 
 
 def test_the_page_on_furniture_shows_how_a_recording_of_ones_own_is_made(tmp_path, monkeypatch):

@@ -82,7 +82,7 @@ def test_another_goal_and_fixed_objects_are_heard(tmp_path, map_file):
     path = run(PlanNamo(map=map_file, out=tmp_path / "near", goal=(2.0, 2.0, 0.5)))
     assert json.loads(path.read_text())["goal"] == [2.0, 2.0, 0.5]
     assert read_plan(path).transfers == 0
-    with pytest.raises(PalpateError, match="walls and what may not be moved"):
+    with pytest.raises(PalpateError, match="walls or what may not be moved"):
         run(PlanNamo(map=map_file, out=tmp_path / "fixed", immovable=("a",)))
     with pytest.raises(PalpateError, match="no file"):
         run(PlanNamo(map=tmp_path / "absent.svg", out=tmp_path / "none"))

@@ -14,7 +14,8 @@ from palpate.planning.movable_obstacles.occupancy import Space
 from palpate.planning.movable_obstacles.openings import OpeningSearch
 from palpate.planning.movable_obstacles.physics_manipulation import ConstrainedManipulation, Drawn
 from palpate.planning.movable_obstacles.plan import TRANSFER, Plan
-from palpate.planning.movable_obstacles.planner import NoWayError, Planner
+from palpate.planning.movable_obstacles.planner import Planner
+from palpate.planning.movable_obstacles.policy import NoWayError
 from palpate.planning.movable_obstacles.primitives import AXIS, PIVOT, STATIC, Constraint
 from palpate.planning.movable_obstacles.regrasps import stops_of
 from palpate.planning.movable_obstacles.situation import whole

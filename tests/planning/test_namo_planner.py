@@ -21,7 +21,8 @@ from palpate.planning.movable_obstacles.occupancy import Space
 from palpate.planning.movable_obstacles.openings import CARRYING, HANDLING, TURNING
 from palpate.planning.movable_obstacles.paths import distances
 from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, Segment, read_plan, write_plan
-from palpate.planning.movable_obstacles.planner import NoWayError, Planner
+from palpate.planning.movable_obstacles.planner import Planner
+from palpate.planning.movable_obstacles.policy import NoWayError
 from palpate.planning.movable_obstacles.regions import regions_of
 from palpate.planning.movable_obstacles.tree_search import Settings
 from palpate.planning.movable_obstacles.verification import faults_of
@@ -201,7 +202,7 @@ def test_the_nearer_of_two_doors_is_taken_unless_its_object_may_not_be_moved():
     assert planned(world).moved == ["near"]
     plan = Planner().plan(world, immovable=["near"])
     assert plan.moved == ["far"]
-    with pytest.raises(NoWayError, match=r"walls and what .* \('near', 'far'\) close"):
+    with pytest.raises(NoWayError, match=r"walls or what .* \('near', 'far'\) close"):
         Planner().plan(world, immovable=["near", "far"])
     with pytest.raises(PalpateError, match="no movable 'door'"):
         Planner().plan(world, immovable=["door"])
@@ -215,6 +216,15 @@ def test_a_door_that_the_cells_miss_is_found_in_smaller_ones():
     plan = Planner().plan(world)
     assert plan.moved == ["a"]
     assert not faults_of(plan, world)
+
+
+@pytest.mark.parametrize("goal", [(7.58, 0.42), (4.5, 2.58)])
+def test_a_goal_in_a_corner_that_the_cells_miss_is_reached_in_smaller_ones(goal):
+    world = two_rooms({"a": IN_DOOR}, cell=0.2, margin=0.1, goal=goal)
+    for one in (world, dataclasses.replace(world, start=(*goal, 0.0), goals=(world.start,))):
+        plan = Planner().plan(one)
+        assert plan.moved == ["a"]
+        assert not faults_of(plan, one)
 
 
 def test_who_only_pushes_moves_things_straight_ahead_and_nothing_else():

@@ -267,6 +267,7 @@ def test_other_agents_and_drawn_walls_stand_in_the_way(tmp_path):
         ({"collision_margin_cm": 0}, 0.1),  # namosim takes 0 as not given
         ({"collision_margin_cm": None}, 0.1),
         ({"collision_margin": 0.25}, 0.25),
+        ({"collision_margin": 0}, 0.0),
         ({}, 0.1),
     ],
 )
@@ -280,6 +281,8 @@ def test_an_agent_may_be_drawn_instead_of_having_a_pose(tmp_path):
     layers = f'{LAYERS}<g id="robots_layer">{other}{drawn}</g>'
     world = read_map(namosim_map(tmp_path, layers, agents=[{"id": "a", "radius": 0.2}]))
     assert world.start == pytest.approx((0.0, 3.0, math.pi / 2))
+    side = np.ptp(world.robot.outline, axis=0)
+    assert world.robot.radius == pytest.approx(np.hypot(*side) / 2)  # as namosim: what is drawn
 
 
 @pytest.mark.parametrize("where", [{}, {"behavior": {"parameters": {"push_only": True}}}])

@@ -184,6 +184,23 @@ def test_gaps_and_nothing_but_gaps_are_drawn_as_gaps(tmp_path):
 EVIL = "</script><script>alert(1)</script><img src='http://x/y' onerror=alert(1)>\"'&<!--body-->"
 
 
+def test_what_the_data_tell_is_counted_and_what_follows_from_it_is_not(tmp_path):
+    untold = "not told by the data: the interval is the prior's"
+    rows = [
+        parameter("mass", [8.0, 9.0], "kg", "") | {"lower": [7.0, 8.5], "upper": [8.5, 9.5]},
+        parameter("friction", [0.1], "", "", lower=[0.0], upper=[0.4], verdict=untold),
+        parameter("radius", [0.2], "m", "", fixed=True),
+        parameter("roll_direction", [3.0], "deg", "", lower=[-1.0], upper=[5.0], derived=True),
+    ]
+    run = write_run(tmp_path / "identify", "identify", parameters=rows)
+    page = page_of(build_report([run], tmp_path / "report.html", "A table"))
+    assert "1 of 3 parameters were identified" in page.text
+    assert "7 to 8.5; 8.5 to 9.5" in page.text  # a few elements one by one
+    assert "derived" in page.text
+    drawn = [row for text in page.data for row in re.findall("roll.direction", text)]
+    assert drawn == []  # degrees have no place on a logarithmic axis
+
+
 def test_nobodys_text_becomes_markup(tmp_path):
     group = EVIL.replace("/", "").replace(".", "")
     arrays = {"motion.time": TIME, f"motion.{EVIL}": POINTS, f"motion/{group}.{EVIL}": POINTS}

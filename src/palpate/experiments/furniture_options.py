@@ -96,7 +96,7 @@ class IdentifyFurniture(IdentifyBayesian):
 
         if self.wheels < 1:
             raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
-        check_alike(*recordings)
+        check_alike(*recordings, sized=self.size is not None)
         return starting_furniture(recordings[0], period, self.size, wheels=self.wheels)
 
     def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
@@ -118,10 +118,11 @@ class IdentifyFurniture(IdentifyBayesian):
         assert isinstance(model, Planar)  # by `hypotheses`
         return meeting(model, *recordings)
 
-    def meanings(self, models: Model) -> list[dict[str, Any]]:
+    def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:
         """See `IdentifyBayesian.meanings`."""
         from palpate.experiments.furniture_wheels import wheel_rows
         from palpate.models.planar import Planar
 
         assert isinstance(models, Planar)  # by `hypotheses`
-        return wheel_rows(models, viscous=self.law == "viscous")
+        assert isinstance(prior, Planar)
+        return wheel_rows(models, prior, viscous=self.law == "viscous")

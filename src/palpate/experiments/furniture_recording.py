@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import shapely
 
 from palpate.errors import PalpateError
 from palpate.models.planar import Planar
@@ -27,6 +28,7 @@ APART = 2.5  # m between pieces that are handled, so that they do not meet
 UNITS = {POSE: "m, m, rad", WRENCH: "N, N, N m"}
 SLOWEST = 0.25  # s between frames: of less nothing can be told from a push
 LARGEST = 50.0  # m of an outline
+SAME = 1e-3  # m between corners of the same outline
 
 
 def checked(recording: Recording) -> Recording:
@@ -67,12 +69,12 @@ def checked(recording: Recording) -> Recording:
 
 def _check_meant(trial: str, channel: Channel, unit: str, frame: str) -> None:
     """Refuse what is said to be in another unit or frame, and clocks that are not in seconds."""
-    said, meant = (re.sub(r"[\s*·]", "", text) for text in (channel.unit, unit))
-    if said and said != meant:
+    each = ", ".join(dict.fromkeys(unit.split(", ")))  # "m, rad" says as much as "m, m, rad"
+    if channel.unit and _plain(channel.unit) not in (_plain(unit), _plain(each)):
         raise PalpateError(
             f"channel '{channel.name}' of trial '{trial}' is in '{channel.unit}': expected {unit}"
         )
-    if channel.frame != frame:
+    if channel.frame and frame and channel.frame != frame:
         raise PalpateError(
             f"channel '{channel.name}' of trial '{trial}' is in the frame '{channel.frame}' and "
             f"the poses are in '{frame}': expected both in the same"
@@ -84,6 +86,11 @@ def _check_meant(trial: str, channel: Channel, unit: str, frame: str) -> None:
             f"{f'{count} frames{apart}' if count > 1 else 'one frame'}: expected many, at most "
             f"{SLOWEST:g} s apart, with stamps in seconds"
         )
+
+
+def _plain(unit: str) -> str:
+    """Without what may be written one way or another."""
+    return re.sub(r"[\s*·⋅.()\[\]-]", "", unit.replace("radians", "rad"))
 
 
 def names_of(recording: Recording) -> tuple[str, ...]:
@@ -101,8 +108,11 @@ def names_of(recording: Recording) -> tuple[str, ...]:
     return tuple(told)
 
 
-def check_alike(*recordings: Recording) -> None:
-    """Raise `PalpateError` unless all are of as many bodies, of the same names and outlines."""
+def check_alike(*recordings: Recording, sized: bool = False) -> None:
+    """Raise `PalpateError` unless all are of as many bodies, of the same names and outlines.
+
+    Bodies that are `sized` in another way may have any outlines.
+    """
     names = [names_of(recording) for recording in recordings]
     named = {of for of, each in zip(names, recordings, strict=True) if "bodies" in each.provenance}
     if len(named) > 1 or len(set(map(len, names))) > 1:
@@ -111,10 +121,14 @@ def check_alike(*recordings: Recording) -> None:
             f"the recordings are of {told}: expected the same bodies in what is fitted and in what "
             "is scored"
         )
-    outlines = [told for each in recordings if (told := _told(each, "outlines")) is not None]
+    outlines = [] if sized else [_told(each, "outlines") for each in recordings]
     for name in names[0]:
-        drawn = [one[name] for one in outlines if isinstance(one, dict) and name in one]
-        if any(one != drawn[0] for one in drawn):
+        corners = [
+            shapely.MultiPoint(_polygon(one[name], f"outline of '{name}'"))
+            for one in outlines
+            if isinstance(one, dict) and name in one
+        ]
+        if any(corners[0].hausdorff_distance(other) > SAME for other in corners[1:]):
             raise PalpateError(
                 f"'{name}' has another outline in what is scored than in what is fitted: expected "
                 "the same body"
@@ -132,7 +146,7 @@ def starting_furniture(
     Raises `PalpateError` when there are neither, or they are malformed.
     """
     names = names_of(recording)
-    told = _told(recording, "outlines")
+    told = None if size is not None else _told(recording, "outlines")
     if size is not None:
         if not all(math.isfinite(s) and s > 0 for s in size):
             raise PalpateError(f"a size is two positive lengths in m, not {size}")
@@ -257,12 +271,20 @@ def _told(recording: Recording, key: str) -> Any:
     try:
         return json.loads(str(text))
     except ValueError as error:
-        if "; " in str(text):  # as `join` puts together what differs
+        parts = str(text).split("; ")  # as `join` puts together what differs
+        if len(parts) > 1 and all(map(_is_json, parts)):
             raise PalpateError(
-                f'the recordings say different things of "{key}": expected recordings of the same '
-                "bodies"
+                f'the recordings say different things of "{key}": expected the same of all'
             ) from error
         raise PalpateError(f'the recording\'s "{key}" is not JSON: {error}') from error
+
+
+def _is_json(text: str) -> bool:
+    try:
+        json.loads(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _polygon(points: Any, what: str, most: float = math.inf) -> np.ndarray:

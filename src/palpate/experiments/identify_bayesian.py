@@ -26,6 +26,7 @@ from palpate.identification.prediction import or_nan
 from palpate.identification.predictive import Predicted, Score, check_seen
 from palpate.identification.segments import Segments, cut, difference, noise_scale
 from palpate.identification.settled import Settled, settle_each
+from palpate.identification.verdicts import verdict
 from palpate.models.model import Model
 from palpate.parameters import format_value
 from palpate.recording import Aligned, Recording, join
@@ -178,7 +179,6 @@ def rows(posterior: Posterior) -> list[dict[str, Any]]:
     found = []
     for path, declaration in declared.items():
         of = [row for row in posterior.table if row.name.partition("[")[0] == path]
-        told = sum(not row.undecided for row in of)
         found.append({
             "name": path,
             "value": [row.median for row in of],
@@ -188,17 +188,9 @@ def rows(posterior: Posterior) -> list[dict[str, Any]]:
             "shared": declaration.shared,
             "lower": [row.lower for row in of],
             "upper": [row.upper for row in of],
-            "verdict": _verdict(told, len(of)),
+            "verdict": verdict(np.array([row.undecided for row in of])),
         })  # fmt: skip
     return found
-
-
-def _verdict(told: int, elements: int) -> str | None:
-    if told == elements:
-        return None
-    if told == 0:
-        return "not told by the data: the interval is the prior's"
-    return f"not told by the data for {elements - told} of {elements} elements"
 
 
 def _write(
@@ -219,6 +211,7 @@ def _write(
     model = posterior.target.coordinates.reference
     predicted = posterior.predict(pieces)
     score = posterior.score(pieces)
+    meanings = options.meanings(posterior.models(), posterior.prior)
     write_evidence(run.path, _horizon(predicted, pieces, model))
     settings = run.configuration | {
         "structure": found.structure,
@@ -241,7 +234,7 @@ def _write(
                 else "none: errors and coverage are those on the fitted trials",
             },
             wall_time_s=run.elapsed,
-            parameters=[*rows(posterior), *options.meanings(posterior.models())],
+            parameters=[*rows(posterior), *meanings],
             warnings=list(posterior.warnings),
         ).to_dict()
     )

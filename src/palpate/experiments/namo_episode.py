@@ -24,7 +24,8 @@ from palpate.planning.movable_obstacles.belief import Belief
 from palpate.planning.movable_obstacles.map import Map
 from palpate.planning.movable_obstacles.physics_manipulation import ConstrainedManipulation, Drawn
 from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, timed
-from palpate.planning.movable_obstacles.planner import NoWayError, Planner
+from palpate.planning.movable_obstacles.planner import Planner
+from palpate.planning.movable_obstacles.policy import NoWayError
 from palpate.planning.movable_obstacles.primitives import (
     AXIS,
     FREE,

@@ -17,7 +17,8 @@ from shapely.geometry import Polygon, box
 
 from palpate.planning.movable_obstacles.map import Map, Movable, Robot, map_of
 from palpate.planning.movable_obstacles.plan import Plan, timed
-from palpate.planning.movable_obstacles.planner import NoWayError, Planner
+from palpate.planning.movable_obstacles.planner import Planner
+from palpate.planning.movable_obstacles.policy import NoWayError
 from palpate.planning.movable_obstacles.verification import faults_of
 from palpate.report.namo_picture import plan_picture
 from palpate.result import Figure, Result

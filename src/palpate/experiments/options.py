@@ -187,8 +187,11 @@ class IdentifyBayesian(Reading, ABC):
         """The model without what cannot show in these recordings, for less work."""
         return model
 
-    def meanings(self, models: Model) -> list[dict[str, Any]]:
-        """Rows for `result.json` of what follows from the parameters of draws, as one model."""
+    def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:
+        """Rows for `result.json` of what follows from parameters, "derived" in each.
+
+        `models` are the posterior's draws as one model, `prior` those of the prior.
+        """
         return []
 
 

@@ -10,7 +10,8 @@ from palpate.experiments import folders
 from palpate.experiments.namo_options import PlanNamo
 from palpate.planning.movable_obstacles.map_files import read_map
 from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, read_plan, write_plan
-from palpate.planning.movable_obstacles.planner import NoWayError, Planner, unmoved
+from palpate.planning.movable_obstacles.planner import Planner, unmoved
+from palpate.planning.movable_obstacles.policy import NoWayError
 from palpate.planning.movable_obstacles.verification import faults_of
 from palpate.report.namo_picture import plan_animation, plan_picture
 from palpate.result import Figure, Result

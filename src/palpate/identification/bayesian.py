@@ -39,13 +39,14 @@ from palpate.identification.local_global import compiled_meanwhile, local_global
 from palpate.identification.predictive import Predicted, Score
 from palpate.identification.segments import Segments, cut, noise_scale
 from palpate.identification.settled import Settled, factors_of, joined, settle_each
+from palpate.identification.verdicts import UNDECIDED
 from palpate.models.model import Model
 from palpate.parameters import value_of
 from palpate.recording import Aligned
 
 MIXED, ENOUGH = 1.01, 400.0  # R-hat and effective sizes that chains should reach (Vehtari et al.)
-UNDECIDED = 0.7  # posterior over prior standard deviation above which the data say nothing
 WIDEST = 40  # coordinates among which a mixture that proposes can be learnt
+PRIOR_DRAWS = 1000  # that the posterior's spread is held against
 PREDICTING = 400  # draws that a prediction is made of
 
 
@@ -108,6 +109,15 @@ class Posterior:
         return self.target.models(jnp.asarray(self.flat if count is None else self.thinned(count)))
 
     @cached_property
+    def prior(self) -> Model:
+        """Models as one, as `models`, of draws from the prior."""
+        return self.target.models(self._prior_draws)
+
+    @cached_property
+    def _prior_draws(self) -> Float[Array, "draws free"]:
+        return jax.random.normal(jax.random.key(0), (PRIOR_DRAWS, self.target.dimension))
+
+    @cached_property
     def values(self) -> dict[str, Float[np.ndarray, "chains draws ..."]]:
         """Legal values of the free parameters by path, in their units."""
         models = self.models()
@@ -138,8 +148,7 @@ class Posterior:
         """A row for each coordinate: the parameters by element, then the noise scales."""
         position = self.draws.position
         legal = _legal(self.target, jnp.asarray(self.flat))
-        prior = jax.random.normal(jax.random.key(0), (1000, self.target.dimension))
-        share = np.std(legal, axis=0) / np.std(_legal(self.target, prior), axis=0)
+        share = np.std(legal, axis=0) / np.std(_legal(self.target, self._prior_draws), axis=0)
         judged = rhat(position), bulk_size(position), tail_size(position)
         values = self._by_name()
         rows = []

@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from palpate.identification.prediction import Windows, WindowSource, residuals
+from palpate.identification.verdicts import UNDECIDED, verdict
 from palpate.parameters import FreeParameters, value_of
 from palpate.recording import Aligned
 
@@ -24,7 +25,6 @@ Free = dict[str, Array]
 GROUP = 4  # windows whose Jacobians are held at a time
 BLOCKS = 10  # pieces of a trial whose scores are taken as independent of one another
 QUANTILE = 1.6449  # of the normal distribution: 90 % within
-UNDECIDED = 0.7  # posterior over prior standard deviation above which the data say nothing
 
 
 class System(eqx.Module):
@@ -181,7 +181,7 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     # the prior's variance, which is one.
     variance = np.minimum(np.maximum(np.diag(sandwich), np.diag(inverse)), 1.0)
     deviation = unravel(jnp.asarray(np.sqrt(variance), flat.dtype))
-    lower, upper, verdict = {}, {}, {}
+    lower, upper, verdicts = {}, {}, {}
     for path, declaration in coordinates.declarations.items():
         reference = value_of(coordinates.reference, path)
         low, high = (
@@ -192,17 +192,8 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
             for sign in (-QUANTILE, QUANTILE)
         )
         lower[path], upper[path] = low, high
-        share = float(np.mean(np.asarray(deviation[path]) > UNDECIDED))
-        verdict[path] = _verdict(share, np.size(deviation[path]))
-    return Intervals(lower, upper, verdict, _undecided(information, unravel))
-
-
-def _verdict(share: float, elements: int) -> str | None:
-    if share == 0.0:
-        return None
-    if share == 1.0:
-        return "not told by the data: the interval is the prior's"
-    return f"not told by the data for {round(share * elements)} of {elements} elements"
+        verdicts[path] = verdict(np.ravel(deviation[path]) > UNDECIDED)
+    return Intervals(lower, upper, verdicts, _undecided(information, unravel))
 
 
 def _undecided(information: Float[np.ndarray, "free free"], unravel: Any) -> tuple[str, ...]:

@@ -14,8 +14,9 @@ folder and holds plain arrays, named by what they are:
 Several motions stand side by side as `motion/<group>.time`, `motion/<group>.<label>`. NaN is a gap.
 Errors are in the unit that "observation_unit" names in the settings of `result.json`, else in m.
 What else a report shows is read from the run's other files: figures from `result.json`, and from
-its "parameters" rows {name, value, unit, about, fixed, shared, lower, upper, verdict}, where value
-and 90 % interval are a number, a list of them or null; the learning curve from `metrics.jsonl`.
+its "parameters" rows {name, value, unit, about, fixed, shared, lower, upper, verdict, derived},
+where value and 90 % interval are a number, a list of them or null, and what is derived follows from
+others; the learning curve from `metrics.jsonl`.
 """
 
 import io
@@ -67,7 +68,7 @@ class Parameter:
     """What was identified: `value` (elements,) in `unit`, one if all elements share it.
 
     `lower` and `upper` (elements,) are the 90 % interval; NaN where there is none. `verdict` is a
-    sentence about how far to trust it, or None.
+    sentence about how far to trust it, or None. What is `derived` follows from other parameters.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Parameter:
     lower: np.ndarray
     upper: np.ndarray
     verdict: str | None
+    derived: bool = False
 
 
 @dataclass(frozen=True)
@@ -317,5 +319,6 @@ def _parameter(row: dict[str, Any]) -> Parameter:
         fixed=fixed,
         shared=shared,
         verdict=None if verdict is None else str(verdict),
+        derived=bool(row.get("derived", False)),
         **edges,
     )

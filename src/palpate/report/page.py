@@ -200,15 +200,17 @@ def _parameters(rows: Sequence[Parameter]) -> str:
     rows = [row for row in rows if row.value.size]  # a model may have none of a kind
     if not rows:
         return ""
-    untold = [str(row.verdict).startswith("not told by the data:") for row in rows]
-    free = sum(not row.fixed and not lost for row, lost in zip(rows, untold, strict=True))
-    caption = f"{free} of {len(rows)} parameters were identified; a short whisker is one that the "
+    own = [row for row in rows if not row.derived]
+    told = [not str(row.verdict).startswith("not told by the data:") for row in own]
+    free = sum(not row.fixed and known for row, known in zip(own, told, strict=True))
+    caption = f"{free} of {len(own)} parameters were identified; a short whisker is one that the "
     caption += "data determine, a long or missing one is not to be trusted."
-    chart = parameters(rows)
+    chart = parameters(own)
     drawn = _chart(chart) if chart else ""
     cells = []
     for row in rows:
         status = "fixed" if row.fixed else "shared" if row.shared else "free"
+        status = "derived" if row.derived else status
         about = f"{_readable(row.name)}<br><small>{_text(row.about)}</small>"
         verdict = _text(row.verdict or "–")
         cells.append(

@@ -53,6 +53,8 @@ GRID_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin"}
 _MAP_KEYS = GRID_KEYS | {"bounds", "walls", "format", "name"}
 _DRAWING_KEYS = {"movables"}
 _ROBOT_KEYS = {"radius", "footprint", "drive", "reach", "push_only"}
+_TRUTHS = {"yes": True, "on": True, "true": True, "1": True}
+_TRUTHS |= {"no": False, "off": False, "false": False, "0": False}
 _CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
 
 
@@ -224,9 +226,7 @@ def checked_keys(content: Any, what: str, known: set[str]) -> dict[str, Any]:
 
 def robot_from(content: Any, what: str) -> Robot:
     """The robot that `content` describes; see the head of this file."""
-    item = checked_keys(
-        content, f"robot of {what}", {"radius", "footprint", "drive", "reach", "push_only"}
-    )
+    item = checked_keys(content, f"robot of {what}", _ROBOT_KEYS)
     if ("radius" in item) == ("footprint" in item):
         raise PalpateError(f"robot of {what}: expected either a radius or a footprint")
     outline = None
@@ -236,9 +236,7 @@ def robot_from(content: Any, what: str) -> Robot:
     else:
         radius = number(item["radius"], f"the robot's radius in {what}")
     reach = None if item.get("reach") is None else number(item["reach"], f"reach in {what}")
-    push_only = item.get("push_only", False)
-    if not isinstance(push_only, bool):
-        raise PalpateError(f"push_only in {what} is {shown(push_only)}: expected true or false")
+    push_only = truth(item.get("push_only", False), f"push_only in {what}")
     return Robot(radius, str(item.get("drive", "differential")), reach, outline, push_only)
 
 
@@ -287,6 +285,15 @@ def number(value: Any, what: str) -> float:
     if not math.isfinite(found):
         raise PalpateError(f"{what} is {shown(value)}: expected a number")
     return found
+
+
+def truth(value: Any, what: str) -> bool:
+    """0, 1, true or false; also those in a string, and the words that are truths in YAML 1.1."""
+    if isinstance(value, str) and value.strip().lower() in _TRUTHS:
+        return _TRUTHS[value.strip().lower()]
+    if isinstance(value, bool | int) and value in (0, 1):
+        return bool(value)
+    raise PalpateError(f"{what} is {shown(value)}: expected 0, 1, true or false")
 
 
 def _mapping(content: Any, what: str) -> Mapping[Any, Any]:

@@ -2,27 +2,32 @@
 
 The drawing lies on the picture pixel by pixel; its layers hold movables, goals and robots. The
 first agent is the robot, the others stand in its way. An agent without an `initial_pose` stands
-where the layer of robots has a path with its `agent_id`. Angles are degrees.
+where the layer of robots has a path with its `agent_id`, and has its outline. Angles are degrees.
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import shapely
 
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.geometry import checked_pose, shown
+from palpate.planning.movable_obstacles.geometry import (
+    checked_pose,
+    circumscribed_radius,
+    shown,
+)
 from palpate.planning.movable_obstacles.map import Map, Pose, Robot, map_of
-from palpate.planning.movable_obstacles.map_description import number, with_hints
-from palpate.planning.movable_obstacles.map_ros import described, read_grid, truth
+from palpate.planning.movable_obstacles.map_description import number, truth, with_hints
+from palpate.planning.movable_obstacles.map_ros import described, read_grid
 from palpate.planning.movable_obstacles.map_svg import (
     Drawing,
+    drawn_robot,
     drawn_walls,
     goals_of,
     movables_of,
     read_drawing,
-    robot_pose,
 )
 
 
@@ -60,12 +65,12 @@ def read_namosim(path: str | Path) -> Map:
 
 
 def _margin(content: dict[str, Any], what: str) -> float | None:
-    """In m; None, or 0 as namosim takes it, where it is to be a cell."""
+    """In m; None where it is to be a cell, as namosim takes 0 centimetres too."""
     if content.get("collision_margin_cm") is not None:
         centimetres = number(content["collision_margin_cm"], f"collision_margin_cm in {what}")
         return centimetres / 100 or None
     if content.get("collision_margin") is not None:  # older files, in m
-        return number(content["collision_margin"], f"collision_margin in {what}") or None
+        return number(content["collision_margin"], f"collision_margin in {what}")
     return None
 
 
@@ -85,13 +90,14 @@ def _agent(content: Any, drawing: Drawing | None, what: str) -> tuple[Robot, Pos
     )
     pose = agent.get("initial_pose")
     if pose is None:
-        drawn = None if drawing is None else robot_pose(drawing, str(agent["id"]))
+        drawn = None if drawing is None else drawn_robot(drawing, str(agent["id"]))
         if drawn is None:
             raise PalpateError(
                 f"{what} has the agent {shown(agent['id'])} without an initial_pose: expected "
                 "one, or in the drawing's robots_layer a path with its agent_id"
             )
-        return robot, drawn
+        outline, place = drawn
+        return replace(robot, radius=circumscribed_radius(outline), outline=outline), place
     if not isinstance(pose, list) or len(pose) not in (2, 3):
         raise PalpateError(
             f"{what} has the initial_pose {shown(pose)}: expected [x, y, angle] in m and degrees"

@@ -25,13 +25,13 @@ from palpate.planning.movable_obstacles.map_description import (
     read_yaml,
     robot_from,
     side_car,
+    truth,
 )
 
 MODES = ("trinary", "scale", "raw")
 _BROKEN = (OSError, ValueError, SyntaxError)  # what Pillow raises for the middle of a picture
 _THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.25}
 _OPAQUE = 255
-_TRUTHS = {"yes": True, "on": True, "true": True, "no": False, "off": False, "false": False}
 _LEAST_YAW = 1e-3  # rad: less turns a map of 10 m by a centimetre
 Bounds = tuple[float, float, float, float]
 
@@ -115,15 +115,6 @@ def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds
     height, width = blocked.shape
     bounds = (left, bottom, left + width * resolution, bottom + height * resolution)
     return walls_of(blocked[::-1], left, bottom, resolution), bounds, resolution
-
-
-def truth(value: Any, what: str) -> bool:
-    """0, 1, true or false; also the words that are truths in YAML 1.1 and strings in YAML 1.2."""
-    if isinstance(value, str) and value.lower() in _TRUTHS:
-        return _TRUTHS[value.lower()]
-    if isinstance(value, bool | int) and value in (0, 1):
-        return bool(value)
-    raise PalpateError(f"{what} is {shown(value)}: expected 0, 1, true or false")
 
 
 def walls_of(blocked: np.ndarray, left: float, bottom: float, resolution: float) -> BaseGeometry:

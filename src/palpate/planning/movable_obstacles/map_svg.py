@@ -27,7 +27,8 @@ from palpate.planning.movable_obstacles.geometry import (
     circumscribed_radius,
     shown,
 )
-from palpate.planning.movable_obstacles.map import Map, Movable, Robot, map_of
+from palpate.planning.movable_obstacles.map import Map, Movable, Pose, Robot, map_of
+from palpate.planning.movable_obstacles.map_description import truth
 from palpate.planning.movable_obstacles.map_svg_paths import joined, path_outlines, transform_matrix
 
 _LARGEST_FILE = 50_000_000
@@ -36,7 +37,6 @@ _DIRECTIONS = {"orientation", "direction"}
 _TYPES = {"wall", "movable", "shape"} | _DIRECTIONS
 _DRAWN = {"path", "rect", "polygon", "circle", "ellipse", "polyline", "line", "use"}
 _NEVER_DRAWN = {"defs", "clipPath", "mask", "symbol", "marker", "pattern", "metadata"}
-_TRUTHS = {"true": True, "1": True, "false": False, "0": False}
 _DEEPEST = 60
 _LEAST_ARROW = 1e-9  # m
 
@@ -174,9 +174,6 @@ def read_svg(path: str | Path) -> Map:
     outline, (x, y) = centred(checked_polygon(shape.points, f"agent {shown(shape.name)}"))
     parameters = [element for element in agent.iter() if _local(element.tag) == "parameters"]
     said = parameters[0].attrib if parameters else {}
-    push_only = said.get("push_only", "false").strip().lower()
-    if push_only not in _TRUTHS:
-        raise PalpateError(f"push_only in {path} is {shown(push_only)}: expected true or false")
     goals = []
     for element in agent:
         if _local(element.tag) == "goal":
@@ -192,7 +189,7 @@ def read_svg(path: str | Path) -> Map:
             circumscribed_radius(outline),
             said.get("drive_type", "differential"),
             outline=outline,
-            push_only=_TRUTHS[push_only],
+            push_only=truth(said.get("push_only", False), f"push_only in {path}"),
         ),
         start=(x, y, heading),
         goals=goals,
@@ -227,11 +224,15 @@ def goals_of(drawing: Drawing, agent: str) -> list[tuple[float, float, float]]:
     return goals
 
 
-def robot_pose(drawing: Drawing, agent: str) -> tuple[float, float, float] | None:
-    """Where the layer of robots has the path with that `agent_id`; None if it has none."""
+def drawn_robot(drawing: Drawing, agent: str) -> tuple[np.ndarray, Pose] | None:
+    """Outline about its middle, and pose, of the path in the layer of robots with that `agent_id`.
+
+    None where there is no such path.
+    """
     for drawn in drawing.paths:
         if "robots_layer" in drawn.groups and drawn.attributes.get("agent_id") == agent:
-            return (*_middle(drawn, "robot"), _angle(drawn))
+            outline, middle = centred(checked_polygon(drawn.points, f"robot {shown(drawn.name)}"))
+            return outline, (*middle, _angle(drawn))
     return None
 
 
@@ -258,8 +259,8 @@ def _wall(drawn: _Drawn) -> BaseGeometry:
     return shapely.union_all(parts[shapely.area(parts) >= LEAST_AREA])  # no slivers of rounding
 
 
-def _middle(drawn: _Drawn, what: str = "goal") -> tuple[float, float]:
-    return centred(checked_polygon(drawn.points, f"{what} {shown(drawn.name)}"))[1]
+def _middle(drawn: _Drawn) -> tuple[float, float]:
+    return centred(checked_polygon(drawn.points, f"goal {shown(drawn.name)}"))[1]
 
 
 def _direction(drawn: _Drawn) -> float:

@@ -16,14 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.judgement import open_way
 from palpate.planning.movable_obstacles.manipulation import ManipulationModel, RigidCarry
 from palpate.planning.movable_obstacles.map import Map, Pose
 from palpate.planning.movable_obstacles.occupancy import Space, Window
 from palpate.planning.movable_obstacles.openings import OpeningSearch
 from palpate.planning.movable_obstacles.plan import TRANSIT, Plan, timed
-from palpate.planning.movable_obstacles.policy import Move, PolicyGraph
+from palpate.planning.movable_obstacles.policy import Move, NoWayError, PolicyGraph, WalledError
 from palpate.planning.movable_obstacles.regrasps import stops_of
 from palpate.planning.movable_obstacles.situation import (
     Situation,
@@ -43,14 +42,6 @@ _DEPTH = 2  # blockers of blockers that are cleared away
 _MOST_BLOCKING = 4  # objects in the way of one
 _HALVINGS = 2  # of cells that walls alone seem to close
 _GROWN = 2.5  # sizes of object and robot that a window reaches beyond what it holds
-
-
-class NoWayError(PalpateError):
-    """There is no plan, as far as was searched; says which objects keep which regions closed."""
-
-
-class _WalledError(NoWayError):
-    """No way in these cells, whatever is moved."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +122,7 @@ class Planner:
         begin = Situation(Space(world, fixed), np.array(world.start))
         try:
             return self._planned(begin, goal, sizes, regrasps=False)
-        except _WalledError:
+        except WalledError:
             finer = world.finer if halvings else None
             if finer is None:
                 raise
@@ -157,7 +148,7 @@ class Planner:
                 sizes |= {"regions": graph.regions.free, "borders": len(graph.regions.borders)}
             reached = self._advance(graph, now, goal, sizes, regrasps)
             if reached is None or stale == _STALE:
-                error = NoWayError if graph.tried else _WalledError
+                error = NoWayError if graph.tried else WalledError
                 raise error(graph.complaint(world.name))
             now = reached
             if len(now.segments) and now.segments[-1].kind == TRANSIT:

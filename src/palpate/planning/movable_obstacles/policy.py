@@ -37,6 +37,14 @@ class Move:
     keep_out: BaseGeometry | None = None
 
 
+class NoWayError(PalpateError):
+    """There is no plan, as far as was searched; says which objects keep which regions closed."""
+
+
+class WalledError(NoWayError):
+    """No way in these cells, whatever is moved."""
+
+
 class PolicyGraph:
     """The abstract actions of an arrangement: state 0 is the start, the last one the goal.
 
@@ -206,13 +214,13 @@ class PolicyGraph:
         if not self.tried:
             fixed = [f"'{one}'" for one in self.space.fixed]
             more = ", ..." if len(fixed) > 6 else ""
-            closing = f"walls and what may not be moved ({', '.join(fixed[:6])}{more})"
+            closing = f"walls or what may not be moved ({', '.join(fixed[:6])}{more})"
             return (
                 f"no way to the goal on map '{name}': {closing if fixed else 'walls'} close the "
                 f"robot's {size} off from the goal, so that nothing that may be moved could open "
-                "it (other robots on the map count as walls; seen in cells of "
-                f"{self.space.cell:.3g} m, with a margin of {self.space.map.margin:.3g} m: smaller "
-                "ones may find a narrow way)"
+                "it (other robots on the map count as walls; cells down to "
+                f"{self.space.cell:.3g} m were tried, with a margin of {self.space.map.margin:.3g} "
+                "m: a smaller margin may open a narrow way)"
             )
         kept = ", ".join(f"'{name}'" for name in list(self.tried)[:6])
         stuck = [f"'{name}'" for name in self.tried if self._overlaps(name)][:6]
@@ -238,9 +246,15 @@ def _node(space: Space, regions: Regions, point: np.ndarray, what: str) -> int:
     open_cells = ~space.static
     joined = links(space, whole(space), point, open_cells, {name: 0.0 for name in space.names})
     if not joined:
+        place = f"the {what} ({point[0]:.3g}, {point[1]:.3g})"
+        if shapely.distance(space.map.walls, shapely.Point(point[:2])) >= space.map.clearance:
+            raise WalledError(
+                f"no way leads from {place} in cells down to {space.cell:.3g} m, as walls are near "
+                "on several sides: expected a freer place, or a smaller margin"
+            )
         raise PalpateError(
-            f"the {what} ({point[0]:.3g}, {point[1]:.3g}) is nearer to a wall than the robot's "
-            f"radius {space.map.robot.radius:.3g} m and the margin {space.map.margin:.3g} m allow: "
-            "expected a freer place, or a smaller margin"
+            f"{place} is nearer to a wall than the robot's radius {space.map.robot.radius:.3g} m "
+            f"and the margin {space.map.margin:.3g} m allow: expected a freer place, or a smaller "
+            "margin"
         )
     return int(regions.node.ravel()[min(joined, key=lambda link: link[1])[0]])

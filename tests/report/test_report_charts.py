@@ -82,10 +82,10 @@ def test_a_long_curve_is_smoothed_within_a_stage_and_thinned():
     assert smooth["y"][750] == 7.0
 
 
-def row(name, value, lower=np.nan, upper=np.nan, fixed=False):
+def row(name, value, lower=np.nan, upper=np.nan, fixed=False, verdict=None):
     value = np.atleast_1d(np.asarray(value, float))
     edges = (np.broadcast_to(np.asarray(edge, float), value.shape) for edge in (lower, upper))
-    return Parameter(name, value, "N", "", fixed, False, *edges, None)
+    return Parameter(name, value, "N", "", fixed, False, *edges, verdict)
 
 
 def test_whiskers_are_relative_to_the_median_and_cut_with_an_arrow():
@@ -96,15 +96,19 @@ def test_whiskers_are_relative_to_the_median_and_cut_with_an_arrow():
         row("given", 5.0, fixed=True),
         row("unknown", 5.0),
         row("signed", -1.0, -2.0, 1.0),
+        row("prior", 4.0, 2.0, 8.0, verdict="not told by the data: the interval is the prior's"),
     ]
     chart = parameters(rows)
-    assert len(chart["layout"]["yaxis"]["ticktext"]) == 5  # the signed one is left to the table
+    assert len(chart["layout"]["yaxis"]["ticktext"]) == 6  # the signed one is left to the table
     whiskers = chart["data"][0]["x"]
     assert whiskers[:2] == [0.5, 1.5]
     assert whiskers[3:5] == [0.5, 20.0]  # ten times beyond the largest value shown
     assert whiskers[6:8] == [0.25, 1.0]
     (sure,) = traces(chart, name="identified, 90 % interval")
     assert sure["x"] == [1.0, 1.0, 0.5, 1.0, 2.0]
+    (untold,) = traces(chart, name="not told by the data")
+    assert untold["text"] == ["prior = 4 N (2 to 8)"]
+    assert whiskers[15:17] == [0.5, 2.0]
     assert traces(chart, name="fixed")[0]["x"] == [1.0]
     assert traces(chart, name="no interval")[0]["x"] == [1.0]
     assert [t["marker"]["symbol"] for t in traces(chart, name="beyond")] == ["triangle-right"]

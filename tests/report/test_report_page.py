@@ -188,7 +188,7 @@ def test_what_the_data_tell_is_counted_and_what_follows_from_it_is_not(tmp_path)
     untold = "not told by the data: the interval is the prior's"
     rows = [
         parameter("mass", [8.0, 9.0], "kg", "") | {"lower": [7.0, 8.5], "upper": [8.5, 9.5]},
-        parameter("friction", [0.1], "", "", lower=[0.0], upper=[0.4], verdict=untold),
+        parameter("friction", [0.1], "1", "", lower=[0.0], upper=[0.4], verdict=untold),
         parameter("radius", [0.2], "m", "", fixed=True),
         parameter("roll_direction", [3.0], "deg", "", lower=[-1.0], upper=[5.0], derived=True),
     ]
@@ -197,6 +197,7 @@ def test_what_the_data_tell_is_counted_and_what_follows_from_it_is_not(tmp_path)
     assert "1 of 3 parameters were identified" in page.text
     assert "7 to 8.5; 8.5 to 9.5" in page.text  # a few elements one by one
     assert "derived" in page.text
+    assert "0.1 1" not in page.text
     drawn = [row for text in page.data for row in re.findall("roll.direction", text)]
     assert drawn == []  # degrees have no place on a logarithmic axis
 

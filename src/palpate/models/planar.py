@@ -135,7 +135,7 @@ class Planar(Model):
         "N",
         prior=LogNormal(5.0, 2.0),
         spread=0.3,
-        about="as `wheel_along`, along the body's y axis",
+        about="as wheel_along, along the body's y axis",
     )
     wheel_shear: Float[Array, "*batch bodies wheels"] = parameter(
         "1",

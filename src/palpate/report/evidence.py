@@ -65,7 +65,7 @@ class Curves:
 
 @dataclass(frozen=True)
 class Parameter:
-    """What was identified: `value` (elements,) in `unit`, one if all elements share it.
+    """What was identified: `value` (elements,) in `unit` (empty: none), one if all share it.
 
     `lower` and `upper` (elements,) are the 90 % interval; NaN where there is none. `verdict` is a
     sentence about how far to trust it, or None. What is `derived` follows from other parameters.
@@ -81,6 +81,11 @@ class Parameter:
     upper: np.ndarray
     verdict: str | None
     derived: bool = False
+
+    @property
+    def untold(self) -> bool:
+        """Whether the data left all of it where the prior had it."""
+        return str(self.verdict).startswith("not told by the data:")
 
 
 @dataclass(frozen=True)
@@ -310,11 +315,11 @@ def _parameter(row: dict[str, Any]) -> Parameter:
     fixed, shared = bool(row.get("fixed", False)), bool(row.get("shared", False))
     if (fixed or shared) and value.size and np.ptp(value) == 0.0:  # one number, many times
         value, edges = value[:1], {name: edge[:1] for name, edge in edges.items()}
-    verdict = row.get("verdict")
+    verdict, unit = row.get("verdict"), str(row.get("unit", ""))
     return Parameter(
         name=str(row["name"]),
         value=value,
-        unit=str(row.get("unit", "")),
+        unit="" if unit == "1" else unit,
         about=str(row.get("about", "")),
         fixed=fixed,
         shared=shared,

@@ -201,8 +201,7 @@ def _parameters(rows: Sequence[Parameter]) -> str:
     if not rows:
         return ""
     own = [row for row in rows if not row.derived]
-    told = [not str(row.verdict).startswith("not told by the data:") for row in own]
-    free = sum(not row.fixed and known for row, known in zip(own, told, strict=True))
+    free = sum(not row.fixed and not row.untold for row in own)
     caption = f"{free} of {len(own)} parameters were identified; a short whisker is one that the "
     caption += "data determine, a long or missing one is not to be trusted."
     chart = parameters(own)

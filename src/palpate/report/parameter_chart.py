@@ -9,8 +9,14 @@ import numpy as np
 from palpate.report.charts import Chart, empty_layout, plain_text, titled_axis
 from palpate.report.evidence import Parameter
 
-_SURE, _FIXED, _UNSURE = "identified, 90 % interval", "fixed", "no interval"
-_SYMBOLS = {_SURE: "circle", _FIXED: "circle-open", _UNSURE: "x-thin-open"}
+_SURE, _UNTOLD = "identified, 90 % interval", "not told by the data"
+_FIXED, _UNSURE = "fixed", "no interval"
+_SYMBOLS = {
+    _SURE: "circle",
+    _UNTOLD: "diamond-open",
+    _FIXED: "circle-open",
+    _UNSURE: "x-thin-open",
+}
 _REACH = 10.0  # an interval that goes on beyond this factor is drawn to there, with an arrow
 _ARROWS = "triangle-left", "triangle-right"
 _TICKS = [0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0]
@@ -35,8 +41,9 @@ def parameters(rows: Sequence[Parameter]) -> Chart | None:
     """Dots with 90 % whiskers relative to each parameter's median, on a log axis; no unit.
 
     A parameter of several elements has a dot for each, one under the other. Filled is what was
-    identified, hollow what was fixed, a cross what has no interval. Parameters that are not
-    positive have no place on the axis and are left to the table; None when there is no other.
+    identified, hollow what was fixed, a diamond what the data did not tell, a cross what has no
+    interval. Parameters that are not positive have no place on the axis and are left to the table;
+    None when there is no other.
     """
     drawn = [row for row in rows if row.value.size and np.all(row.value > 0)]
     if not drawn:
@@ -49,7 +56,7 @@ def parameters(rows: Sequence[Parameter]) -> Chart | None:
         top = dots[-1].y + _GAP
     least = min(dot.value for dot in dots) / _REACH
     most = max(dot.value for dot in dots) * _REACH
-    intervals = [dot for dot in dots if dot.kind == _SURE]
+    intervals = [dot for dot in dots if dot.kind in (_SURE, _UNTOLD)]
     shown = [(max(dot.lower, least), min(dot.upper, most)) for dot in intervals]
     data = [_whiskers([(dot.y, *ends) for dot, ends in zip(intervals, shown, strict=True)])]
     for kind, symbol in _SYMBOLS.items():
@@ -90,10 +97,11 @@ def _dots(row: Parameter, top: float, pitch: float) -> Iterator[_Dot]:
         zip(row.value, row.lower, row.upper, strict=True)
     ):
         known = math.isfinite(upper - lower)
-        kind = _FIXED if row.fixed else _SURE if known else _UNSURE
+        kind = _UNTOLD if row.untold else _SURE
+        kind = _FIXED if row.fixed else kind if known else _UNSURE
         element = f"[{index}]" if row.value.size > 1 else ""
-        text = f"{row.name}{element} = {number(value)} {row.unit}"
-        text += f" ({number(lower)} to {number(upper)})" if kind == _SURE else ""
+        text = f"{row.name}{element} = {number(value)} {row.unit}".rstrip()
+        text += f" ({number(lower)} to {number(upper)})" if kind in (_SURE, _UNTOLD) else ""
         yield _Dot(
             kind=kind,
             y=top + pitch * index,

@@ -270,7 +270,7 @@ def _told(recording: Recording, key: str) -> Any:
         return None
     try:
         return json.loads(str(text))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         parts = str(text).split("; ")  # as `join` puts together what differs
         if len(parts) > 1 and all(map(_is_json, parts)):
             raise PalpateError(
@@ -282,7 +282,7 @@ def _told(recording: Recording, key: str) -> Any:
 def _is_json(text: str) -> bool:
     try:
         json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
     return True
 

@@ -156,8 +156,8 @@ def own_device() -> Any:
 def one_on_each(function: Callable[[Any], Any], work: Iterable[Any]) -> list[Any]:
     """`function` of every piece of work, as many at a time as there are devices, each on its own.
 
-    Small batches are better whole on one device each than one after another on all: a posterior's
-    16 chains take but a sixth less time on two cores than on one. What is raised by one piece is
+    Small batches are better whole on one device each than one after another on all: 16 chains of a
+    posterior take but a sixth less time on two cores than on one. What is raised by one piece is
     raised when those that have begun are done, and no others begin.
     """
     import jax

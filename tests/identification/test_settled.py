@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from palpate.identification.bayesian import draw, sample
 from palpate.identification.laplace import Modes
 from palpate.identification.likelihood import inferred_scales, known_scales, motion_posterior
+from palpate.identification.local_global import CHAINS
 from palpate.identification.segments import cut
 from palpate.identification.settled import Part, Settled, factors_of
 from palpate.identification.target import log_prior
@@ -164,7 +165,7 @@ def test_a_room_is_sampled_part_by_part():
     heard = []
     target = posterior(sliders(), seconds=1.0)
     found = sample(target, draws=60, tell=lambda *done: heard.append(done))
-    assert found.draws.position.shape == (16, 60, target.dimension)
+    assert found.draws.position.shape == (CHAINS, 60, target.dimension)
     assert found.rhat_of_predictions < 1.1
     rows = {row.name: row for row in found.table}
     for body, mass in enumerate(MASSES):

@@ -15,7 +15,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.experiments import folders
 from palpate.experiments.options import Hypotheses, IdentifyBayesian
-from palpate.identification.bayesian import Posterior, check_numbers, draw, preparing
+from palpate.identification.bayesian import CHAINS, Posterior, check_numbers, draw, preparing
 from palpate.identification.likelihood import (
     MotionPosterior,
     inferred_scales,
@@ -93,7 +93,10 @@ def run(options: IdentifyBayesian) -> Path:
 
 
 def identify(
-    targets: Mapping[str, MotionPosterior], draws: int = 100, chains: int = 16, seed: int = 0
+    targets: Mapping[str, MotionPosterior],
+    draws: int = 100,
+    chains: int = CHAINS,
+    seed: int = 0,
 ) -> Found:
     """Compare hypotheses by their evidence and sample the posterior of the most probable.
 

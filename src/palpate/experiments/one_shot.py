@@ -70,7 +70,7 @@ class Size:
 
 
 FULL = Size(
-    2, 10, 100, 50, 150, 6, 120, 60.0, {"pieces": 20, "samples": 35, "samplers": 4, "scene": 6}
+    2, 10, 100, 50, 150, 6, 140, 60.0, {"pieces": 20, "samples": 35, "samplers": 4, "scene": 6}
 )
 QUICK = Size(1, 4, 25, 25, 50, 2, 25, 5.0, {"pieces": 4, "samples": 2, "samplers": 1})
 

@@ -162,7 +162,7 @@ class IdentifyBayesian(Reading, ABC):
     """Recordings to score on and not to fit."""
     draws: int = 100
     """Of each chain, after its warm-up."""
-    chains: int = 16
+    chains: int = 32
     """Independent of one another, so that it shows when they do not agree."""
 
     @abstractmethod

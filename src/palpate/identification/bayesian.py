@@ -35,7 +35,7 @@ from palpate.identification.likelihood import (
     inferred_scales,
     motion_posterior,
 )
-from palpate.identification.local_global import compiled_meanwhile, local_global
+from palpate.identification.local_global import CHAINS, compiled_meanwhile, local_global
 from palpate.identification.predictive import Predicted, Score
 from palpate.identification.segments import Segments, cut, noise_scale
 from palpate.identification.settled import Settled, factors_of, joined, settle_each
@@ -248,7 +248,7 @@ def identify(
     *,
     seconds: float = 1.0,
     at_rest: bool = False,
-    chains: int = 16,
+    chains: int = CHAINS,
     draws: int = 100,
     seed: int = 0,
     probes: Segments | None = None,
@@ -273,7 +273,7 @@ def identify(
 def sample(
     target: MotionPosterior,
     *,
-    chains: int = 16,
+    chains: int = CHAINS,
     draws: int = 100,
     seed: int = 0,
     probes: Segments | None = None,
@@ -298,7 +298,7 @@ def preparing(target: MotionPosterior, chains: int) -> AbstractContextManager[No
 def draw(
     settled: Settled,
     *,
-    chains: int = 16,
+    chains: int = CHAINS,
     draws: int = 100,
     seed: int = 0,
     probes: Segments | None = None,
@@ -327,7 +327,7 @@ def check_numbers(chains: int, draws: int) -> None:
     if chains < 1 or draws < FEWEST:
         raise PalpateError(
             f"expected at least 1 chain of {FEWEST} draws, by which it can be judged, got {chains} "
-            f"of {draws}: 16 of 100 are usual"
+            f"of {draws}: {CHAINS} of 100 are usual"
         )
 
 

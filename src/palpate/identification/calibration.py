@@ -30,10 +30,10 @@ from palpate.identification.likelihood import (
     known_scales,
     motion_posterior,
 )
+from palpate.identification.local_global import CHAINS
 from palpate.identification.segments import known_start
 from palpate.models.model import Model
 
-CHAINS = 16  # of each posterior, as are usual
 THIN = 5  # draws of a chain for each that is kept: those that are kept are then independent
 
 

@@ -8,8 +8,9 @@ responsibility for where the chain is (a localised random walk: Andrieu and Thom
 mixture itself (Tierney, Ann. Stat. 22, 1994). No move needs a slope.
 
 A leap leads back as seldom as the mixture knows where a chain has got to, so it has to know the
-posterior's tails as well. In the warm-up half of the chains therefore see a flatter likelihood, the
-flattest its root (as in tempering: Geyer, Comput. Sci. Stat. 23, 1991).
+posterior's tails as well, and what straight chains see of these in a warm-up is a matter of luck.
+In the warm-up most of the chains therefore see a flatter likelihood (as in tempering: Geyer,
+Comput. Sci. Stat. 23, 1991).
 
 All chains step at once, so that their densities are computed side by side.
 """
@@ -30,13 +31,15 @@ from palpate.identification.laplace import Modes
 from palpate.identification.mixture import DEGREES, Mixture, fit_mixture, one_of
 from palpate.identification.target import Target, log_prior
 
+CHAINS = 32  # 16 a core: a vector of as many numbers is computed as soon as one of fewer
 STEPS = 3  # between two draws, for each coordinate
-ROUNDS, ROUND = 18, 40  # of the warm-up, and looks at the chains in each
+ROUNDS, ROUND = 12, 40  # of the warm-up, and looks at the chains in each
 LOOKS = 2  # of these in as many steps as there are coordinates
-FLATTEST, STRAIGHT = 0.5, 3  # power of the likelihood; rounds of the warm-up that end without any
+FLAT, FLATTEST = 0.8, 0.3  # share of chains that see a flatter likelihood; its least power
+STRAIGHT = 3  # last rounds of the warm-up, without any
 MORE = 1.2  # times as much as was learnt from has to be seen before more is learnt
 REMEMBERED = 2 / 3  # share of the warm-up's looks so far, the last ones, that is learnt from
-LEAPING, WHOLE = 0.2, 0.2  # shares of steps that leap, and that have the shape of all that was seen
+LEAPING, WHOLE = 0.4, 0.2  # shares of steps that leap, and that have the shape of all that was seen
 ACCEPTANCE = 0.25  # of steps that do not leap
 LENGTH = 2.38  # over the root of the dimension: first length of a step, in standard deviations
 
@@ -45,7 +48,7 @@ def local_global(
     target: Target,
     modes: Modes,
     key: PRNGKeyArray,
-    chains: int = 16,
+    chains: int = CHAINS,
     draws: int = 100,
     tell: Callable[[int, int], None] = lambda done, rounds: None,
 ) -> Draws:
@@ -63,7 +66,8 @@ def local_global(
     mixture = fit_mixture(np.asarray(modes.draw(fitting, 20 * size)), covariance)
     log_length = float(np.log(LENGTH / np.sqrt(size)))
     flat = np.ones(chains, position.dtype)
-    flat[: chains // 2] = np.linspace(FLATTEST, 1.0, chains // 2, endpoint=False)
+    flattened = int(FLAT * chains)
+    flat[:flattened] = np.linspace(FLATTEST, 1.0, flattened, endpoint=False)
     looks = [ROUND] * ROUNDS + [ROUND] * (draws // ROUND) + [draws % ROUND] * (draws % ROUND > 0)
     positions, values, accepted, spent, evaluations, learnt = [], [], [], [], [], 0
     for index, count in enumerate(looks):
@@ -105,7 +109,7 @@ def local_global(
 
 
 @contextlib.contextmanager
-def compiled_meanwhile(target: Target, chains: int = 16) -> Iterator[None]:
+def compiled_meanwhile(target: Target, chains: int = CHAINS) -> Iterator[None]:
     """Compile what `local_global` runs for a target of these shapes, beside what is done within.
 
     A search for modes waits for a compiler of its own, and leaves a core to another. What is raised

@@ -4,7 +4,7 @@ Where a wheel may be too weak to be noticed, its place and direction are free, t
 where it is felt: no one shape of a step fits both. What all chains have seen is described by a
 mixture. A chain takes the shape of a step from one of its components, chosen by their
 responsibility for where the chain is (a localised random walk: Andrieu and Thoms, Stat. Comput. 18,
-2008), or, less often, from all that has been seen; and now and then it is proposed a draw of the
+2008), or, less often, from all that has been seen; and two proposals of five are draws of the
 mixture itself (Tierney, Ann. Stat. 22, 1994). No move needs a slope.
 
 A leap leads back as seldom as the mixture knows where a chain has got to, so it has to know the

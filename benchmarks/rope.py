@@ -20,15 +20,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from palpate import devices
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
-from palpate.result import Figure, Result
-from palpate.storage import write_json
-from palpate.tasks import RopeStabilization
-from palpate.worlds.rope import RopeConfiguration, RopeWorld
+from palpate.numerics import devices
+from palpate.runs import Figure, Result
+from palpate.runs.storage import write_json
+from palpate.tasks.rope import RopeStabilization
+from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 
 LENGTH, MASS, NODES = 1.0, 0.1, 21
 GRAVITY = 9.81

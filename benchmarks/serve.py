@@ -27,20 +27,20 @@ from typing import Any
 
 import numpy as np
 
-from palpate import devices
+from palpate.commands.serve import free_endpoint, limits_of, supervisor_of
 from palpate.deployment.contract import contract_of
 from palpate.deployment.loop import LATE, Record, run_loop, wait_until
 from palpate.deployment.scheduling import ROBOT, real_time
 from palpate.deployment.supervisor import Mode, Supervisor
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.errors import PalpateError
-from palpate.experiments.rope_robot import RopeRobot, servoed
-from palpate.experiments.rope_trials import GRIPPER_AT_REST
-from palpate.experiments.serve import free_endpoint, limits_of, supervisor_of
+from palpate.families.rope.robot import RopeRobot, servoed
 from palpate.networks import load_policy
-from palpate.result import Figure, Result
-from palpate.storage import write_json
-from palpate.worlds.rope import START_POSES, Disturbance, RopeConfiguration
+from palpate.numerics import devices
+from palpate.runs import Figure, Result
+from palpate.runs.storage import write_json
+from palpate.trials.rope.trials import GRIPPER_AT_REST
+from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration
 
 PUSH = (0.25, 0.1)  # N, s; one every `EVERY` s, at the middle of the rope
 EVERY = 2.0  # s

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from palpate.identification.target import Target
+from palpate.identification.samplers.target import Target
 from palpate.models.model import Model, rollout
 from palpate.parameters import LogNormal, Parameter, parameter
-from palpate.recording import Aligned
+from palpate.recordings import Aligned
 
 
 class Linear(Target):

@@ -1,12 +1,14 @@
 """What every test may ask for: float64, and no implicit promotion of dtypes."""
 
 import gc
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import jax
 import pytest
 
-from palpate.devices import cores
+from palpate import family
+from palpate.numerics.devices import cores
 
 if cores() == 1:  # what is divided over devices has to be divided here too
     jax.config.update("jax_num_cpu_devices", 2)
@@ -42,3 +44,13 @@ def strict():
     """Refuse implicit promotion of dtypes inside the test."""
     with jax.numpy_dtype_promotion("strict"):
         yield
+
+
+@pytest.fixture
+def toys(monkeypatch):
+    """The toys, plugged in as a family of another package is: by its entry point alone."""
+    point = EntryPoint("toys", "toy_family:FAMILY", family.GROUP)
+    monkeypatch.setattr(family, "entry_points", lambda group: [point])
+    family.families.cache_clear()
+    yield
+    family.families.cache_clear()

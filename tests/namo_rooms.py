@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from shapely import box
 
-from palpate.planning.movable_obstacles.map import Map, Movable, Robot, map_of
+from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot, map_of
 
 Box = tuple[float, float, float, float]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from palpate.worlds.rope import RopeConfiguration, RopeWorld
+from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 
 STILL = np.zeros(3)
 SMALL = {"bodies": 10, "markers": 11}  # ten bodies instead of forty: a twentieth of the time

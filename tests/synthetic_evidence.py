@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.report import write_evidence
-from palpate.storage import write_json, write_text
+from palpate.runs.storage import write_json, write_text
 
 
 def chain(damping: float = 0.35, rate: float = 6.0, points: int = 21, seconds: float = 5.0):

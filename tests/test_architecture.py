@@ -7,6 +7,7 @@ gone blind is noticed.
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,14 +19,17 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 FOUNDATION = (
-    *("networks", "recording", "parameters", "small_systems"),
-    *("runs", "loops", "result", "storage", "errors", "devices", "__init__"),
+    *("networks", "recordings", "parameters", "runs", "numerics"),
+    *("family", "errors", "__init__"),
 )
 # From the top of the house to its foundation: a row imports rows below it and its own, never one
-# above. A new file or folder directly under palpate/ is given its place here; recording_csv.py
-# belongs to recording without being named.
+# above. A new folder directly under palpate/ is given its place here.
 LAYERS = (
-    ("__main__", "cli", "experiments"),
+    ("__main__", "cli"),
+    ("experiments",),
+    ("commands",),
+    ("families",),
+    ("trials",),
     ("report", "deployment"),
     ("learning",),
     ("planning",),
@@ -41,14 +45,18 @@ RANK = {name: rank for rank, names in enumerate(reversed(LAYERS)) for name in na
 STRANGERS = {("models", "worlds"), ("worlds", "models")}
 # What is real is seen through a world's sensors: the engine behind it is nobody else's business.
 ENGINE, ENGINE_FREE = "mujoco", {"models", "safety", "planning", "learning", "identification"}
-TRUTH_READERS = {"worlds", "experiments"}
+TRUTH_READERS = {"worlds", "trials", "experiments", "families"}
+
+# Tables of places: their strings name what is resolved when a command runs.
+PLACE_KEEPERS = {"families", "family", "cli"}
 
 # These work for any model and any world, and so name no family of objects.
 FAMILY_WORDS = {"rope", "ropes", "furniture", "appliance", "appliances", "maze", "mazes"}
 GENERAL = {
     *FOUNDATION,
     *("identification", "planning", "learning", "safety"),
-    *("models/model.py", "worlds/world.py"),
+    *("models/model.py", "models/residual.py", "models/files.py"),
+    *("worlds/world.py", "worlds/gymnasium.py", "tasks/task.py"),
 }
 NAMED_FOR_A_FAMILY = {
     "planning/movable_obstacles",
@@ -58,12 +66,9 @@ NAMED_FOR_A_FAMILY = {
 
 UNPICKLERS = {"pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
 LONGEST_FILE = 500
+MOST_FILES = 20  # of a folder's own, its face not counted
+MOST_LOOSE = 6  # files directly under the package
 NAMELESS = {"util", "utils", "helper", "helpers", "common", "misc"}
-
-
-def part_of(name: str) -> str:
-    """The part that a file or folder directly under the package belongs to."""
-    return next((part for part in (name, name.partition("_")[0]) if part in RANK), name)
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class Source:
 
     @property
     def part(self) -> str:
-        return part_of(self.name.split("/")[0].removesuffix(".py"))
+        return self.name.split("/")[0].removesuffix(".py")
 
     @property
     def ancestry(self) -> set[str]:
@@ -99,11 +104,10 @@ class Source:
     def dotted(self) -> list[str]:
         return ["palpate", *self.path.relative_to(self.package).with_suffix("").parts]
 
-    def imports(self) -> Iterator[tuple[int, str]]:
+    def statements(self) -> Iterator[tuple[int, str]]:
         """(line, absolute dotted name) of every import, those inside functions included.
 
-        `from palpate import worlds` gives `palpate.worlds`. A string that is nothing but the
-        dotted name of a part counts too, because it is how modules are imported by name.
+        `from palpate import worlds` gives `palpate.worlds`.
         """
         for node in self.nodes:
             if isinstance(node, ast.Import):
@@ -114,10 +118,18 @@ class Source:
                 base = [*base, *(node.module.split(".") if node.module else [])]
                 for alias in node.names:
                     yield node.lineno, ".".join([*base, alias.name])
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+
+    def imports(self) -> Iterator[tuple[int, str]]:
+        """`statements`, and strings that are nothing but the dotted name of a part.
+
+        That is how modules are imported by name.
+        """
+        yield from self.statements()
+        for node in self.nodes:
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 # ".worlds.rope" is what importlib.import_module takes with a package beside it.
                 match = re.fullmatch(r"(?:palpate)?\.(\w+)[\w.]*(?::\w+)?", node.value)
-                if match and part_of(match[1]) in RANK:
+                if match and match[1] in RANK and self.part not in PLACE_KEEPERS:
                     yield node.lineno, f"palpate.{match[1]}"
 
     def parts_imported(self) -> Iterator[tuple[int, str]]:
@@ -125,7 +137,7 @@ class Source:
         for line, name in self.imports():
             head, _, rest = name.partition(".")
             if head == "palpate":
-                part = part_of(rest.split(".")[0])
+                part = rest.split(".")[0]
                 # A name that is no part, such as palpate.__version__, stands in palpate/__init__.
                 yield line, part if part in RANK else "__init__"
 
@@ -235,6 +247,38 @@ RULES: tuple[Rule, ...] = (
 )
 
 
+def modules_of(sources: list[Source]) -> dict[str, Source]:
+    """The sources by dotted name; a package's face has the name of the package."""
+    return {".".join(source.dotted).removesuffix(".__init__"): source for source in sources}
+
+
+def imports_go_in_no_circle(sources: list[Source]) -> Iterator[str]:
+    """No file imports itself by way of others, whether or not only a type checker sees it."""
+    modules = modules_of(sources)
+    arrows: dict[str, set[str]] = {}
+    for name, source in modules.items():
+        named = {found for _, found in source.statements()}
+        direct = {f if f in modules else f.rpartition(".")[0] for f in named}
+        arrows[name] = {target for target in direct if target in modules} - {name}
+    left = dict(arrows)
+    while free := [name for name, targets in left.items() if not targets & set(left)]:
+        for name in free:
+            del left[name]
+    while entered := [n for n in left if not any(n in targets for targets in left.values())]:
+        for name in entered:  # they lead into a circle and lie on none
+            del left[name]
+    if left:
+        yield f"imports go in a circle: {', '.join(sorted(left))}"
+
+
+def folders_are_small(sources: list[Source]) -> Iterator[str]:
+    counts = Counter(source.path.parent for source in sources if source.path.stem != "__init__")
+    for folder, count in counts.items():
+        most = MOST_LOOSE if folder == sources[0].package else MOST_FILES
+        if count > most:
+            yield f"{folder.name}/ holds {count} files of its own: at most {most}, so give it rooms"
+
+
 def violations(rule: Rule, package: Path) -> list[str]:
     sources = (Source(package, path) for path in sorted(package.rglob("*.py")))
     return list(chain.from_iterable(map(rule, sources)))
@@ -246,6 +290,44 @@ def test_package_keeps(rule: Rule) -> None:
     assert not found, "\n".join(found)
 
 
+@pytest.mark.parametrize("rule", [imports_go_in_no_circle, folders_are_small])
+def test_package_as_a_whole_keeps(rule) -> None:
+    package = ROOT / "src" / "palpate"
+    found = list(rule([Source(package, path) for path in sorted(package.rglob("*.py"))]))
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    "arrows",
+    [
+        {"a": "from palpate.b import x", "b": "def f():\n    from palpate.a import y"},
+        {"a": "if TYPE_CHECKING:\n    from palpate.c.d import x", "c/d": "import palpate.a"},
+        {"a": "from palpate.c import x", "c/__init__": "from palpate.c.d import x",
+         "c/d": "from palpate import a"},
+    ],
+)  # fmt: skip
+def test_a_planted_circle_is_found(arrows: dict[str, str], tmp_path: Path) -> None:
+    for name, text in arrows.items():
+        plant(tmp_path, f"{name}.py", text)
+    plant(tmp_path, "above.py", "from palpate.a import x")
+    plant(tmp_path, "below.py", "")
+    sources = [Source(tmp_path, path) for path in sorted(tmp_path.rglob("*.py"))]
+    (sentence,) = imports_go_in_no_circle(sources)
+    assert "above" not in sentence
+    assert "palpate.a" in sentence
+    one_way = [source for source in sources if source.path.stem not in ("b", "d")]
+    assert not list(imports_go_in_no_circle(one_way))
+
+
+def test_a_planted_crowd_is_found(tmp_path: Path) -> None:
+    for number in range(21):
+        plant(tmp_path, f"models/a{number}.py", "")
+    for number in range(7):
+        plant(tmp_path, f"b{number}.py", "")
+    sources = [Source(tmp_path, path) for path in sorted(tmp_path.rglob("*.py"))]
+    assert len(list(folders_are_small(sources))) == 2
+
+
 def test_test_files_are_short() -> None:
     found = violations(files_are_short, ROOT / "tests")
     assert not found, "\n".join(found)
@@ -255,12 +337,12 @@ def test_test_files_are_short() -> None:
 PLANTED = [
     (imports_point_down, "attic.py", ""),
     (imports_point_down, "models/a.py", "import palpate.cli"),
-    (imports_point_down, "recording.py", "from palpate.models import Model"),
+    (imports_point_down, "recordings/a.py", "from palpate.models import Model"),
     (imports_point_down, "identification/a.py", "from ..planning import plan"),
     (imports_point_down, "planning/deep/a.py", "from ...learning.x import y"),
     (imports_point_down, "safety/a.py", "def f():\n    from palpate import learning"),
-    (imports_point_down, "runs.py", "from . import report"),
-    (imports_point_down, "runs_kept.py", "from .learning import dagger"),
+    (imports_point_down, "runs/a.py", "from .. import report"),
+    (imports_point_down, "commands/a.py", "from palpate.experiments.rope import model"),
     (imports_point_down, "tasks/a.py", "load('palpate.experiments.one:main')"),
     (imports_point_down, "__init__.py", "from palpate.models.model import Model"),
     (models_and_worlds_are_strangers, "models/a.py", "from palpate.worlds.world import World"),
@@ -278,14 +360,14 @@ PLANTED = [
     (general_code_names_no_family, "safety/a.py", "message = f'the {x} maze is dark'"),
     (general_code_names_no_family, "safety/a.py", "f(furniture=1)"),
     (general_code_names_no_family, "safety/a.py", "def f(appliances): ..."),
-    (general_code_names_no_family, "recording_csv.py", "ROPE = 1"),
-    (general_code_names_no_family, "runs.py", "x.maze_size = 1"),
+    (general_code_names_no_family, "recordings/csv.py", "ROPE = 1"),
+    (general_code_names_no_family, "runs/a.py", "x.maze_size = 1"),
     (general_code_names_no_family, "models/model.py", "isinstance(model, Rope)"),
     (general_code_names_no_family, "learning/rope_control.py", ""),
-    (nothing_is_unpickled_or_evaluated, "recording.py", "import pickle"),
-    (nothing_is_unpickled_or_evaluated, "recording.py", "from pickle import loads"),
-    (nothing_is_unpickled_or_evaluated, "recording.py", "np.load(path, allow_pickle=True)"),
-    (nothing_is_unpickled_or_evaluated, "recording.py", "np.load(path, allow_pickle=trusted)"),
+    (nothing_is_unpickled_or_evaluated, "recordings/a.py", "import pickle"),
+    (nothing_is_unpickled_or_evaluated, "recordings/a.py", "from pickle import loads"),
+    (nothing_is_unpickled_or_evaluated, "recordings/a.py", "np.load(path, allow_pickle=True)"),
+    (nothing_is_unpickled_or_evaluated, "recordings/a.py", "np.load(path, allow_pickle=trusted)"),
     (nothing_is_unpickled_or_evaluated, "cli.py", "eval(text)"),
     (nothing_is_unpickled_or_evaluated, "cli.py", "def f():\n    exec(text)"),
     (files_are_short, "cli.py", "\n" * 501),
@@ -304,9 +386,9 @@ ALLOWED = [
     ("identification/interactive.py", "appliance = 1"),
     ("models/rope.py", "class Rope: ...\nfrom .model import Model\nfrom palpate.errors import E"),
     ("parameters.py", "from . import __version__\nKEYS = 'palpate.keys'\nSUFFIX = '.npz'"),
-    ("recording.py", "np.load(path, allow_pickle=False)\nmodel.eval()\njax.eval_shape(f)"),
+    ("recordings/a.py", "np.load(path, allow_pickle=False)\nmodel.eval()\njax.eval_shape(f)"),
     ("worlds/rope.py", "import mujoco"),
-    ("runs.py", "\n" * 500),
+    ("runs/run.py", "\n" * 500),
 ]
 
 

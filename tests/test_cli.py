@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from palpate.cli import COMMANDS, main
-from palpate.experiments.rope_options import RecordRope
-from palpate.worlds.rope import RopeConfiguration
+from palpate.families.rope.options import RecordRope
+from palpate.worlds.rope.rope import RopeConfiguration
 
 KINDS = [
     [name, kind] if kind else [name]
     for name, command in COMMANDS.items()
-    for kind in command.options
+    for kind in command.kinds(name)
 ]
 
 
@@ -115,12 +115,12 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         ),
         (
             "identify rpoe R.npz",
-            "unknown family 'rpoe'; did you mean 'rope'? there are: rope, furniture",
+            "unknown family 'rpoe'; did you mean 'rope'? there are: furniture, rope",
         ),
-        ("identify", "palpate identify needs a family first; there are: rope, furniture"),
+        ("identify", "palpate identify needs a family first; there are: furniture, rope"),
         (
             "identify --seed 1 rope",
-            "palpate identify needs a family first; there are: rope, furniture",
+            "palpate identify needs a family first; there are: furniture, rope",
         ),
         (
             "train rope-stabilisation",
@@ -129,10 +129,10 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         ),
         (
             "reproduce rope-modle",
-            "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: rope-model, "
-            "rope-stabilization, rope-ablation, rope-rivals, rope-bound, rope-generalization, "
-            "rope-tracking, rope-dagger, rope-residual, rope-markerless, namo-scenarios, "
-            "namo-scaling, namo-online, calibration, one-shot, cart-online",
+            "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
+            "namo-scenarios, namo-scaling, namo-online, calibration, one-shot, cart-online, "
+            "rope-model, rope-stabilization, rope-ablation, rope-rivals, rope-bound, "
+            "rope-generalization, rope-tracking, rope-dagger, rope-residual, rope-markerless",
         ),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),
         (

@@ -72,7 +72,7 @@ def test_package_imports_from_an_empty_folder(python, installed: Path) -> None:
 
 
 # What the tests do not install, because it is gigabytes, and the module that needs it.
-NEEDS = {"palpate.experiments.rope_sac": "stable_baselines3"}
+NEEDS = {"palpate.experiments.rivals.soft_actor_critic": "stable_baselines3"}
 
 
 def test_every_module_imports_from_an_empty_folder(python) -> None:

@@ -1,13 +1,13 @@
 """A plain trolley, and sledges on frictionless feet, whose constants are known to a test."""
 
-from palpate.worlds.furniture import (
+from palpate.worlds.furniture.furniture import (
     FurnitureSensors,
     FurnitureWorld,
     Piece,
     PieceKind,
     PieceParameters,
 )
-from palpate.worlds.furniture_pieces import Mount
+from palpate.worlds.furniture.pieces import Mount
 
 EXACT = FurnitureSensors(0.0, 0.0, 0.0, 0.0, 0.0)
 MASS = 21.2  # kg

@@ -7,7 +7,7 @@ Recordings become differentiable models (`palpate.identification`), models becom
 
 from importlib.metadata import PackageNotFoundError, version
 
-from palpate import devices
+from palpate.numerics import devices
 
 try:
     __version__ = version("palpate")

@@ -1,17 +1,16 @@
-"""The command line: a thin face over `palpate.experiments`.
+"""The command line: a thin face over `palpate.commands`, and the table of families.
 
 What computes is imported when a command runs, never before, so that help is instant.
 """
 
-import importlib
 import shlex
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from palpate import __version__
 from palpate.errors import PalpateError
+from palpate.family import check_name, options_of, places, resolve
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 BAD_INPUT = 2
@@ -19,117 +18,85 @@ BAD_INPUT = 2
 
 @dataclass(frozen=True)
 class Command:
-    """One command: where its options and its work are found, as "module:name".
+    """One command: its work, and its options, as "module:name".
 
-    Where a command works on one of several things, `options` gives those of each by its name and
-    `what` says what they are. Options that name a `worker` have their work done there.
+    Where it works on one of several things, `subject` says what they are, and the families' tables
+    give the options of each; `options` then serve those that come without (experiments).
     """
 
     about: str
     run: str
-    options: dict[str, str] = field(default_factory=dict)
-    what: str = ""
+    options: str = ""
+    subject: str = ""
 
+    def kinds(self, name: str) -> dict[str, str]:
+        """Where the options of each thing that the command `name` works on are."""
+        if not self.subject:
+            return {"": self.options}
+        return (
+            dict.fromkeys(places("experiments"), self.options) if self.options else options_of(name)
+        )
+
+
+_OPTIONS = "palpate.commands.options"
 
 COMMANDS = {
     "demo": Command(
         "record a rope, identify it, train a controller, try it, write a report",
-        "palpate.experiments.demo:run",
-        {"": "palpate.experiments.options:Demo"},
+        "palpate.commands.demo:run",
+        f"{_OPTIONS}:Demo",
     ),
-    "record": Command(
-        "record a simulated object",
-        "palpate.experiments.record:run",
-        {
-            "rope": "palpate.experiments.rope_options:RecordRope",
-            "furniture": "palpate.experiments.furniture_options:RecordFurniture",
-        },
-        "family",
-    ),
+    "record": Command("record a simulated object", "palpate.commands.record:run", subject="family"),
     "convert": Command(
         "turn a robot's log or any recording into another format",
-        "palpate.experiments.convert:run",
-        {"": "palpate.experiments.options:Convert"},
+        "palpate.commands.convert:run",
+        f"{_OPTIONS}:Convert",
     ),
     "track": Command(
         "follow an object through a camera's pictures",
-        "palpate.experiments.track:run",
-        {"rope": "palpate.experiments.rope_options:TrackRope"},
-        "family",
+        "palpate.commands.track:run",
+        subject="family",
     ),
     "identify": Command(
         "find an object's physical parameters from recordings of it",
-        "palpate.experiments.identify:run",
-        {
-            "rope": "palpate.experiments.rope_options:IdentifyRope",
-            "furniture": "palpate.experiments.furniture_options:IdentifyFurniture",
-        },
-        "family",
+        "palpate.commands.identify:run",
+        subject="family",
     ),
     "plan": Command(
         "plan a robot's way, moving what stands in it",
-        "palpate.experiments.plan_namo:run",
-        {"namo": "palpate.experiments.namo_options:PlanNamo"},
-        "problem",
+        "palpate.commands.plan:run",
+        subject="problem",
     ),
     "train": Command(
         "train a controller through an identified model",
-        "palpate.experiments.train:run",
-        {
-            "rope-stabilization": "palpate.experiments.rope_options:TrainRopeStabilization",
-            "rope-tracking": "palpate.experiments.rope_options:TrainRopeTracking",
-        },
-        "task",
+        "palpate.commands.train:run",
+        subject="task",
     ),
     "evaluate": Command(
         "try a controller in a world the model cannot see into",
-        "palpate.experiments.evaluate:run",
-        {
-            "rope-stabilization": "palpate.experiments.rope_options:EvaluateRopeStabilization",
-            "rope-tracking": "palpate.experiments.rope_options:EvaluateRopeTracking",
-        },
-        "task",
+        "palpate.commands.evaluate:run",
+        subject="task",
     ),
     "export": Command(
         "write a policy as ONNX, with a contract that says how to connect it",
-        "palpate.experiments.export:run",
-        {"": "palpate.experiments.options:Export"},
+        "palpate.commands.export:run",
+        f"{_OPTIONS}:Export",
     ),
     "serve": Command(
         "run a policy in real time, and brake when its eyes fail",
-        "palpate.experiments.serve:run",
-        {"": "palpate.experiments.options:Serve"},
+        "palpate.commands.serve:run",
+        f"{_OPTIONS}:Serve",
     ),
     "report": Command(
         "write the page of one or several runs",
-        "palpate.experiments.page:run",
-        {"": "palpate.experiments.options:Report"},
+        "palpate.commands.report:run",
+        f"{_OPTIONS}:Report",
     ),
     "reproduce": Command(
         "repeat a headline experiment and hold its figures against their bars",
-        "palpate.experiments.reproduce:run",
-        dict.fromkeys(
-            (
-                "rope-model",
-                "rope-stabilization",
-                "rope-ablation",
-                "rope-rivals",
-                "rope-bound",
-                "rope-generalization",
-                "rope-tracking",
-                "rope-dagger",
-                "rope-residual",
-                "rope-markerless",
-                "namo-scenarios",
-                "namo-scaling",
-                "namo-online",
-                "calibration",
-                "one-shot",
-                "cart-online",
-            ),
-            "palpate.experiments.options:Reproduce",
-        ),
-        "experiment",
+        "palpate.commands.reproduce:run",
+        f"{_OPTIONS}:Reproduce",
+        subject="experiment",
     ),
 }
 
@@ -163,39 +130,34 @@ def _run(words: list[str]) -> int:
     if words[0] == "--version":
         print(f"palpate {__version__}")
         return 0
-    from palpate.cli_parsing import parse
-    from palpate.experiments.names import check_name
+    from palpate.commands.parsing import parse
 
     name, *rest = words
     command = COMMANDS[check_name("command", name, COMMANDS)]
     kind, program = "", f"palpate {name}"
-    if command.what:
+    kinds = command.kinds(name)
+    if command.subject:
         if not rest or rest[0].startswith("-"):
             if rest and rest[0] in ("-h", "--help"):
-                print(_kinds(name, command))
+                print(_subjects(name, command, kinds))
                 return 0
-            kinds = ", ".join(command.options)
-            raise PalpateError(f"{program} needs a {command.what} first; there are: {kinds}")
+            known = ", ".join(kinds)
+            raise PalpateError(f"{program} needs a {command.subject} first; there are: {known}")
         kind, *rest = rest
-        check_name(command.what, kind, command.options)
+        check_name(command.subject, kind, kinds)
         program = f"{program} {kind}"
-    kind_of_options = _found(command.options[kind])
+    kind_of_options = resolve(kinds[kind])
     options = parse(kind_of_options, program, rest)
     if options is None:
         return 0
     work = getattr(kind_of_options, "worker", command.run)
-    _found(work)(options, *([kind] if name == "reproduce" else []))
+    resolve(work)(options, *([kind] if name == "reproduce" else []))
     return 0
 
 
 def _refuse(sentence: str) -> int:
     print(f"palpate: {' '.join(sentence.split())}", file=sys.stderr)
     return BAD_INPUT
-
-
-def _found(place: str) -> Any:
-    module, _, name = place.partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 def _overview() -> str:
@@ -212,13 +174,14 @@ def _overview() -> str:
     return "\n".join(lines)
 
 
-def _kinds(name: str, command: Command) -> str:
+def _subjects(name: str, command: Command, kinds: Iterable[str]) -> str:
     lines = [
-        f"usage: palpate {name} {command.what.upper()} ...",
+        f"usage: palpate {name} {command.subject.upper()} ...",
         "",
-        f"{command.about[0].upper()}{command.about[1:]}. Each {command.what} has its own options:",
+        f"{command.about[0].upper()}{command.about[1:]}.",
+        f"Each {command.subject} has its own options:",
         "",
-        *(f"  palpate {name} {kind} --help" for kind in command.options),
+        *(f"  palpate {name} {kind} --help" for kind in kinds),
     ]
     return "\n".join(lines)
 

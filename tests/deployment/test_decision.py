@@ -8,9 +8,9 @@ from deployed import PERIOD, manifest, rope_policy
 from palpate.deployment.contract import contract_of
 from palpate.deployment.decision import NetworkDecision, RopeDecision, segment_lengths
 from palpate.errors import PalpateError
-from palpate.experiments.rope_trials import LearnedController, Seen
-from palpate.tasks import RopeStabilization
-from palpate.worlds.rope import RopeConfiguration, RopeWorld
+from palpate.tasks.rope import RopeStabilization
+from palpate.trials.rope.trials import LearnedController, Seen
+from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import SMALL
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.deployment.plausibility import ChainCheck
-from palpate.worlds.rope import START_POSES, Disturbance, RopeConfiguration, RopeWorld
+from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration, RopeWorld
 
 PUSH = Disturbance(time=0.3, duration=0.1, force=(0.25, 0.0, 0.0), node_fraction=0.5)
 

@@ -11,13 +11,13 @@ import pytest
 
 from deployed import NODES, PERIOD, Pusher
 from deployed import supervisor as supervised
+from palpate.commands.serve import free_endpoint
 from palpate.deployment import intake
 from palpate.deployment import supervisor as supervising
 from palpate.deployment.loop import run_loop
 from palpate.deployment.supervisor import Mode
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.errors import PalpateError
-from palpate.experiments.serve import free_endpoint
 
 zenoh = pytest.importorskip("zenoh")
 PATIENT = 20.0  # s that a busy machine may take
@@ -103,7 +103,7 @@ def test_a_robot_that_is_killed_is_braked_for(monkeypatch):
         monkeypatch.setattr(intake, name, 30.0)
     monkeypatch.setattr(supervising, "PAUSE", 30.0)
     endpoint, killed = free_endpoint(), []
-    words = [sys.executable, "-m", "palpate.experiments.rope_robot", "--connect", endpoint]
+    words = [sys.executable, "-m", "palpate.families.rope.robot", "--connect", endpoint]
     words += ["--markers", str(NODES), "--period", str(PERIOD), "--seconds", "60"]
     supervisor = supervised(Pusher((0.3, 0.0, 0.0)), length=1.0)
     with subprocess.Popen(words, stdout=subprocess.DEVNULL) as robot:

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from palpate.experiments import calibration
-from palpate.identification.calibration import Ranks
+from palpate.experiments.furniture import calibration
+from palpate.identification.posterior.calibration import Ranks
 
 
 def drawn(problem, key, simulations, draws):

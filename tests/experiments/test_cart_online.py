@@ -10,8 +10,21 @@ import pytest
 import shapely
 from shapely import affinity
 
-from palpate.experiments import cart_agents, cart_online, cart_posterior, cart_trials
-from palpate.experiments.cart_agents import (
+from palpate.experiments.furniture import cart_online
+from palpate.identification.data.segments import Segments
+from palpate.models.planar import Planar, PlanarState
+from palpate.planning.sampling import SamplingPlanner
+from palpate.tasks.furniture.cart import (
+    CLEAR,
+    DONE,
+    TURN,
+    Turns,
+    apartment,
+    clearance,
+    shopping_cart,
+)
+from palpate.trials.furniture import cart_agents, cart_posterior, cart_trials
+from palpate.trials.furniture.cart_agents import (
     FRAMES,
     Decision,
     Episode,
@@ -24,22 +37,10 @@ from palpate.experiments.cart_agents import (
     piece_model,
     scene_model,
 )
-from palpate.experiments.cart_posterior import PiecePosterior
-from palpate.experiments.cart_tasks import (
-    CLEAR,
-    DONE,
-    TURN,
-    Turns,
-    apartment,
-    clearance,
-    shopping_cart,
-)
-from palpate.experiments.cart_trials import Planning, Trial, best_scene
-from palpate.identification.segments import Segments
-from palpate.models.planar import Planar, PlanarState
-from palpate.planning.sampling import SamplingPlanner
-from palpate.worlds.furniture import KINDS
-from palpate.worlds.furniture_pieces import draw_parameters
+from palpate.trials.furniture.cart_posterior import PiecePosterior
+from palpate.trials.furniture.cart_trials import Planning, Trial, best_scene
+from palpate.worlds.furniture.furniture import KINDS
+from palpate.worlds.furniture.pieces import draw_parameters
 
 TASKS = [shopping_cart(), apartment()]
 SMALL = Planning(samples=4, knots=3, spacing=1)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from palpate.experiments import namo_online
-from palpate.experiments.namo_episode import Learner
-from palpate.experiments.namo_rooms import scenes
+from palpate.experiments.furniture import namo_online
+from palpate.trials.furniture.namo_episode import Learner
+from palpate.trials.furniture.rooms import scenes
 
 
 def row(seed: int, **reached: bool) -> dict:

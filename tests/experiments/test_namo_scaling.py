@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
-from palpate.experiments import namo_scaling as study
-from palpate.planning.movable_obstacles.occupancy import Space
-from palpate.planning.movable_obstacles.regions import regions_of
+from palpate.experiments.furniture import namo_scaling as study
+from palpate.planning.movable_obstacles.maps.occupancy import Space
+from palpate.planning.movable_obstacles.maps.regions import regions_of
 
 
 @pytest.mark.parametrize(("objects", "seed"), [(5, 1), (12, 2), (30, 3), (100, 4)])

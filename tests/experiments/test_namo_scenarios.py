@@ -8,9 +8,9 @@ import pytest
 
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.errors import PalpateError
-from palpate.experiments import namo_scenarios as study
-from palpate.planning.movable_obstacles.map_description import write_map
-from palpate.planning.movable_obstacles.planner import Planner
+from palpate.experiments.furniture import namo_scenarios as study
+from palpate.planning.movable_obstacles.maps.description import write_map
+from palpate.planning.movable_obstacles.search.planner import Planner
 
 
 @pytest.fixture(autouse=True)

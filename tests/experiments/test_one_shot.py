@@ -4,29 +4,24 @@ import jax
 import numpy as np
 import pytest
 
-from palpate.experiments import one_shot, one_shot_pieces, one_shot_regression
-from palpate.experiments.furniture_recording import (
-    POSE,
-    WRENCH,
-    alone,
-    starting_furniture,
-)
-from palpate.experiments.furniture_structures import structures
-from palpate.experiments.identify_bayesian import posterior_of
-from palpate.experiments.one_shot_figure import shares_figure
-from palpate.experiments.one_shot_pieces import PERIOD, error_share, judged, pushes_of
-from palpate.experiments.one_shot_regression import (
+from palpate.experiments.furniture import one_shot, one_shot_pieces, one_shot_regression
+from palpate.experiments.furniture.one_shot_figure import shares_figure
+from palpate.experiments.furniture.one_shot_pieces import PERIOD, error_share, judged, pushes_of
+from palpate.experiments.furniture.one_shot_regression import (
     OURS,
     RIVALS,
     first_samples,
     recorded,
     transitions,
 )
-from palpate.experiments.one_shot_sampling import OURS as SAMPLER
-from palpate.identification.laplace import settle
-from palpate.identification.predictive import Predicted
-from palpate.worlds.furniture import FurnitureWorld, Piece
-from palpate.worlds.furniture_handling import Together, Wiggle, record, record_pushes
+from palpate.experiments.furniture.one_shot_sampling import OURS as SAMPLER
+from palpate.families.furniture.recording import POSE, WRENCH, alone, starting_furniture
+from palpate.families.furniture.structures import structures
+from palpate.identification.posterior.comparison import posterior_of
+from palpate.identification.posterior.laplace import settle
+from palpate.identification.posterior.predictive import Predicted
+from palpate.worlds.furniture.furniture import FurnitureWorld, Piece
+from palpate.worlds.furniture.handling import Together, Wiggle, record, record_pushes
 
 KINDS = "cart", "chair"
 

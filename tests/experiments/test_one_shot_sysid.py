@@ -9,24 +9,24 @@ import pytest
 from mujoco import sysid
 
 from palpate.errors import PalpateError
-from palpate.experiments.one_shot_sysid import KNOWN, SysidFit, fit_scene, predict_pieces
-from palpate.experiments.told_scene import (
+from palpate.experiments.rivals.furniture_scene import (
     ToldScene,
     caster_angles,
     caster_tracks,
     rolling_state,
     settled_positions,
 )
-from palpate.identification.segments import cut
-from palpate.models.planar_shapes import furniture
-from palpate.worlds.furniture import (
+from palpate.experiments.rivals.mujoco_sysid import KNOWN, SysidFit, fit_scene, predict_pieces
+from palpate.identification.data.segments import cut
+from palpate.models.planar import furniture
+from palpate.worlds.furniture.furniture import (
     CONTROL_PERIOD,
     KINDS,
     FurnitureSensors,
     FurnitureWorld,
     Piece,
 )
-from palpate.worlds.furniture_handling import record_handling, record_pushes
+from palpate.worlds.furniture.handling import record_handling, record_pushes
 
 PERFECT = FurnitureSensors(0.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -5,19 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palpate.experiments import rope_bound
-from palpate.experiments.rope_bound import OWN, RESTARTS, Outcome, start_state
-from palpate.experiments.rope_trials import Trial
+from palpate.experiments.rope import bound as rope_bound
+from palpate.experiments.rope.bound import OWN, RESTARTS, Outcome, start_state
 from palpate.models.model import rollout
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
 from palpate.planning import open_loop
 from palpate.planning.open_loop import Found
 from palpate.report.evidence import read_evidence
-from palpate.result import read_result
 from palpate.runs import Run
-from palpate.storage import write_json
-from palpate.worlds.rope import RopeConfiguration, RopeWorld
+from palpate.runs.result import read_result
+from palpate.runs.storage import write_json
+from palpate.trials.rope.trials import Trial
+from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import SMALL
 
 BASE = RopeConfiguration(**SMALL)

@@ -7,17 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palpate.experiments import rope_dagger, rope_evaluation, rope_stabilization
-from palpate.experiments.rope_baselines import HeldStill
-from palpate.experiments.rope_dagger import Follower, TakeOver, Work, nominal, whirled
+from palpate.experiments.rope import dagger as rope_dagger
+from palpate.experiments.rope import stabilization as rope_stabilization
+from palpate.experiments.rope.dagger import Follower, TakeOver, Work, nominal, whirled
 from palpate.learning import Training, dagger
 from palpate.learning.loss_monitor import Alarm
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
-from palpate.result import read_result
-from palpate.storage import write_json
-from palpate.tasks import RopeStabilization
-from palpate.worlds.rope import RopeConfiguration
+from palpate.runs.result import read_result
+from palpate.runs.storage import write_json
+from palpate.tasks.rope import RopeStabilization
+from palpate.trials.rope import evaluation as rope_evaluation
+from palpate.trials.rope.baselines import HeldStill
+from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL
 
 TINY = Work(rope_dagger.QUICK, Training(iterations=1, starts=20), 1, 2, 2, {"everything": 1})

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from palpate.experiments.rope_environment import Episodes, RopeEnvironment
-from palpate.experiments.rope_trials import LearnedController, Trial, run_trials
+from palpate.experiments.rivals.rope_environment import Episodes, RopeEnvironment
 from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.parameters import parameters_of
-from palpate.tasks import RopeStabilization
-from palpate.worlds.rope import RopeConfiguration
+from palpate.tasks.rope import RopeStabilization
+from palpate.trials.rope.trials import LearnedController, Trial, run_trials
+from palpate.worlds.rope.rope import RopeConfiguration
 
 TASK = RopeStabilization(duration=0.2)
 NOISE = 5e-4  # m

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from palpate.experiments import rope_generalization as study
-from palpate.experiments.rope_evaluation import summarise
-from palpate.experiments.rope_generalization import ROWS, ObservedController, Row
-from palpate.experiments.rope_stabilization import BASE, shipped_policy
-from palpate.experiments.rope_trials import Episodes, LearnedController, Trial, run_trials
+from palpate.experiments.rope import generalization as study
+from palpate.experiments.rope.generalization import ROWS, ObservedController, Row
+from palpate.experiments.rope.stabilization import BASE, shipped_policy
 from palpate.models.rope import Rope
-from palpate.tasks import RopeStabilization
+from palpate.tasks.rope import RopeStabilization
+from palpate.trials.rope.evaluation import summarise
+from palpate.trials.rope.trials import Episodes, LearnedController, Trial, run_trials
 
 TASK = RopeStabilization()
 MODEL = Rope.uniform(BASE.length, BASE.mass, 11, driven=(0,), drive="velocity", substeps=4)

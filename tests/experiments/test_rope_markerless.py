@@ -6,14 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palpate.experiments import rope_filming, rope_markerless
-from palpate.experiments.rope_filming import film
-from palpate.experiments.rope_stabilization import shipped_policy
-from palpate.experiments.rope_trials import Trial
+from palpate.experiments.rope import markerless as rope_markerless
+from palpate.experiments.rope.stabilization import shipped_policy
 from palpate.models.rope import Rope, RopeState
-from palpate.runs import RESULT
+from palpate.runs.run import RESULT
+from palpate.trials.rope import filming as rope_filming
+from palpate.trials.rope.filming import film
+from palpate.trials.rope.trials import Trial
 from palpate.worlds.camera import Sensor
-from palpate.worlds.rope import RopeConfiguration
+from palpate.worlds.rope.rope import RopeConfiguration
 
 MODEL = Rope.uniform(nodes=11, substeps=4, bend_stiffness=2e-3, bend_damping=5e-4)
 

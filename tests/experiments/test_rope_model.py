@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.experiments import rope_model
-from palpate.experiments.rope_swing import swing_half_life
+from palpate.experiments.rope import model as rope_model
+from palpate.experiments.rope.swing import swing_half_life
 from palpate.parameters import describe
-from palpate.worlds.rope import RopeConfiguration
+from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.experiments import rope_residual
-from palpate.experiments.rope_recording import GRIPPER, MARKERS
-from palpate.recording_files import read_recording
-from palpate.result import Figure, Result
-from palpate.storage import write_json
+from palpate.experiments.rope import residual as rope_residual
+from palpate.families.rope.recording import GRIPPER, MARKERS
+from palpate.recordings.files import read_recording
+from palpate.runs import Figure, Result
+from palpate.runs.storage import write_json
 
 
 @pytest.fixture

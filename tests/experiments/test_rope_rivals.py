@@ -10,23 +10,21 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.experiments import rope_evaluation, rope_rivals, rope_stabilization
-from palpate.experiments.rope_baselines import HeldStill
-from palpate.experiments.rope_followers import as_of_model
-from palpate.experiments.rope_planners import (
-    PlannedStabiliser,
-    energy_and_speed,
-    stabilising_planner,
-)
-from palpate.experiments.rope_stabilization import Size
-from palpate.experiments.rope_trials import Trial, run_trials
+from palpate.experiments.rope import rivals as rope_rivals
+from palpate.experiments.rope import stabilization as rope_stabilization
+from palpate.experiments.rope.stabilization import Size
 from palpate.learning import Training
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
-from palpate.result import read_result
-from palpate.storage import write_json
-from palpate.tasks.rope_tracking import hanging_rope
-from palpate.worlds.rope import RopeConfiguration
+from palpate.runs.result import read_result
+from palpate.runs.storage import write_json
+from palpate.tasks.rope.tracking import hanging_rope
+from palpate.trials.rope import evaluation as rope_evaluation
+from palpate.trials.rope.baselines import HeldStill
+from palpate.trials.rope.followers import as_of_model
+from palpate.trials.rope.planners import PlannedStabiliser, energy_and_speed, stabilising_planner
+from palpate.trials.rope.trials import Trial, run_trials
+from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL
 
 TINY = Size(2, (1, 1, 1), Training(iterations=8, width=4), 1, dict.fromkeys(
@@ -106,7 +104,7 @@ def calls(monkeypatch):
         monkeypatch.setattr(module, "identify", identify)
     monkeypatch.setattr(rope_stabilization, "NODES", 6)
     monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
-    monkeypatch.setattr("palpate.experiments.train.train", train)
+    monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.02)
     monkeypatch.setattr(rope_rivals, "SMALL", TINY)
     monkeypatch.setattr(rope_rivals, "UNHURRIED", {"gradient": 2})
@@ -181,7 +179,7 @@ def install_sac(monkeypatch) -> list[tuple]:
     stand_in = SimpleNamespace(
         Sac=lambda rounds: SimpleNamespace(rounds=rounds), trained_actor=trained_actor
     )
-    monkeypatch.setitem(sys.modules, "palpate.experiments.rope_sac", stand_in)
+    monkeypatch.setitem(sys.modules, "palpate.experiments.rivals.soft_actor_critic", stand_in)
     monkeypatch.setattr(rope_rivals, "sac_installed", lambda: True)
     return asked
 

@@ -10,11 +10,11 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
-from palpate.experiments.rope_environment import Actor  # noqa: E402
-from palpate.experiments.rope_sac import Sac, as_actor, trained_actor  # noqa: E402
+from palpate.experiments.rivals.rope_environment import Actor  # noqa: E402
+from palpate.experiments.rivals.soft_actor_critic import Sac, as_actor, trained_actor  # noqa: E402
 from palpate.learning import Training  # noqa: E402
 from palpate.models.rope import Rope  # noqa: E402
-from palpate.storage import read_manifest  # noqa: E402
+from palpate.runs.storage import read_manifest  # noqa: E402
 
 
 def small_model() -> Rope:

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.experiments import rope_ablation, rope_evaluation, rope_stabilization
-from palpate.experiments.rope_stabilization import Size, shipped_policy
+from palpate.experiments.rope import ablation as rope_ablation
+from palpate.experiments.rope import stabilization as rope_stabilization
+from palpate.experiments.rope.stabilization import Size, shipped_policy
 from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy, save_policy
 from palpate.report.evidence import read_evidence
-from palpate.result import read_result
-from palpate.storage import write_json
-from palpate.worlds.rope import START_POSES, RopeConfiguration
+from palpate.runs.result import read_result
+from palpate.runs.storage import write_json
+from palpate.trials.rope import evaluation as rope_evaluation
+from palpate.worlds.rope.rope import START_POSES, RopeConfiguration
 from small_rope import SMALL
 
 TINY = Size(2, (1, 1, 1), Training(iterations=8, width=4), 1, dict.fromkeys(
@@ -44,7 +46,7 @@ def calls(monkeypatch):
     monkeypatch.setattr(rope_stabilization, "NODES", 6)
     monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr(rope_stabilization, "identify", identify)
-    monkeypatch.setattr("palpate.experiments.train.train", train)
+    monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_stabilization, "_left_when_still", lambda *_: figure())
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.05)
     return made

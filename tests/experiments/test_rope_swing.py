@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.experiments.rope_swing import (
+from palpate.experiments.rope.swing import (
     AMPLITUDE,
     first_mode,
     half_life_periods,
     swing,
     swing_half_life,
 )
-from palpate.worlds.rope import RopeConfiguration
+from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import FREE, SMALL, rope
 
 TIME = np.arange(0, 6.5, 0.01)

@@ -8,8 +8,21 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.experiments import rope_stabilization, rope_tracking, rope_tracking_trials
-from palpate.experiments.rope_followers import (
+from palpate.experiments.rope import stabilization as rope_stabilization
+from palpate.experiments.rope import tracking as rope_tracking
+from palpate.experiments.rope.stabilization import Size
+from palpate.learning import Training
+from palpate.models.rope import Rope
+from palpate.networks import CommandPolicy
+from palpate.report.evidence import read_evidence
+from palpate.runs import Run
+from palpate.runs.result import read_result
+from palpate.runs.storage import write_json
+from palpate.tasks.rope import RopeTracking
+from palpate.tasks.rope.paths import CURVES
+from palpate.tasks.rope.tracking import PREVIEW
+from palpate.trials.rope import tracking as rope_tracking_trials
+from palpate.trials.rope.followers import (
     LearnedFollower,
     OpenLoop,
     PlannedFollower,
@@ -17,26 +30,9 @@ from palpate.experiments.rope_followers import (
     blind_followers,
     planner,
 )
-from palpate.experiments.rope_stabilization import Size
-from palpate.experiments.rope_tracking_trials import (
-    Followed,
-    follow,
-    path_trials,
-    summarise,
-    table,
-)
-from palpate.experiments.rope_trials import Seen
-from palpate.learning import Training
-from palpate.models.rope import Rope
-from palpate.networks import CommandPolicy
-from palpate.report.evidence import read_evidence
-from palpate.result import read_result
-from palpate.runs import Run
-from palpate.storage import write_json
-from palpate.tasks import RopeTracking
-from palpate.tasks.paths import CURVES
-from palpate.tasks.rope_tracking import PREVIEW
-from palpate.worlds.rope import RopeConfiguration
+from palpate.trials.rope.tracking import Followed, follow, path_trials, summarise, table
+from palpate.trials.rope.trials import Seen
+from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL
 
 BASE = RopeConfiguration(**SMALL)
@@ -203,7 +199,7 @@ def test_stages_hand_on_what_they_made(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(rope_stabilization, "NODES", 6)
     monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr(rope_stabilization, "identify", lambda start, *_: start)
-    monkeypatch.setattr("palpate.experiments.train.train", train)
+    monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_tracking, "SMALL", TINY)
     monkeypatch.setattr(rope_tracking, "samples_within", lambda *_: (8, 0.001))
     monkeypatch.setattr(rope_tracking, "UNHURRIED", (8, 2))

@@ -10,11 +10,11 @@ import pytest
 
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
-from palpate.identification.bayesian import draw, identify, preparing, sample
-from palpate.identification.laplace import Modes
-from palpate.identification.likelihood import known_scales, motion_posterior
-from palpate.identification.segments import cut
-from palpate.identification.settled import Part, Settled, settle_each
+from palpate.identification.data.segments import cut
+from palpate.identification.posterior.laplace import Modes
+from palpate.identification.posterior.likelihood import known_scales, motion_posterior
+from palpate.identification.posterior.posterior import draw, identify, preparing, sample
+from palpate.identification.posterior.settled import Part, Settled, settle_each
 
 TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])
@@ -127,8 +127,8 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
     def searched(*_):
         raise AssertionError("expected to be refused before the search for modes")
 
-    monkeypatch.setattr("palpate.identification.bayesian.settle_each", searched)
-    monkeypatch.setattr("palpate.identification.bayesian.local_global", searched)
+    monkeypatch.setattr("palpate.identification.posterior.posterior.settle_each", searched)
+    monkeypatch.setattr("palpate.identification.posterior.posterior.local_global", searched)
     recording = pushes(TRUE, 3, trials=1, frames=61)
     target = motion_posterior(
         MODEL, cut(recording, MODEL, 1.0, at_rest=True), known_scales(MODEL, NOISE)
@@ -146,7 +146,9 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
 
 
 def test_a_posterior_of_too_many_coordinates_is_for_the_no_u_turn_sampler(posterior, monkeypatch):
-    monkeypatch.setattr("palpate.identification.bayesian.WIDEST", posterior.target.dimension - 1)
+    monkeypatch.setattr(
+        "palpate.identification.posterior.posterior.WIDEST", posterior.target.dimension - 1
+    )
     with compiled({"_block", "_walked"}) as names:
         found = draw(posterior.settled, chains=4, draws=150)
     assert names == {"_block"}

@@ -10,16 +10,15 @@ import pytest
 
 from bayesian_toys import Sled, pushes
 from palpate.errors import PalpateError
-from palpate.identification.bayesian import identify
-from palpate.identification.posterior_files import (
+from palpate.identification.posterior.files import (
     read_models,
     read_posterior,
     to_arviz,
     write_netcdf,
     write_posterior,
 )
-from palpate.models.files import MODELS
-from palpate.storage import DamagedFileError
+from palpate.identification.posterior.posterior import identify
+from palpate.runs.storage import DamagedFileError
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +38,7 @@ def test_what_was_written_is_read_back(posterior, tmp_path):
     assert about["warnings"] == list(posterior.warnings)
 
 
-def test_models_come_back_and_predict_the_same(posterior, tmp_path, monkeypatch):
-    monkeypatch.setitem(MODELS, "sled", Sled)
+def test_models_come_back_and_predict_the_same(posterior, tmp_path, toys):
     path = write_posterior(tmp_path / "posterior.npz", posterior)
     for count in (None, 7):
         ours, written = read_models(path, count), posterior.models(count)
@@ -49,8 +47,7 @@ def test_models_come_back_and_predict_the_same(posterior, tmp_path, monkeypatch)
             np.testing.assert_array_equal(one, other)
 
 
-def test_a_more_complete_model_may_be_kept(posterior, tmp_path, monkeypatch):
-    monkeypatch.setitem(MODELS, "sled", Sled)
+def test_a_more_complete_model_may_be_kept(posterior, tmp_path, toys):
     reference = posterior.target.coordinates.reference
     other = dataclasses.replace(reference, control_period=2 * reference.control_period)
     path = write_posterior(tmp_path / "posterior.npz", posterior, other)
@@ -59,12 +56,12 @@ def test_a_more_complete_model_may_be_kept(posterior, tmp_path, monkeypatch):
     np.testing.assert_array_equal(models.mass, posterior.models().mass)
 
 
-def test_draws_of_a_model_without_a_name_or_of_another_are_refused(
-    posterior, tmp_path, monkeypatch
-):
-    with pytest.raises(PalpateError, match="does not hold the model of its draws"):
+def test_draws_of_a_model_without_a_name_are_refused(posterior, tmp_path):
+    with pytest.raises(PalpateError, match=r"holds the unknown model 'None'; there are: .*rope"):
         read_models(write_posterior(tmp_path / "posterior.npz", posterior))
-    monkeypatch.setitem(MODELS, "sled", Sled)
+
+
+def test_draws_that_do_not_fit_their_model_are_refused(posterior, tmp_path, toys):
     path = write_posterior(tmp_path / "posterior.npz", posterior)
     with np.load(path) as file:
         arrays = dict(file)

@@ -9,8 +9,9 @@ from scipy.stats import multivariate_normal
 
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
-from palpate.identification.discrepancy import MEMORY, discrepancy_covariance
-from palpate.identification.likelihood import (
+from palpate.identification.data.segments import Segments, cut, known_start, noise_scale
+from palpate.identification.posterior.discrepancy import MEMORY, discrepancy_covariance
+from palpate.identification.posterior.likelihood import (
     VAGUE,
     from_start,
     inferred_scales,
@@ -19,8 +20,7 @@ from palpate.identification.likelihood import (
     motion_posterior,
     residuals,
 )
-from palpate.identification.predictive import Predicted, predict, score
-from palpate.identification.segments import Segments, cut, known_start, noise_scale
+from palpate.identification.posterior.predictive import Predicted, predict, score
 from palpate.models.model import rollout
 from palpate.parameters import sample_prior
 from toys import Cart, CartState

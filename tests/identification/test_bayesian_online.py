@@ -7,10 +7,10 @@ import pytest
 
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
-from palpate.identification.likelihood import inferred_scales, motion_posterior
+from palpate.identification.data.segments import cut
 from palpate.identification.online import absorb, begin, models_of, places
-from palpate.identification.segments import cut
-from palpate.identification.tempered import effective_share, temper
+from palpate.identification.posterior.likelihood import inferred_scales, motion_posterior
+from palpate.identification.samplers.tempered import effective_share, temper
 
 TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])

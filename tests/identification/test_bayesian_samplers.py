@@ -9,17 +9,17 @@ from scipy.stats import chi
 
 from bayesian_toys import Linear, linear
 from palpate.errors import PalpateError
-from palpate.identification import local_global as local_global_module
-from palpate.identification import metropolis
-from palpate.identification.diagnostics import bulk_size, rhat
-from palpate.identification.draws import time_to_compile
-from palpate.identification.hamiltonian import no_u_turn
-from palpate.identification.laplace import Modes, climb_each, find_modes
-from palpate.identification.local_global import local_global
-from palpate.identification.metropolis import covariance_adapted, prior_scaled
-from palpate.identification.mixture import DEGREES, Mixture, fit_mixture
-from palpate.identification.target import Target
-from palpate.identification.tempered import (
+from palpate.identification.posterior.diagnostics import bulk_size, rhat
+from palpate.identification.posterior.laplace import Modes, climb_each, find_modes
+from palpate.identification.samplers import local_global as local_global_module
+from palpate.identification.samplers import metropolis
+from palpate.identification.samplers.draws import time_to_compile
+from palpate.identification.samplers.hamiltonian import no_u_turn
+from palpate.identification.samplers.local_global import local_global
+from palpate.identification.samplers.metropolis import covariance_adapted, prior_scaled
+from palpate.identification.samplers.mixture import DEGREES, Mixture, fit_mixture
+from palpate.identification.samplers.target import Target
+from palpate.identification.samplers.tempered import (
     IMPOSSIBLE,
     batch_of,
     compare,

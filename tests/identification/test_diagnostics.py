@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.identification.diagnostics import bulk_size, rhat, tail_size
+from palpate.identification.posterior.diagnostics import bulk_size, rhat, tail_size
 
 
 def autoregressive(correlation, chains=4, draws=2000, repeats=40, seed=0):

@@ -10,11 +10,11 @@ import pytest
 
 from correctable_toys import CorrectableCart, CorrectablePendulum
 from palpate.errors import PalpateError
-from palpate.identification import residual
-from palpate.identification.residual import ResidualSettings, fit_residual
+from palpate.identification.gradient import residual
+from palpate.identification.gradient.residual import ResidualSettings, fit_residual
 from palpate.models.model import rollout
 from palpate.models.residual import Residual
-from palpate.recording import Aligned
+from palpate.recordings import Aligned
 from palpate.runs import Run
 from toys import Cart
 

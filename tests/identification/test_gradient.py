@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.identification import gradient
-from palpate.identification.gradient import RECOVERY, Settings, identify
-from palpate.identification.least_squares import intervals
-from palpate.identification.prediction import (
+from palpate.identification.data.prediction import (
     WindowSource,
     observation_scale,
     predict,
     prediction_error,
 )
+from palpate.identification.gradient import descent as gradient
+from palpate.identification.gradient.descent import RECOVERY, Settings, identify
+from palpate.identification.gradient.least_squares import intervals
 from palpate.models.model import rollout
 from palpate.models.rope import Rope
 from palpate.parameters import FreeParameters, LogNormal, declare, value_of
-from palpate.recording import Aligned
+from palpate.recordings import Aligned
 from palpate.runs import Run
 from toys import Cart, Pendulum
 

@@ -6,10 +6,10 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from palpate.identification.least_squares import _undecided, intervals
+from palpate.identification.gradient.least_squares import _undecided, intervals
 from palpate.models.model import Model, rollout
 from palpate.parameters import FreeParameters, LogNormal, parameter
-from palpate.recording import Aligned
+from palpate.recordings import Aligned
 from toys import CartState
 
 PRIOR = LogNormal(1.0, 0.5)

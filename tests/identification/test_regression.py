@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.identification import regression as module
-from palpate.identification.regression import LocallyWeighted, locally_weighted
+from palpate.identification.regression import locally_weighted as module
+from palpate.identification.regression.locally_weighted import LocallyWeighted, locally_weighted
 
 
 def data(count: int, inputs: int, seed: int = 0) -> np.ndarray:

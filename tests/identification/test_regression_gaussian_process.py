@@ -6,7 +6,7 @@ import pytest
 import scipy.stats
 
 from palpate.errors import PalpateError
-from palpate.identification.regression_gaussian_process import (
+from palpate.identification.regression.gaussian_process import (
     LARGEST,
     gaussian_process,
     log_marginal_likelihood,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.identification.regression_model import KINDS, Features, regressed
+from palpate.identification.regression.model import KINDS, Features, regressed
 from palpate.models.model import rollout
 from toys import Cart, CartState
 

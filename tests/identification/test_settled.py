@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from palpate.identification.bayesian import draw, sample
-from palpate.identification.laplace import Modes
-from palpate.identification.likelihood import inferred_scales, known_scales, motion_posterior
-from palpate.identification.local_global import CHAINS
-from palpate.identification.segments import cut
-from palpate.identification.settled import Part, Settled, factors_of
-from palpate.identification.target import log_prior
+from palpate.identification.data.segments import cut
+from palpate.identification.posterior.laplace import Modes
+from palpate.identification.posterior.likelihood import (
+    inferred_scales,
+    known_scales,
+    motion_posterior,
+)
+from palpate.identification.posterior.posterior import draw, sample
+from palpate.identification.posterior.settled import Part, Settled, factors_of
+from palpate.identification.samplers.local_global import CHAINS
+from palpate.identification.samplers.target import log_prior
 from palpate.models.model import Model, rollout
 from palpate.parameters import LogNormal, Normal, Parameter, declare, parameter
-from palpate.recording import Aligned
+from palpate.recordings import Aligned
 
 PERIOD, NOISE = 0.02, np.array([1e-3, 2e-3])
 MASSES = (5.0, 10.0, 20.0, 40.0)

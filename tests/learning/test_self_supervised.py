@@ -18,7 +18,7 @@ from palpate.learning import Training, simulate, train
 from palpate.networks.policy import CommandPolicy, Policy
 from palpate.parameters import randomise
 from palpate.runs import Run
-from palpate.storage import plain
+from palpate.runs.storage import plain
 from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
 
 CART, PENDULUM = Cart(1.0, 0.5), Pendulum(1.0, 0.2)

@@ -10,7 +10,8 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.models.files import load_model, save_model
-from palpate.models.planar_shapes import furniture, rectangle
+from palpate.models.planar import furniture
+from palpate.models.planar.shapes import rectangle
 from palpate.models.rope import Rope
 from palpate.parameters import declare, parameters_of, value_of, with_values
 from toys import Cart
@@ -121,7 +122,7 @@ def test_a_batch_of_models_is_not_saved(tmp_path):
 def test_a_model_that_nobody_could_read_again_is_not_saved(tmp_path):
     with pytest.raises(PalpateError) as error:
         save_model(tmp_path / "model.json", Cart(1.0, 0.5))
-    assert str(error.value) == "a model of type Cart cannot be saved; known: rope, planar"
+    assert str(error.value) == "a model of type Cart cannot be saved; known: planar, rope"
     assert not (tmp_path / "model.json").exists()
 
 
@@ -176,9 +177,9 @@ def test_other_json_is_no_model(file, text):
         (("version",), [1], "FILE has version [1]; this palpate reads versions 1 and 2"),
         (("version",), True, "FILE has version True; this palpate reads versions 1 and 2"),
         (("version",), REMOVED, "FILE has version None; this palpate reads versions 1 and 2"),
-        (("model",), "string", "FILE holds the unknown model 'string'; there are: rope, planar"),
-        (("model",), ["rope"], "FILE holds the unknown model '['rope']'; there are: rope, planar"),
-        (("model",), REMOVED, "FILE holds the unknown model 'None'; there are: rope, planar"),
+        (("model",), "string", "FILE holds the unknown model 'string'; there are: planar, rope"),
+        (("model",), ["rope"], "FILE holds the unknown model '['rope']'; there are: planar, rope"),
+        (("model",), REMOVED, "FILE holds the unknown model 'None'; there are: planar, rope"),
         (
             ("value", "node_mass"),
             [-0.01, *[0.01] * 5],

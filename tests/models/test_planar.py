@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
-from palpate.models.planar import Planar, PlanarState
-from palpate.models.planar_shapes import centred, furniture, rectangle
+from palpate.models.planar import Planar, PlanarState, furniture
+from palpate.models.planar.shapes import centred, rectangle
 from palpate.parameters import FreeParameters, parameters_of, sample_prior, with_values
 
 run = jax.jit(rollout)

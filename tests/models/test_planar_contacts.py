@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palpate.models import planar_geometry
 from palpate.models.model import rollout
-from palpate.models.planar import PlanarState
-from palpate.models.planar_shapes import furniture, rectangle
-from palpate.models.planar_system import system_of
+from palpate.models.planar import PlanarState, furniture
+from palpate.models.planar import geometry as planar_geometry
+from palpate.models.planar.shapes import rectangle
+from palpate.models.planar.system import system_of
 
 run = jax.jit(rollout)
 SMOOTH = {"floor_friction": 0.0, "floor_damping": 0.0, "wheels": 0}

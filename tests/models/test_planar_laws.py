@@ -10,11 +10,11 @@ import scipy.linalg
 
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
-from palpate.models.planar import Planar, PlanarState
-from palpate.models.planar_friction import STICTION, Tensor, exponential
-from palpate.models.planar_shapes import furniture, rectangle
-from palpate.models.planar_system import GRAVITY
-from palpate.models.planar_wheels import turned_wheel, wheel_axes
+from palpate.models.planar import Planar, PlanarState, furniture
+from palpate.models.planar.friction import STICTION, Tensor, exponential
+from palpate.models.planar.shapes import rectangle
+from palpate.models.planar.system import GRAVITY
+from palpate.models.planar.wheels import turned_wheel, wheel_axes
 
 run = jax.jit(rollout)
 BOX = rectangle(1.2, 0.6)

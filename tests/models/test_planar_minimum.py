@@ -10,11 +10,11 @@ import pytest
 import scipy.optimize
 
 from palpate.models.model import rollout
-from palpate.models.planar import Planar, PlanarState
-from palpate.models.planar_friction import STICTION
-from palpate.models.planar_shapes import furniture, rectangle
-from palpate.models.planar_system import GRAVITY
-from palpate.models.planar_wheels import turned_wheel
+from palpate.models.planar import Planar, PlanarState, furniture
+from palpate.models.planar.friction import STICTION
+from palpate.models.planar.shapes import rectangle
+from palpate.models.planar.system import GRAVITY
+from palpate.models.planar.wheels import turned_wheel
 
 HALF = np.array([0.9, 0.425])
 

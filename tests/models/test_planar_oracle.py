@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from palpate.models.model import rollout
-from palpate.models.planar import PlanarState
-from palpate.models.planar_shapes import furniture, rectangle
+from palpate.models.planar import PlanarState, furniture
+from palpate.models.planar.shapes import rectangle
 
 BLOCK = """<body name="{name}" pos="{x} {y} 0.05"><joint type="slide" axis="1 0 0"/>
 <joint type="slide" axis="0 1 0"/><joint type="hinge" axis="0 0 1"/>

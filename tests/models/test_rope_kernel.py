@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from palpate.models import rope_kernel
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
+from palpate.models.rope import kernel as rope_kernel
 from rope_states import at_rest, bent
 
 NODES = 7
@@ -258,7 +258,7 @@ def test_a_rope_that_nothing_holds_keeps_both_momenta(float64):
 
 @pytest.mark.parametrize("lanes", [1, 2, 3, 16])
 def test_lanes_do_not_touch_each_other(lanes, monkeypatch, float64):
-    monkeypatch.setattr("palpate.models.rope.LANES", lanes)
+    monkeypatch.setattr("palpate.models.rope.rope.LANES", lanes)
     rng = np.random.default_rng(6)
     ropes = [uneven_rope(rng) for _ in range(3)]
     starts = [bent(rope, rng, 0.5, 0.1) for rope in ropes]

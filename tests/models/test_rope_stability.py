@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from palpate.models.model import rollout
 from palpate.models.rope import Rope
-from palpate.models.rope_stability import LIMIT
+from palpate.models.rope.stability import LIMIT
 from palpate.parameters import FreeParameters, declare, randomise, sample_prior, value_of
 from rope_states import at_rest, bent, hanging, still
 

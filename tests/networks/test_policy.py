@@ -8,7 +8,7 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.networks.policy import CommandPolicy, load_policy, save_policy
-from palpate.storage import save_arrays
+from palpate.runs.storage import save_arrays
 
 LIMIT, RATE, PERIOD = 1.5, 10.0, 0.01
 

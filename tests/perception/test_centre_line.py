@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.perception.centre_line import CentreLine, centre_lines, line_points, walk
-from palpate.perception.rope_segmentation import Appearance, Segmentation, segment
-from palpate.worlds.pinhole import Frame, Pinhole
+from palpate.numerics.pinhole import Frame, Pinhole
+from palpate.perception.rope.centre_line import CentreLine, centre_lines, line_points, walk
+from palpate.perception.rope.segmentation import Appearance, Segmentation, segment
 
 CAMERA = Pinhole.looking_at((0.0, 0.0, 0.0), (0.0, -2.5, 0.0), 320, 240, math.radians(60))
 ROPE = Appearance((0.85, 0.45, 0.15), 0.0)

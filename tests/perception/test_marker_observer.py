@@ -9,7 +9,7 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.models.rope import Rope, RopeState
-from palpate.perception.marker_observer import MODEL_ERROR, MarkerObserver, gains
+from palpate.perception.rope.marker_observer import MODEL_ERROR, MarkerObserver, gains
 
 PERIOD, NOISE, STEPS = 0.01, 5e-4, 150
 ROPE = dataclasses.replace(Rope.uniform(1.0, 0.1, 11, driven=(0,), substeps=4), drive="velocity")

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.models.rope import Rope
-from palpate.perception import rope_filter
-from palpate.perception.rope_filter import Belief, Sighting, View, advance, correct
-from palpate.worlds.filmed_rope import TRIPOD
+from palpate.perception.rope import filter as rope_filter
+from palpate.perception.rope.filter import Belief, Sighting, View, advance, correct
+from palpate.worlds.rope.filmed import TRIPOD
 
 GRIPPER = np.array([0.0, 0.0, 1.5], np.float32)
 MODEL = Rope.uniform(

@@ -9,13 +9,13 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.models.rope import Rope
+from palpate.numerics.pinhole import Frame
 from palpate.perception.image_folder import read_image_folder, write_image_folder
-from palpate.perception.rope_segmentation import Appearance
-from palpate.perception.rope_tracking import LOST_FRAMES, RopeTracker
+from palpate.perception.rope.segmentation import Appearance
+from palpate.perception.rope.tracking import LOST_FRAMES, RopeTracker
 from palpate.worlds.camera import Sensor
-from palpate.worlds.filmed_rope import ROPE_COLOUR, TRIPOD, FilmedRope
-from palpate.worlds.pinhole import Frame
-from palpate.worlds.rope import START_POSES, RopeConfiguration
+from palpate.worlds.rope.filmed import ROPE_COLOUR, TRIPOD, FilmedRope
+from palpate.worlds.rope.rope import START_POSES, RopeConfiguration
 
 ROPE = Appearance(ROPE_COLOUR, 5e-3)
 GRIPPER = np.array([0.0, 0.0, 1.5], np.float32)

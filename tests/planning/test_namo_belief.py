@@ -8,11 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palpate.models.planar import Planar, PlanarState
-from palpate.models.planar_shapes import furniture, rectangle
-from palpate.planning.movable_obstacles import belief as beliefs
-from palpate.planning.movable_obstacles.belief import LEAST, PIECES, Belief, ObjectBelief, cut
-from palpate.planning.movable_obstacles.primitives import AXIS, FREE, PIVOT, STATIC
+from palpate.models.planar import Planar, PlanarState, furniture
+from palpate.models.planar.shapes import rectangle
+from palpate.planning.movable_obstacles.motion import belief as beliefs
+from palpate.planning.movable_obstacles.motion.belief import (
+    LEAST,
+    PIECES,
+    Belief,
+    ObjectBelief,
+    cut,
+)
+from palpate.planning.movable_obstacles.motion.primitives import AXIS, FREE, PIVOT, STATIC
 
 OUTLINE = rectangle(1.1, 0.5)
 KINDS = [kind for kind, *_ in beliefs.HYPOTHESES]

@@ -8,18 +8,21 @@ import pytest
 import shapely
 
 from namo_rooms import two_rooms
-from palpate.planning.movable_obstacles.geometry import placed, polygons
-from palpate.planning.movable_obstacles.map import Map
-from palpate.planning.movable_obstacles.occupancy import Space
-from palpate.planning.movable_obstacles.openings import OpeningSearch
-from palpate.planning.movable_obstacles.physics_manipulation import ConstrainedManipulation, Drawn
-from palpate.planning.movable_obstacles.plan import TRANSFER, Plan
-from palpate.planning.movable_obstacles.planner import Planner
-from palpate.planning.movable_obstacles.policy import NoWayError
-from palpate.planning.movable_obstacles.primitives import AXIS, PIVOT, STATIC, Constraint
-from palpate.planning.movable_obstacles.regrasps import stops_of
-from palpate.planning.movable_obstacles.situation import whole
-from palpate.planning.movable_obstacles.verification import faults_of
+from palpate.numerics.polygons import placed, polygons
+from palpate.planning.movable_obstacles.maps.map import Map
+from palpate.planning.movable_obstacles.maps.occupancy import Space
+from palpate.planning.movable_obstacles.motion.physics_manipulation import (
+    ConstrainedManipulation,
+    Drawn,
+)
+from palpate.planning.movable_obstacles.motion.primitives import AXIS, PIVOT, STATIC, Constraint
+from palpate.planning.movable_obstacles.search.openings import OpeningSearch
+from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan
+from palpate.planning.movable_obstacles.search.planner import Planner
+from palpate.planning.movable_obstacles.search.policy import NoWayError
+from palpate.planning.movable_obstacles.search.regrasps import stops_of
+from palpate.planning.movable_obstacles.search.situation import whole
+from palpate.planning.movable_obstacles.search.verification import faults_of
 
 ALONG_WALL = math.pi / 2  # the wall between the rooms runs along y, and so does the body's y
 NEAR_END = Constraint(PIVOT, (0.0, -0.5))

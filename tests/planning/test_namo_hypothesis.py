@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 from namo_grids import OWN
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.geometry import checked_polygon
-from palpate.planning.movable_obstacles.map import Map, Movable, Robot, map_of
-from palpate.planning.movable_obstacles.map_description import read_described
-from palpate.planning.movable_obstacles.map_svg_paths import path_outlines
-from palpate.planning.movable_obstacles.planner import Planner
-from palpate.planning.movable_obstacles.tree_search import Settings
-from palpate.planning.movable_obstacles.verification import faults_of
+from palpate.numerics.polygons import checked_polygon
+from palpate.planning.movable_obstacles.maps.description import read_described
+from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot, map_of
+from palpate.planning.movable_obstacles.maps.svg_paths import path_outlines
+from palpate.planning.movable_obstacles.search.planner import Planner
+from palpate.planning.movable_obstacles.search.tree_search import Settings
+from palpate.planning.movable_obstacles.search.verification import faults_of
 
 LONGEST = 30.0  # s, on a busy machine: what takes longer is a hang
 QUICK = Settings(iterations=40)

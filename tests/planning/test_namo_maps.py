@@ -13,10 +13,10 @@ from shapely.geometry import Polygon
 from namo_grids import CORNERS, OWN, room, ros_map
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.geometry import checked_polygon, checked_pose, shown
-from palpate.planning.movable_obstacles.map import Map, Movable, Robot
-from palpate.planning.movable_obstacles.map_description import write_map
-from palpate.planning.movable_obstacles.map_files import maps_in, read_map
+from palpate.numerics.polygons import checked_polygon, checked_pose, shown
+from palpate.planning.movable_obstacles.maps.description import write_map
+from palpate.planning.movable_obstacles.maps.files import maps_in, read_map
+from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot
 
 
 def own_map(folder: Path, **keys) -> Path:

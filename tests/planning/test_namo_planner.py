@@ -13,19 +13,25 @@ from scipy import ndimage
 
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.geometry import placed, polygons
-from palpate.planning.movable_obstacles.manipulation import PRIMITIVES, Motion, RigidCarry
-from palpate.planning.movable_obstacles.map import Movable
-from palpate.planning.movable_obstacles.map_files import read_map
-from palpate.planning.movable_obstacles.occupancy import Space
-from palpate.planning.movable_obstacles.openings import CARRYING, HANDLING, TURNING
-from palpate.planning.movable_obstacles.paths import distances
-from palpate.planning.movable_obstacles.plan import TRANSFER, Plan, Segment, read_plan, write_plan
-from palpate.planning.movable_obstacles.planner import Planner
-from palpate.planning.movable_obstacles.policy import NoWayError
-from palpate.planning.movable_obstacles.regions import regions_of
-from palpate.planning.movable_obstacles.tree_search import Settings
-from palpate.planning.movable_obstacles.verification import faults_of
+from palpate.numerics.polygons import placed, polygons
+from palpate.planning.movable_obstacles.maps.files import read_map
+from palpate.planning.movable_obstacles.maps.map import Movable
+from palpate.planning.movable_obstacles.maps.occupancy import Space
+from palpate.planning.movable_obstacles.maps.regions import regions_of
+from palpate.planning.movable_obstacles.motion.manipulation import PRIMITIVES, Motion, RigidCarry
+from palpate.planning.movable_obstacles.search.openings import CARRYING, HANDLING, TURNING
+from palpate.planning.movable_obstacles.search.paths import distances
+from palpate.planning.movable_obstacles.search.plan import (
+    TRANSFER,
+    Plan,
+    Segment,
+    read_plan,
+    write_plan,
+)
+from palpate.planning.movable_obstacles.search.planner import Planner
+from palpate.planning.movable_obstacles.search.policy import NoWayError
+from palpate.planning.movable_obstacles.search.tree_search import Settings
+from palpate.planning.movable_obstacles.search.verification import faults_of
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "namo_scenarios"
 

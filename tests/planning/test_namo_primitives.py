@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from palpate.planning.movable_obstacles.geometry import placed
-from palpate.planning.movable_obstacles.manipulation import (
+from palpate.numerics.polygons import placed
+from palpate.planning.movable_obstacles.maps.map import Movable
+from palpate.planning.movable_obstacles.motion.manipulation import (
     BACKWARD,
     FORWARD,
     LEFT,
@@ -16,13 +17,12 @@ from palpate.planning.movable_obstacles.manipulation import (
     RigidCarry,
     outline_grasps,
 )
-from palpate.planning.movable_obstacles.map import Movable
-from palpate.planning.movable_obstacles.physics_manipulation import (
+from palpate.planning.movable_obstacles.motion.physics_manipulation import (
     ConstrainedManipulation,
     Drawn,
     swept,
 )
-from palpate.planning.movable_obstacles.primitives import (
+from palpate.planning.movable_obstacles.motion.primitives import (
     APART,
     AXIS,
     FREE,

@@ -12,8 +12,8 @@ from PIL import Image
 
 from namo_grids import AGENT, BESIDE, CORNERS, LAYERS, SQUARE, namosim_map, room, ros_map
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.map_files import maps_in, read_map
-from palpate.planning.movable_obstacles.map_ros import walls_of
+from palpate.planning.movable_obstacles.maps.files import maps_in, read_map
+from palpate.planning.movable_obstacles.maps.ros import walls_of
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "namo_scenarios"
 

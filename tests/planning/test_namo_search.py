@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from namo_rooms import IN_DOOR, two_rooms
-from palpate.planning.movable_obstacles.abstract import Actions, iterate
-from palpate.planning.movable_obstacles.collisions import Clearance
-from palpate.planning.movable_obstacles.geometry import length_of, placed, polygons
-from palpate.planning.movable_obstacles.manipulation import (
+from palpate.numerics.polygons import length_of, placed, polygons
+from palpate.planning.movable_obstacles.maps.occupancy import Footprint, Space, inside
+from palpate.planning.movable_obstacles.maps.regions import regions_of
+from palpate.planning.movable_obstacles.motion.collisions import Clearance
+from palpate.planning.movable_obstacles.motion.manipulation import (
     FORWARD,
     PRIMITIVES,
     TURN_LEFT,
@@ -21,12 +22,11 @@ from palpate.planning.movable_obstacles.manipulation import (
     carried,
     outline_grasps,
 )
-from palpate.planning.movable_obstacles.occupancy import Footprint, Space, inside
-from palpate.planning.movable_obstacles.passages import Passage
-from palpate.planning.movable_obstacles.paths import distances
-from palpate.planning.movable_obstacles.regions import regions_of
-from palpate.planning.movable_obstacles.situation import whole
-from palpate.planning.movable_obstacles.tree_search import Settings, Step, search
+from palpate.planning.movable_obstacles.search.abstract import Actions, iterate
+from palpate.planning.movable_obstacles.search.passages import Passage
+from palpate.planning.movable_obstacles.search.paths import distances
+from palpate.planning.movable_obstacles.search.situation import whole
+from palpate.planning.movable_obstacles.search.tree_search import Settings, Step, search
 
 # --- value iteration --------------------------------------------------------------------------
 

@@ -8,8 +8,8 @@ import pytest
 import shapely
 
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.map_svg import read_svg
-from palpate.planning.movable_obstacles.map_svg_paths import path_outlines, transform_matrix
+from palpate.planning.movable_obstacles.maps.svg import read_svg
+from palpate.planning.movable_obstacles.maps.svg_paths import path_outlines, transform_matrix
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "namo_scenarios"
 CONFIG = """<namo_config cell_size_cm="10"{extra}><agent agent_id="robot_0">

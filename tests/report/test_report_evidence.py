@@ -6,7 +6,7 @@ import pytest
 from palpate.errors import PalpateError
 from palpate.report import read_evidence, write_evidence
 from palpate.report.evidence import EVIDENCE
-from palpate.storage import DamagedFileError, write_json, write_text
+from palpate.runs.storage import DamagedFileError, write_json, write_text
 from synthetic_evidence import evaluation, identification, parameter, training, write_run
 
 TIME = np.linspace(0.0, 1.0, 5)

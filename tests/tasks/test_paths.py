@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.tasks.paths import (
+from palpate.tasks.rope.paths import (
     CURVES,
     FARTHEST,
     FASTEST,

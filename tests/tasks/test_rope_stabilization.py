@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.models import Rope, RopeState, rollout
+from palpate.family import find
+from palpate.models import rollout
+from palpate.models.rope import Rope, RopeState
 from palpate.parameters import randomise
-from palpate.tasks import TASKS, RopeStabilization, task_named
-from palpate.tasks.rope_stabilization import vertical_symmetry
+from palpate.tasks.rope import RopeStabilization
+from palpate.tasks.rope.stabilization import vertical_symmetry
 from palpate.tasks.task import Start
 
 TASK = RopeStabilization()
@@ -162,6 +164,6 @@ def test_energy_share_is_the_same_compiled_and_not(model) -> None:
 
 
 def test_tasks_are_found_by_name() -> None:
-    assert task_named("rope-stabilization") is TASKS["rope-stabilization"] is RopeStabilization
+    assert find("tasks", "rope-stabilization") is RopeStabilization
     with pytest.raises(PalpateError, match="unknown task 'knot'; there are: rope-stab"):
-        task_named("knot")
+        find("tasks", "knot")

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.models import Rope, RopeState, rollout
+from palpate.family import find
+from palpate.models import rollout
+from palpate.models.rope import Rope, RopeState
 from palpate.parameters import randomise
-from palpate.tasks import RopeTracking, task_named
-from palpate.tasks.paths import DesiredPath, named_path
-from palpate.tasks.rope_stabilization import vertical_symmetry
-from palpate.tasks.rope_tracking import PREVIEW, grip_of_chain, hanging_rope
+from palpate.tasks.rope import RopeTracking
+from palpate.tasks.rope.paths import DesiredPath, named_path
+from palpate.tasks.rope.stabilization import vertical_symmetry
+from palpate.tasks.rope.tracking import PREVIEW, grip_of_chain, hanging_rope
 from palpate.tasks.task import Start
 
 TASK = RopeTracking()
@@ -178,4 +180,4 @@ def test_a_hanging_rope_stays_where_it_is(model) -> None:
 
 
 def test_the_task_is_found_by_name() -> None:
-    assert task_named("rope-tracking") is RopeTracking
+    assert find("tasks", "rope-tracking") is RopeTracking

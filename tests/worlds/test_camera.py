@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.numerics.pinhole import Pinhole
 from palpate.worlds.camera import AMBIENT, TO_LIGHT, Camera, Sensor
-from palpate.worlds.filmed_rope import ROPE_COLOUR, FilmedRope
-from palpate.worlds.pinhole import Pinhole
-from palpate.worlds.rope import RopeConfiguration
+from palpate.worlds.rope.filmed import ROPE_COLOUR, FilmedRope
+from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import QUIET, SMALL
 
 AHEAD = Pinhole.looking_at((0.0, 0.0, 1.0), (0.0, -2.0, 1.0), 80, 60, math.radians(60))

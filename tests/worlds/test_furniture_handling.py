@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.recording import Role
-from palpate.worlds.furniture import KINDS, FurnitureWorld, Piece
-from palpate.worlds.furniture_handling import (
-    Push,
-    Wiggle,
-    record,
-    record_handling,
-    record_pushes,
-)
+from palpate.recordings import Role
+from palpate.worlds.furniture.furniture import KINDS, FurnitureWorld, Piece
+from palpate.worlds.furniture.handling import Push, Wiggle, record, record_handling, record_pushes
 from trolley import sledge, trolley
 
 MOVABLE = [name for name, kind in KINDS.items() if not kind.bolted]

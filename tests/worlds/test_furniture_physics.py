@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from palpate.worlds.furniture import KINDS, FurnitureWorld, Piece
-from palpate.worlds.furniture_pieces import placed
+from palpate.worlds.furniture.furniture import KINDS, FurnitureWorld, Piece
+from palpate.worlds.furniture.pieces import placed
 from trolley import EXACT, LENGTH, MASS, OUTLINE, PLACES, WIDTH, sledge, trolley
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.worlds.furniture import KINDS, FurnitureWorld, Piece, Robot
-from palpate.worlds.furniture_picture import robot_footprints, top_view
-from palpate.worlds.furniture_pieces import centroid, placed
+from palpate.worlds.furniture.furniture import KINDS, FurnitureWorld, Piece, Robot
+from palpate.worlds.furniture.picture import robot_footprints, top_view
+from palpate.worlds.furniture.pieces import centroid, placed
 
 OUTLINES = {"box": np.array(KINDS["box"].outline)}
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.body_controller import BodyController, moved_with
-from palpate.worlds.furniture import FurnitureWorld, Piece, Robot, RobotAction
-from palpate.worlds.furniture_pieces import placed
-from palpate.worlds.furniture_robot import RobotObservation
-from palpate.worlds.furniture_touch import felt_wrenches
+from palpate.planning.movable_obstacles.motion.body_controller import BodyController, moved_with
+from palpate.worlds.furniture.furniture import FurnitureWorld, Piece, Robot, RobotAction
+from palpate.worlds.furniture.pieces import placed
+from palpate.worlds.furniture.robot import RobotObservation
+from palpate.worlds.furniture.touch import felt_wrenches
 from trolley import EXACT, LENGTH, MASS, OUTLINE, sledge
 
 STILL = np.zeros(3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.worlds.furniture import (
+from palpate.worlds.furniture.furniture import (
     KINDS,
     FurnitureSensors,
     FurnitureWorld,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.worlds.rope import Disturbance, RopeConfiguration, sample_configurations
+from palpate.worlds.rope.rope import Disturbance, RopeConfiguration, sample_configurations
 
 
 def test_sampled_ropes_span_their_ranges_and_nothing_else_changes():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.worlds import rope as rope_world
-from palpate.worlds.rope import START_POSES, Disturbance, RopeConfiguration, RopeWorld
+from palpate.worlds.rope import rope as rope_world
+from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration, RopeWorld
 from palpate.worlds.world import DivergedError
 from small_rope import FREE, QUIET, SMALL, STILL, rope
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.worlds.rope import Disturbance, RopeConfiguration, RopeWorld
+from palpate.worlds.rope.rope import Disturbance, RopeConfiguration, RopeWorld
 from small_rope import QUIET, STILL, rope
 
 # --- the gripper ---

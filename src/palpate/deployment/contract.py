@@ -16,7 +16,7 @@ from typing import Any
 from palpate.errors import PalpateError
 from palpate.networks import CommandPolicy
 from palpate.perception.velocity import VelocityEstimator
-from palpate.storage import plain, read_json, write_json
+from palpate.runs.storage import plain, read_json, write_json
 
 _FORMAT = "palpate.contract"
 _VERSION = 1

@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.deployment.extras import extra_module
 from palpate.networks import CommandPolicy
-from palpate.storage import write_bytes
+from palpate.runs.storage import write_bytes
 
 EXTRA = "deploy"
 _OPSET, _IR = 17, 8  # read by every ONNX Runtime from 1.12 (2022) on

@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.identification.likelihood import MotionPosterior, Scales, motion_posterior
-from palpate.identification.segments import Segments
-from palpate.identification.tempered import (
+from palpate.identification.data.segments import Segments
+from palpate.identification.posterior.likelihood import MotionPosterior, Scales, motion_posterior
+from palpate.identification.samplers.tempered import (
     IMPOSSIBLE,
     KEPT,
     effective_share,

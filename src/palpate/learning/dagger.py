@@ -24,7 +24,7 @@ from palpate.learning.self_supervised import Training, train
 from palpate.models.model import Model
 from palpate.networks.policy import CommandPolicy
 from palpate.runs import Run
-from palpate.storage import load_arrays, read_manifest, save_arrays
+from palpate.runs.storage import load_arrays, read_manifest, save_arrays
 from palpate.tasks.task import Start, Task
 
 OBSERVED = "observed.safetensors"

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, PRNGKeyArray
 
-from palpate.devices import data_parallel, everywhere
 from palpate.errors import PalpateError
 from palpate.learning.closed_loop import simulate
-from palpate.loops import interruptible, progress
 from palpate.models.model import Model
 from palpate.networks.policy import CommandPolicy
+from palpate.numerics.devices import data_parallel, everywhere
 from palpate.parameters import randomise
 from palpate.runs import Run
+from palpate.runs.progress import interruptible, progress
 from palpate.tasks.task import Start, Task
 
 MOST_SKIPPED = 20  # updates in a row without a finite gradient: more will not help

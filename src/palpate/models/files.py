@@ -1,6 +1,7 @@
 """Models on disk: JSON that a person can read, with the unit and meaning of every parameter."""
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.family import places, resolve
 from palpate.models.model import Model
-from palpate.models.planar import Planar
 from palpate.models.residual import Residual, SiteNetwork, correctable
-from palpate.models.rope import Rope
 from palpate.parameters import LogNormal, axes_of, describe, parameters_of
-from palpate.storage import read_json, write_json
+from palpate.runs.storage import read_json, write_json
 
-MODELS: dict[str, type[Model]] = {"rope": Rope, "planar": Planar}
 _FORMAT = "palpate.model"
 _VERSIONS = {1: False, 2: True}  # whether it has a correction, which version 1 had no place for
 
@@ -35,7 +34,8 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
     name = registered(physics)
     if name is None:
         raise PalpateError(
-            f"a model of type {type(physics).__name__} cannot be saved; known: {', '.join(MODELS)}"
+            f"a model of type {type(physics).__name__} cannot be saved; known: "
+            + ", ".join(places("models"))
         )
     for field, axes in axes_of(type(physics)).items():
         shape = getattr(physics, field).shape
@@ -74,12 +74,7 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
             f"{path} has version {version}; this palpate reads versions "
             + " and ".join(map(str, _VERSIONS))
         )
-    kind = MODELS.get(str(content.get("model")))
-    if kind is None:
-        raise PalpateError(
-            f"{path} holds the unknown model '{content.get('model')}'; "
-            f"there are: {', '.join(MODELS)}"
-        )
+    kind = kind_of(path, content.get("model"))
     try:
         rows = {row["name"]: row["value"] for row in content["parameters"]}
         structure: dict[str, Any] = {
@@ -105,7 +100,22 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
 
 def registered(model: Model) -> str | None:
     """The name of the model's kind in files, None for one that has none."""
-    return next((name for name, kind in MODELS.items() if type(model) is kind), None)
+    own = f"{type(model).__module__}:{type(model).__qualname__}"
+    for name, place in places("models").items():
+        module, _, attribute = place.partition(":")  # loaded already, if a model of it is here
+        if own == place or getattr(sys.modules.get(module), attribute, None) is type(model):
+            return name
+    return None
+
+
+def kind_of(path: str | Path, name: Any) -> type[Model]:
+    """The class of models that the file `path` names so; raises `PalpateError` where none is."""
+    known = places("models")
+    if not isinstance(name, str) or name not in known:
+        raise PalpateError(
+            f"{path} holds the unknown model '{name}'; there are: {', '.join(known)}"
+        )
+    return resolve(known[name])
 
 
 def structure_of(kind: type[Model]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.storage import load_arrays, read_manifest, save_arrays
+from palpate.runs.storage import load_arrays, read_manifest, save_arrays
 
 _KIND = "command policy"
 

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.storage import read_json, write_bytes, write_json, write_text
-from palpate.worlds.pinhole import Frame, Pinhole
+from palpate.numerics.pinhole import Frame, Pinhole
+from palpate.runs.storage import read_json, write_bytes, write_json, write_text
 
 CAMERA, TIMES, COLOUR, DEPTH = "camera.json", "times.csv", "colour", "depth"
 FILMS = [f"{COLOUR}{suffix}" for suffix in (".mp4", ".mkv", ".avi", ".mov", ".webm")]

@@ -31,9 +31,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from palpate.errors import PalpateError
-from palpate.result import Figure
-from palpate.runs import CONFIGURATION, ENVIRONMENT, METRICS, RESULT, read_metrics
-from palpate.storage import DamagedFileError, read_json, write_bytes
+from palpate.runs import Figure
+from palpate.runs.run import CONFIGURATION, ENVIRONMENT, METRICS, RESULT, read_metrics
+from palpate.runs.storage import DamagedFileError, read_json, write_bytes
 
 EVIDENCE = "evidence.npz"
 _LARGEST = 2**29  # bytes when unpacked: far above what a page can show

@@ -14,7 +14,7 @@ from palpate.errors import PalpateError
 from palpate.report.charts import quantiles
 from palpate.report.evidence import Curves, Motion
 from palpate.report.style import STYLES, Style, numbered
-from palpate.storage import write_bytes
+from palpate.runs.storage import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

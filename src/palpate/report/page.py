@@ -29,8 +29,8 @@ from palpate.report.evidence import (
 from palpate.report.parameter_chart import number, parameters
 from palpate.report.player import scene
 from palpate.report.style import STYLES, numbered
-from palpate.result import Figure
-from palpate.storage import write_text
+from palpate.runs import Figure
+from palpate.runs.storage import write_text
 
 Section = tuple[str, str]  # title, HTML
 NAMED = 5  # stages that a page names; more are counted

@@ -11,7 +11,7 @@ from scipy.stats import binom, gaussian_kde
 
 from palpate.errors import PalpateError
 from palpate.report.style import STYLES
-from palpate.storage import write_bytes
+from palpate.runs.storage import write_bytes
 
 ACROSS = 4  # panels in a row
 

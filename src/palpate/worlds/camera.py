@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.worlds.pinhole import Frame, Pinhole
+from palpate.numerics.pinhole import Frame, Pinhole
 
 TO_LIGHT = np.array([-0.3, -0.7, 0.65]) / np.linalg.norm([-0.3, -0.7, 0.65])
 AMBIENT = 0.45  # of the light on a surface that faces it

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.planning.movable_obstacles.body_controller import (
+from palpate.planning.movable_obstacles.motion.body_controller import (
     BodyController,
     arm_jacobian,
     gripper_pose,

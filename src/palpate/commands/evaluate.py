@@ -1,0 +1,84 @@
+"""`palpate evaluate`: a trained controller in a world that its model could not see into."""
+
+import math
+from pathlib import Path
+
+import jax
+
+from palpate.commands import folders
+from palpate.commands.train import figures_in_model, named_task
+from palpate.errors import PalpateError
+from palpate.families.options import Evaluate
+from palpate.models.files import load_model
+from palpate.models.model import Model
+from palpate.networks import CommandPolicy, load_policy
+from palpate.runs import Result
+from palpate.runs.result import read_result
+from palpate.runs.run import RESULT
+from palpate.runs.storage import write_text
+from palpate.tasks.task import Task
+
+
+def run(options: Evaluate) -> Path:
+    """Evaluate, print a table of all controllers, and return the folder everything is in.
+
+    Raises `PalpateError` for a file that is no policy, or one for another task or model.
+    """
+    file = folders.product_of(options.policy, folders.POLICY, "train")
+    policy, manifest = load_policy(file)
+    if manifest.get("task") != options.task:
+        raise PalpateError(
+            f"{file} was trained for '{manifest.get('task')}', not for {options.task}"
+        )
+    options.check(policy)
+    task = named_task(options.task)
+    configuration = folders.told(options, f"evaluate {options.task}")
+    configuration["policy"] = folders.fingerprint(file)
+    model = None
+    if options.model is not None:
+        described = folders.product_of(options.model, folders.MODEL, "identify")
+        model = options.prepare(load_model(described)[0])
+        check_model(policy, model, task, str(described))
+        configuration["model"] = folders.fingerprint(described)
+    name = f"evaluate-{options.task}"
+    with folders.open_run(options, name, configuration, None) as run:
+        if not run.finished:
+            found = options.evaluate(policy, run)
+            figures = [*found.figures]
+            if model is not None:
+                figures += figures_in_model(task, model, policy, options.seed)
+            result = Result(
+                name=name,
+                figures=figures,
+                settings=configuration | found.settings | {"notes": found.notes},
+                seeds=[options.seed],
+                split=found.split,
+                wall_time_s=run.elapsed,
+            )
+            write_text(run.path / folders.TABLE, "\n".join(found.table) + "\n")
+            run.finish(result.to_dict())
+        print((run.path / folders.TABLE).read_text(encoding="utf-8"), end="")
+        notes = read_result(run.path / RESULT).settings["notes"]
+        for note in notes:
+            print(f"note: {note}")
+        folders.hand_over(options, run, f"What a controller does: {options.task}", notes=notes)
+        return run.path
+
+
+def check_model(policy: CommandPolicy, model: Model, task: Task, described: str) -> None:
+    """Raise `PalpateError` unless the policy can control the model, which is `described` so."""
+
+    def features() -> jax.Array:
+        start = task.starts(model, jax.random.key(0), 2)
+        return task.features(start.state, start.goal)
+
+    seen = jax.eval_shape(features).shape[-1]
+    same_rate = math.isclose(policy.period, model.control_period, rel_tol=1e-4)
+    wanted = policy.mean.shape[0], policy.action_shape
+    if not same_rate or wanted != (seen, model.action_shape):
+        raise PalpateError(
+            f"the policy wants {wanted[0]} features and gives an action of shape {wanted[1]} every "
+            f"{policy.period:.4g} s, the model in {described} has {seen} and {model.action_shape} "
+            f"every {model.control_period:.4g} s: expected the model that the policy was trained "
+            "through, or one of its size and rate"
+        )

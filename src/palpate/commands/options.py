@@ -1,0 +1,146 @@
+"""Options of the commands that know no family: frozen dataclasses, which are their command lines.
+
+Nothing here imports what computes, so that help is instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from palpate.families.options import Options, Reading, Whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(Reading):
+    """Convert a recording: a robot's log into one of palpate's, any into what others can open.
+
+    What --out ends in says which: .npz is a recording of palpate, .rrd a file of the Rerun viewer.
+    With --lerobot it is the folder of a LeRobot dataset (v3.0).
+
+    1. A log into a recording:                  palpate convert R.mcap --out R.npz
+    2. To look at it in Rerun:                  palpate convert R.npz --out R.rrd
+    3. A dataset to learn from, at 50 Hz:       palpate convert R.npz --out R --lerobot --fps 50
+    """
+
+    out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(required)")] = None
+    """What to write."""
+    recording: Positional[Annotated[Path, arg(metavar="RECORDING", help_behavior_hint="")]]
+    """What `palpate identify` takes, too."""
+    lerobot: bool = False
+    """Write the folder of a LeRobot dataset."""
+    fps: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: the sensor's rate)")
+    ] = None
+    """Frames per second of a LeRobot dataset."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Options):
+    """Write the page of one or several runs.
+
+    A run's page is RUN/report.html and opens without a network. Of a folder with runs in it, such
+    as that of `palpate demo`, one page tells all of them.
+
+    1. Of one run, finished or not:             palpate report runs/identify-rope-001
+    2. Of several, in the order to be told:     palpate report A B --out both.html
+    """
+
+    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN ...", help_behavior_hint="")]]
+    """Folders that other commands have written."""
+    title: Annotated[
+        str | None, arg(metavar="TEXT", help_behavior_hint="(default: the names of the runs)")
+    ] = None
+    """What the page is called."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Options):
+    """Record a simulated rope, identify it, train a controller through what was found, try it.
+
+    The controller is tried in other ropes than the one that was recorded, beside a gripper held
+    still. Everything is written to one folder, with one report. What was cut off goes on when the
+    command is given again.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce(Options):
+    """Repeat a headline experiment from nothing, and hold its figures against their bars.
+
+    It says first how long it takes, and goes on where it was cut off when it is called again.
+
+    1. In full:                                 palpate reproduce rope-model --out DIR
+    2. The same work at a smaller size:         palpate reproduce rope-model --quick
+    3. With motion capture of a real rope:      palpate reproduce rope-model --mocap FOLDER
+    4. Without training:                        palpate reproduce rope-stabilization
+                                                    --weights shipped
+    5. On a folder of maps:                     palpate reproduce namo-scenarios --maps FOLDER
+    """
+
+    quick: bool = False
+    """At a smaller size, in minutes."""
+    weights: Annotated[
+        Literal["trained", "shipped"] | None,
+        arg(metavar="{trained,shipped}", help_behavior_hint="(default: trained)"),
+    ] = None
+    """Train anew, or take what ships with palpate."""
+    mocap: Annotated[
+        Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: figures left out)")
+    ] = None
+    """With dlo1_train.npz and dlo1_eval.npz."""
+    maps: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: none)")] = None
+    """Of maps with a robot, a goal and what can be moved."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Options):
+    """Write a policy as ONNX, with a JSON contract beside it that says how to connect it.
+
+    Needs `pip install 'palpate[deploy]'`. The file is run by ONNX Runtime before it is handed over,
+    and gives the commands that the policy gives.
+
+    1. After `palpate train`:                   palpate export runs/train-rope-stabilization-001
+                                                    --onnx policy.onnx
+    """
+
+    policy: Positional[Annotated[Path, arg(metavar="POLICY", help_behavior_hint="")]]
+    """What `palpate train` wrote: its folder, or the policy file in it."""
+    onnx: Annotated[Path, arg(metavar="FILE")]
+    """Where to; the contract goes beside it, ending in .json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve(Options):
+    """Run a policy in real time: states in over Zenoh, commands out, until Ctrl-C.
+
+    Needs `pip install 'palpate[zenoh]'`. When a state is missing, late or impossible, the robot is
+    braked to rest, and moves again only after half a second of good states.
+
+    1. With a simulated robot, for a look:      palpate serve POLICY --simulate
+    2. With a robot's program that connects:    palpate serve POLICY --acceleration-limit 4
+    """
+
+    policy: Positional[Annotated[Path, arg(metavar="POLICY", help_behavior_hint="")]]
+    """What `palpate train` wrote: its folder, or the policy file in it."""
+    simulate: bool = False
+    """Start a simulated rope and robot, as a process of its own, and serve that."""
+    seconds: Annotated[
+        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: 10 simulated, else ever)")
+    ] = None
+    """How long."""
+    listen: str = "tcp/127.0.0.1:7447"
+    """Where the robot's program connects; whoever reaches it can move the robot."""
+    markers: Whole = None
+    """In each state, gripper and tip included."""
+    speed_limit: Annotated[
+        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: the policy's)")
+    ] = None
+    """Of the gripper, m/s."""
+    acceleration_limit: Annotated[
+        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: the policy's)")
+    ] = None
+    """Of the gripper, m/s^2; it brakes with this."""

@@ -1,0 +1,144 @@
+"""`palpate train`: an identified model in, a controller out.
+
+Nothing here knows the task but by its name: `options.prepare` does.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from palpate.commands import folders
+from palpate.families.options import Train
+from palpate.family import find
+from palpate.learning import Training, simulate, train
+from palpate.models.files import load_model
+from palpate.models.model import Model
+from palpate.networks import CommandPolicy, Policy, save_policy
+from palpate.parameters import describe
+from palpate.runs import Figure, Result, Run
+from palpate.runs.result import machine, read_result
+from palpate.runs.run import RESULT
+from palpate.tasks.task import Task
+
+EPISODES = 256  # from start states that were not trained on, for the figures
+
+
+def run(options: Train) -> Path:
+    """Train, say how well the policy does in the model, and return the folder everything is in.
+
+    Raises `PalpateError` for a model the task cannot use, and for folders that cannot be used.
+    """
+    file = folders.product_of(options.model, folders.MODEL, "identify")
+    model = options.prepare(load_model(file)[0])
+    task = named_task(options.task)
+    training = settings(options)
+    name = f"train-{options.task}"
+    configuration = {
+        **folders.told(options, f"train {options.task}"),
+        "model": folders.fingerprint(file),
+        "task": _constants(task),
+        "training": dataclasses.asdict(training),
+    }
+    with folders.open_run(options, name, configuration, folders.POLICY) as run:
+        if not run.finished:
+            policy = trained(
+                task,
+                model,
+                training,
+                options.seed,
+                run,
+                action=options.action,
+                command=folders.command(options, f"train {options.task}"),
+            )
+            figures = figures_in_model(task, model, policy, options.seed)
+            result = Result(
+                name=name,
+                figures=figures,
+                settings=run.configuration,
+                seeds=[options.seed],
+                split={"scored": f"{EPISODES} new start states in the model it was trained on"},
+                wall_time_s=run.elapsed,
+            )
+            run.finish(result.to_dict())
+        for figure in read_result(run.path / RESULT).figures:
+            value = "none" if figure.value is None else f"{figure.value:.4g} {figure.unit}"
+            print(f"{figure.name.replace('_', ' ').replace('.', ': ')} {value}".rstrip())
+        title = f"How a controller was trained for {options.task}"
+        folders.hand_over(options, run, title, folders.POLICY)
+        return run.path
+
+
+def trained(
+    task: Task,
+    model: Model,
+    training: Training,
+    seed: int,
+    run: Run,
+    *,
+    action: str,
+    command: str,
+) -> CommandPolicy:
+    """The policy that is trained in `run`, which keeps it with all that its reader has to know.
+
+    `action`: what the policy's output is; `command`: what makes it again.
+    """
+    policy = train(task, model, training, seed, run)
+    manifest = {
+        "task": task.name,
+        "features": task.feature_names(model),
+        "action": action,
+        "command": command,
+        "seed": seed,
+        "training": dataclasses.asdict(training),
+        "model": describe(model),
+        "machine": machine(),
+        "wall_time_s": run.elapsed,
+    }
+    save_policy(run.path / folders.POLICY, policy, manifest)
+    return policy
+
+
+def named_task(name: str) -> Task:
+    """The task of that name, as it is by default."""
+    return find("tasks", name)()  # a task has defaults for all its fields
+
+
+def settings(options: Train) -> Training:
+    """The training that was asked for: what was not said is as it is by default."""
+    names = ("iterations", "batch", "starts", "observation_noise")
+    asked = {name: getattr(options, name) for name in names}
+    return Training(**{name: value for name, value in asked.items() if value is not None})
+
+
+def figures_in_model(task: Task, model: Model, policy: Policy, seed: int) -> list[Figure]:
+    """Means over episodes in the model, from start states of another seed than the training's.
+
+    They last twice as long as those trained on, for what has to stay as it is in the end.
+    An outcome that some episodes do not have is averaged over those that do.
+    """
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    steps = round(2 * task.duration / model.control_period)
+
+    @jax.jit
+    def outcome() -> dict[str, jax.Array]:
+        start = task.starts(model, key, EPISODES)
+        models = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (EPISODES, *leaf.shape)), model)
+        states, actions = simulate(task, models, policy, start, steps)
+        return task.outcome(models, start, states, actions)
+
+    figures = []
+    for name, values in outcome().items():
+        known = np.asarray(values)[np.isfinite(values)]
+        value = float(known.mean()) if known.size else None
+        better = "higher" if name == "success" else "lower"
+        unit = task.outcome_units.get(name, "")
+        figures.append(Figure(f"in_model.{name}", value, unit, better=better))
+    return figures
+
+
+def _constants(task: Task) -> dict[str, Any]:
+    return {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}

@@ -1,0 +1,1 @@
+"""Headline experiments with furniture."""

@@ -1,0 +1,240 @@
+"""`palpate reproduce namo-online`: rooms that open where furniture gives way, and it hides how.
+
+In the MuJoCo world a robot plans, tries, feels, and plans anew. First the named scenes of the
+deck, then generated rooms whose goal lies in another free region than the start. The same rooms
+are given to four planners that share search and execution (see `namo_episode`): ours, which learns
+how each piece moves from the contacts; one that is told; one that takes everything to be movable
+and never learns; and the thresholded movable flag of Levihn, Scholz and Stilman (ICRA 2013).
+
+A row for each room is kept in a run folder, and the work resumes after the last one.
+"""
+
+import statistics
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.families.furniture.plan_picture import plan_picture, scene_animation
+from palpate.planning.movable_obstacles.motion.primitives import FREE, Constraint
+from palpate.planning.movable_obstacles.search.plan import timed
+from palpate.runs import Figure, Result, Run
+from palpate.runs.progress import interruptible, progress
+from palpate.runs.run import read_metrics
+from palpate.trials.furniture import rooms as namo_rooms
+from palpate.trials.furniture.namo_episode import (
+    ATTEMPTS,
+    BUDGET,
+    DRAWS,
+    ERRS,
+    MARGINS,
+    MOVABLE,
+    SEARCH,
+    THRESHOLD,
+    Episode,
+    Fixed,
+    Flag,
+    Learner,
+    Opinion,
+    episode,
+    truth_of,
+)
+from palpate.trials.furniture.namo_execution import FORCE
+from palpate.trials.furniture.rooms import Room, generated_room, scenes
+from palpate.trials.rope.trials import wilson_interval
+
+NAME = "namo-online"
+SOLVED_BAR, ALL_MOVABLE_BAR = 0.95, 0.60
+ROOMS = {"full": 100, "quick": 6}
+SEEDS = 970_000  # of rooms, used by nothing else
+OURS, TOLD, ALL, FLAG = "ours", "told_truth", "all_movable", "flag"
+PICTURED = 3  # rooms whose episode is drawn
+FRAMES = 100  # of an animation, about
+COUNTED = ("time", "distance", "carried", "attempts", "failures", "planning_s")
+UNITS = {"time": "s", "distance": "m", "carried": "m", "planning_s": "s"}
+
+
+def planners(room: Room) -> dict[str, Callable[[], Opinion]]:
+    """What each planner takes the room's objects to be."""
+    world = room.world()
+    return {
+        OURS: lambda: Learner(world.outlines, room.seed),
+        TOLD: lambda: Fixed(truth_of(room)),
+        ALL: lambda: Fixed(dict.fromkeys(world.names, Constraint(FREE))),
+        FLAG: lambda: Flag(world.names),
+    }
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Scenes, then rooms; `quick` is fewer rooms."""
+    count = ROOMS["quick" if quick else "full"]
+    first = SEEDS + 1000 * seed
+    minutes = 2 if quick else 12
+    print(
+        f"{NAME}: 4 scenes and {count} rooms, 4 planners each, about {minutes} minutes", flush=True
+    )
+    began = timed()
+    shown = {name: scene_outcome(out, name, room) for name, room in scenes().items()}
+    scenes_s = timed() - began
+    settings = configuration(first, count)
+    rows = outcomes(out, first, count, settings)
+    return Result(
+        NAME,
+        figures(rows, shown),
+        settings | {"quick": quick},
+        list(range(first, first + count)),
+        "nothing is fitted beforehand; every room's constants are drawn by its own seed, and "
+        "development used rooms of seeds below 3000",
+        scenes_s + rows[-1]["time"],  # that of earlier processes included
+    )
+
+
+def configuration(first: int, count: int) -> dict[str, Any]:
+    """All that the outcome depends on."""
+    constants = (
+        "WIDTH",
+        "DEPTH",
+        "DOOR",
+        "DOORS",
+        "LENGTHS",
+        "DEPTHS",
+        "CLUTTER",
+        "TEMPTING",
+        "SHORTER",
+    )
+    constants += ("OTHERS", "REST", "CONSTRAINED_ONLY", "HEAVY", "LIGHT", "RUBBER", "FELT")
+    constants += ("RADIUS", "MARGIN", "CELL")
+    return {
+        "first_seed": first,
+        "rooms": count,
+        "budget_s": BUDGET,
+        "attempts": ATTEMPTS,
+        "draws": DRAWS,
+        "iterations": SEARCH.iterations,
+        "margins_m": MARGINS,
+        "hand_N": FORCE,
+        "flag": {"prior": MOVABLE, "threshold": THRESHOLD, "errs": ERRS},
+        "room": {name.lower(): getattr(namo_rooms, name) for name in constants},
+    }
+
+
+def outcomes(out: Path, first: int, count: int, settings: Mapping[str, Any]) -> list[dict]:
+    """One row for each room, done or read back."""
+    with Run.open(out / "rooms", dict(settings)) as run:
+        if not run.finished:
+            done, _ = run.restore(np.zeros(1)) or (0, None)
+            with interruptible() as stop:
+                for step in progress(range(done + 1, count + 1), "rooms", done=done):
+                    run.log(step, **room_row(out, generated_room(first + step - 1), step))
+                    run.save(step, np.full(1, float(step)))
+                    if stop:
+                        raise KeyboardInterrupt
+            run.finish({"rooms": count})
+        return read_metrics(run.path)
+
+
+def room_row(out: Path, room: Room, step: int) -> dict[str, Any]:
+    """Every planner in one room."""
+    row: dict[str, Any] = {"seed": room.seed, "constructions": list(room.constructions)}
+    for name, opinion in planners(room).items():
+        outcome = episode(room, opinion())
+        row[name] = {"reached": outcome.reached, "reason": outcome.reason}
+        row[name] |= {key: float(getattr(outcome, key)) for key in COUNTED}
+        if name == OURS and step <= PICTURED:
+            show(out / f"room-{step}", room, outcome)
+    return row
+
+
+def scene_outcome(out: Path, name: str, room: Room) -> dict[str, Any]:
+    """Ours in one of the deck's scenes, with pictures."""
+    outcome = episode(room, Learner(room.world().outlines, room.seed))
+    tried = [(piece, round(float(share), 2)) for piece, share in outcome.tried]
+    print(f"scene '{name}': {outcome.reason} after {outcome.time:.0f} s, tried {tried}", flush=True)
+    show(out / name.replace(" ", "-"), room, outcome)
+    return {
+        "reached": outcome.reached,
+        "time": outcome.time,
+        "moved": [piece for piece, _ in tried],
+        "failures": outcome.failures,
+    }
+
+
+def show(folder: Path, room: Room, outcome: Episode) -> None:
+    """The plans one after the other with what was believed then, and the episode as it went."""
+    folder.mkdir(parents=True, exist_ok=True)
+    driven = np.array([frame.robot for frame in outcome.frames])
+    for number, ((world, plan), (_, believed)) in enumerate(
+        zip(outcome.plans, outcome.beliefs, strict=False)
+    ):
+        path = folder / f"plan-{number + 1}.png"
+        plan_picture(path, world, plan, movability=believed, driven=driven)
+    if not outcome.plans or not len(driven):
+        return
+    world = outcome.plans[0][0]
+    every = max(1, len(outcome.frames) // FRAMES)
+    frames = outcome.frames[::every]
+    believed = []
+    for frame in frames:
+        earlier = [belief for time, belief in outcome.beliefs if time <= frame.time]
+        believed.append(earlier[-1] if earlier else outcome.beliefs[0][1])
+    scene_animation(
+        folder / "episode.gif",
+        world,
+        room.goal,
+        np.array([frame.robot for frame in frames]),
+        [dict(zip(world.movables, frame.poses, strict=True)) for frame in frames],
+        [frame.held for frame in frames],
+        movability=believed,
+    )
+
+
+def figures(rows: list[dict], shown: Mapping[str, Mapping[str, Any]]) -> list[Figure]:
+    """What is held against the bars, then what each planner needed, then the scenes."""
+    solvable = [row for row in rows if row[TOLD]["reached"]]
+    ours = [row for row in solvable if row[OURS]["reached"]]
+    share, spread = _share(len(ours), len(solvable))
+    rates = {name: _rate(rows, name) for name in (OURS, TOLD, ALL, FLAG)}
+    flag = [row for row in solvable if row[FLAG]["reached"]]
+    found = [
+        Figure(
+            "success_of_solvable",
+            share,
+            "",
+            bar=SOLVED_BAR,
+            better="higher",
+            rival=_share(len(flag), len(solvable))[0],
+            spread=spread,
+        ),
+        Figure(
+            "success_rate_all_movable", rates[ALL][0], "", ALL_MOVABLE_BAR, spread=rates[ALL][1]
+        ),
+    ]
+    for name in (TOLD, FLAG, OURS):
+        rate, wide = rates[name]
+        found.append(Figure(f"success_rate_{name}", rate, "", better="higher", spread=wide))
+    found.append(Figure("rooms", len(rows), "", better="higher"))
+    for name in (OURS, TOLD, ALL, FLAG):
+        reached = [row[name] for row in rows if row[name]["reached"]]
+        for key in COUNTED:
+            value = statistics.mean(row[key] for row in reached) if reached else None
+            found.append(Figure(f"{name}.{key}", value, UNITS.get(key, "")))
+    for name, outcome in shown.items():
+        key = f"scene.{name.replace(' ', '_')}"
+        found.append(Figure(f"{key}.reached", float(outcome["reached"]), "", better="higher"))
+        found.append(Figure(f"{key}.time", outcome["time"], "s"))
+        found.append(Figure(f"{key}.failures", outcome["failures"], ""))
+    return found
+
+
+def _rate(rows: list[dict], name: str) -> tuple[float | None, float | None]:
+    return _share(sum(row[name]["reached"] for row in rows), len(rows))
+
+
+def _share(successes: int, count: int) -> tuple[float | None, float | None]:
+    """A share and the half-width of Wilson's interval on its wider side; None of nothing."""
+    if not count:
+        return None, None
+    low, high = wilson_interval(successes, count)
+    share = successes / count
+    return share, max(share - low, high - share)

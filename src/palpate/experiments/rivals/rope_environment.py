@@ -1,0 +1,226 @@
+"""Bringing a rope to rest, as reinforcement learning asks for it: a Gymnasium environment.
+
+Inside is the identified model, drawn anew for each episode within the spreads of its parameters,
+from the start states, with the sensors' noise and the limits that our own policy is trained with:
+what an agent is told and may do is the same. A MuJoCo rope of the evaluation gives some 300 steps a
+second on a core, the model some 10,000.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import equinox as eqx
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from palpate.learning import Training
+from palpate.models.rope import Rope, RopeState
+from palpate.networks import CommandPolicy
+from palpate.parameters import randomise
+from palpate.perception.velocity import VelocityEstimator
+from palpate.tasks import Start
+from palpate.tasks.rope import RopeStabilization
+
+
+class Actor(CommandPolicy):
+    """A `CommandPolicy` whose network has ReLU units and says an action in [-1, 1]^3.
+
+    The action, shortened to the length 1, is the rate of the command as a share of its limit:
+    what a squashed Gaussian policy has for its mean (SAC, Haarnoja et al., arXiv 1812.05905).
+    """
+
+    @classmethod
+    def untrained(
+        cls, key: PRNGKeyArray, observations: Float[Array, "samples features"], **sizes: Any
+    ) -> "Actor":
+        """Arguments as of `CommandPolicy.create`."""
+        policy = CommandPolicy.create(key, observations, **sizes)
+        of = policy.network
+        network = eqx.nn.MLP(
+            of.in_size,
+            of.out_size,
+            of.width_size,
+            of.depth,
+            activation=jax.nn.relu,
+            final_activation=jnp.tanh,
+            key=key,
+        )
+        return cls(
+            network=network,
+            mean=policy.mean,
+            scale=policy.scale,
+            action_shape=policy.action_shape,
+            period=policy.period,
+            limit=policy.limit,
+            rate_limit=policy.rate_limit,
+        )
+
+    def told(
+        self, command: Float[Array, "*batch driven 3"], features: Float[Array, "*batch features"]
+    ) -> Float[Array, "*batch inputs"]:
+        """What the network is given: scaled features, and the command as a share of its limit."""
+        scaled = (features - self.mean) / self.scale
+        previous = command.reshape(*features.shape[:-1], -1) / self.limit
+        return jnp.concatenate([scaled, previous], axis=-1)
+
+    def moved(
+        self, command: Float[Array, "*batch driven 3"], action: Float[Array, "*batch outputs"]
+    ) -> Float[Array, "*batch driven 3"]:
+        """The next command (m/s) after an action in [-1, 1]^3."""
+        return self._moved(command, _within_ball(action.reshape(command.shape)))
+
+    def _direction(self, carry: Array, observation: Array) -> Array:
+        network = jax.vmap(self.network) if observation.ndim == 2 else self.network
+        return _within_ball(network(self.told(carry, observation)).reshape(carry.shape))
+
+
+def _within_ball(action: Array) -> Array:
+    return action / jnp.maximum(1.0, jnp.linalg.norm(action, axis=-1, keepdims=True))
+
+
+class Situation(eqx.Module):
+    """Where episodes side by side are; every leaf but the key leads with the same batch axis.
+
+    (Of `models` those leaves do that are drawn.)
+    """
+
+    models: Rope
+    start: Start
+    state: RopeState
+    command: Float[Array, "batch driven 3"]  # m/s
+    window: Float[Array, "frames batch nodes 3"]  # m, the positions last seen
+    key: PRNGKeyArray
+
+
+class Episodes(eqx.Module):
+    """Many episodes side by side, as pure functions. Made by `Episodes.of`.
+
+    The reward of a step is minus the task's loss of an episode that would be that one instant:
+
+        -(final_weight e + settling_weight log(1 + e / 0.01) + rest_weight v)
+
+    with the energy e as a share of the start's and the gripper's speed v. Unlike the loss of a
+    whole episode it does not ask what time it is, which an agent is not told.
+    """
+
+    task: RopeStabilization
+    model: Rope
+    actor: Actor  # untrained: how it is told the state, and what its actions do
+    pool: Start
+    noise: float = eqx.field(static=True)  # m, standard deviation of what is seen
+
+    @classmethod
+    def of(
+        cls, task: RopeStabilization, model: Rope, training: Training, key: PRNGKeyArray
+    ) -> "Episodes":
+        """With as many start states, as much noise and as large a network as in `training`.
+
+        Raises `PalpateError` for a rope that the task cannot use.
+        """
+        for_starts, for_actor = jax.random.split(key)
+        pool = jax.jit(task.starts, static_argnums=2)(model, for_starts, training.starts)
+        actor = Actor.untrained(
+            for_actor,
+            task.features(pool.state, pool.goal),
+            action_shape=model.action_shape,
+            period=model.control_period,
+            limit=task.action_limit,
+            rate_limit=task.action_rate_limit,
+            width=training.width,
+            depth=training.depth,
+        )
+        return cls(task, model, actor, pool, training.observation_noise)
+
+    @property
+    def length(self) -> int:
+        """Steps of an episode."""
+        return round(self.task.duration / self.model.control_period)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Of one episode: what the actor is told."""
+        inputs = self.actor.mean.shape[0] + math.prod(self.actor.action_shape)
+        return gymnasium.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """Of one episode: see `Actor`."""
+        outputs = math.prod(self.actor.action_shape)
+        return gymnasium.spaces.Box(-1.0, 1.0, (outputs,), np.float32)
+
+    @eqx.filter_jit
+    def begin(self, key: PRNGKeyArray, count: int) -> tuple[Situation, Float[Array, "batch seen"]]:
+        """`count` new episodes, drawn by the key: where they are, and what is seen there."""
+        keys = jax.random.split(key, 5)
+        models = randomise(self.model, keys[0], 1.0, count)
+        chosen = jax.random.randint(keys[1], (count,), 0, self.pool.command.shape[0])
+        start = jax.tree.map(lambda leaf: leaf[chosen], self.pool)
+        start = self.task.adapt(self.task.augment(start, keys[2]), models)
+        # What was seen before: the start's motion, continued backwards.
+        position = models.observe(start.state)
+        moved = models.observe(models.step(start.state, start.command)) - position
+        back = jnp.arange(-self._estimator.frames, 0, dtype=position.dtype).reshape(-1, 1, 1, 1)
+        window = position + back * moved
+        window = window + self.noise * jax.random.normal(keys[3], window.shape)
+        return self._seen(Situation(models, start, start.state, start.command, window, keys[4]))
+
+    @eqx.filter_jit
+    def step(
+        self, situation: Situation, actions: Float[Array, "batch outputs"]
+    ) -> tuple[Situation, Float[Array, "batch seen"], Float[Array, " batch"]]:
+        """One control period later; with what is seen then, and the rewards."""
+        models = situation.models
+        command = self.actor.moved(situation.command, actions)
+        state = models.step(situation.state, command)
+        instant = jax.tree.map(lambda leaf: leaf[:, None], state)
+        reward = -self.task.loss(models, situation.start, instant, command[:, None])
+        following = dataclasses.replace(situation, state=state, command=command)
+        return *self._seen(following), reward
+
+    @property
+    def _estimator(self) -> VelocityEstimator:
+        return VelocityEstimator(self.model.control_period)
+
+    def _seen(self, situation: Situation) -> tuple[Situation, Array]:
+        key, for_noise = jax.random.split(situation.key)
+        position = situation.models.observe(situation.state)
+        position = position + self.noise * jax.random.normal(for_noise, position.shape)
+        window, velocity = self._estimator.update(situation.window, position)
+        features = self.task.features(RopeState(position, velocity), None)
+        seen = self.actor.told(situation.command, features)
+        return dataclasses.replace(situation, window=window, key=key), seen
+
+
+class RopeEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One such episode after the other, as Gymnasium has it. Time runs out; nothing else ends one.
+
+    Observations are scaled features and the command (see `Actor.told`), actions as of `Actor`.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own name and kind
+
+    def __init__(self, episodes: Episodes):
+        self._episodes = episodes
+        self.observation_space = episodes.observation_space
+        self.action_space = episodes.action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """See `gymnasium.Env.reset`; there are no options."""
+        super().reset(seed=seed)
+        key = jax.random.key(int(self.np_random.integers(2**31)))
+        self._situation, seen = self._episodes.begin(key, 1)
+        self._step = 0
+        return np.asarray(seen[0]), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """See `gymnasium.Env.step`."""
+        actions = jnp.asarray(action, jnp.float32)[None]
+        self._situation, seen, reward = self._episodes.step(self._situation, actions)
+        self._step += 1
+        return np.asarray(seen[0]), float(reward[0]), False, self._step >= self._episodes.length, {}

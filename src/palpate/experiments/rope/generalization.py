@@ -1,0 +1,293 @@
+"""`palpate reproduce rope-generalization`: ropes never seen, pushed, seen badly, late and seldom.
+
+The policy that ships was trained for one rope, and only that rope is identified here. It then has
+to stabilise three others, of other length, mass and distribution of mass; ropes that are pushed,
+while they settle and once they are at rest; and ropes whose markers are noisy, or come 50, 25 or 10
+times a second and late. Nothing is identified or trained anew: the length is measured when a trial
+starts, by which rope and time are scaled (Froude's similarity), and between measurements the model
+predicts. Beside it, in a part of the same trials, the policy as it is used otherwise.
+
+Each row is a run in a folder below `out`, and resumes there.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from palpate.experiments.rope.stabilization import (
+    BASE,
+    FULL,
+    QUICK,
+    Size,
+    announce,
+    finish,
+    identified_rope,
+    shipped_policy,
+    wall_time,
+)
+from palpate.families.rope.recording import constants
+from palpate.models.rope import Rope, RopeState
+from palpate.networks import CommandPolicy
+from palpate.perception.rope.marker_observer import MarkerObserver
+from palpate.runs import Figure, Result, Run
+from palpate.tasks.rope import RopeStabilization
+from palpate.trials.rope.evaluation import (
+    TRIAL_PERIODS,
+    Summary,
+    evaluate,
+    evaluation_trials,
+    figures,
+    summarise,
+    write_trial_evidence,
+)
+from palpate.trials.rope.trials import Episodes, LearnedController, Seen, Trial
+from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration
+
+NAME = "rope-generalization"
+SUCCESS_BAR, TIME_BAR = 0.95, 1.3
+SEEDS = 970_000  # of ropes, noise and pushes, used by nothing else
+PUSH, PUSH_DURATION = (0.3, 0.6), 0.1  # N, s
+PUSHED_BETWEEN = 0.3, 1.0  # share of the length from the gripper on
+SETTLING, SETTLED = 0.5, 3.0  # s after the start, when a rope is pushed
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """Ropes drawn around `base`; `pushed`: s after the start at which each is pushed once."""
+
+    base: RopeConfiguration
+    pushed: float | None = None
+
+
+def _rope(**changes: Any) -> Row:
+    return Row(dataclasses.replace(BASE, **changes))
+
+
+# Written down before the first evaluation.
+ROWS = {
+    "nominal": Row(BASE),
+    "short and light": _rope(length=0.75, mass=0.05),
+    "long and heavy": _rope(length=1.25, mass=0.2),
+    "weighted": _rope(mass_distribution=lambda place: 1 + 2 * place, tip_mass=0.04),
+    "pushed while settling": Row(BASE, SETTLING),
+    "pushed at rest": Row(BASE, SETTLED),
+    "noise of 2 mm": _rope(observation_noise=2e-3),
+    "noise of 5 mm": _rope(observation_noise=5e-3),
+    "50 Hz": _rope(observation_rate=50.0, observation_delay=0.02),
+    "25 Hz": _rope(observation_rate=25.0, observation_delay=0.03),
+    "10 Hz": _rope(observation_rate=10.0, observation_delay=0.05),
+}
+ROPES = {"full": 15, "quick": 1}  # from each start pose
+PLAIN_ROPES = 3  # of them, with the policy as it is used otherwise
+CONTROLLED, PLAIN = "controlled", "as shipped"
+
+
+class ObservedController(LearnedController):
+    """A policy for ropes of any length, seen late and seldom, all of them at the same instants.
+
+    How long a rope is, is measured in the first observation. `model` is driven by velocity at node
+    0: the rope that the policy was made for. `noise`: of the markers, m.
+    """
+
+    def __init__(
+        self, policy: CommandPolicy, task: RopeStabilization, model: Rope, noise: float
+    ) -> None:
+        super().__init__(policy, task)
+        self._model, self._noise = model, noise
+
+        @eqx.filter_jit
+        def decide(policy, carry, state, size):
+            length, velocity = size[:, None, None], jnp.sqrt(size)[:, None, None]
+            alike = RopeState(state.position / length, state.velocity / velocity)
+            return policy.similar(carry, task.features(alike, None), size)
+
+        self._decide_alike = decide
+
+    def begin(self, seen: Seen) -> None:
+        """See `Controller.begin`."""
+        positions = self._positions(seen)
+        length = jnp.sum(jnp.linalg.norm(jnp.diff(positions, axis=1), axis=-1), axis=1)
+        self._size = length / jnp.sum(self._model.rest_length)
+        rest_length = self._model.rest_length * self._size[:, None]
+        models = eqx.tree_at(lambda rope: rope.rest_length, self._model, rest_length).constrain()
+        self._observer = MarkerObserver(models, self._noise)
+        self._observer.begin(positions, seen.time)
+        self._command = None
+        self._carry = self._policy.initial_carry(jnp.zeros((len(positions), 1, 3)))
+
+    def command(self, seen: Seen) -> np.ndarray:
+        """See `Controller.command`."""
+        positions = self._positions(seen)
+        if self._command is None:
+            state = self._observer.begin(positions, seen.time)
+        else:
+            state = self._observer.step(self._command, positions, seen.time)
+        self._carry, self._command = self._decide_alike(
+            self._policy, self._carry, state, self._size
+        )
+        return np.asarray(self._command)[:, 0]
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Identify the nominal rope below `out` and try every row; `quick` is the same, smaller.
+
+    Raises `PalpateError` when `out` holds another run's stages, or when this installation has no
+    shipped policy.
+    """
+    size: Size = QUICK if quick else FULL
+    announce(
+        NAME, {"recording": 1, "identification": 1 if quick else 2, "rows": 2 if quick else 20}
+    )
+    policy, about = shipped_policy()
+    model, spent = identified_rope(out, size, seed)
+    ropes = ROPES["quick" if quick else "full"]
+    summaries, plain = {}, {}
+    for name, row in ROWS.items():
+        trials = _trials(row, ropes, SEEDS + seed)
+        summaries[name], plain[name], took = _evaluated(
+            out / name.replace(" ", "-"), name, row, trials, policy, about, model, seed
+        )
+        spent += took
+        print(summaries[name].line(name), flush=True)
+        print(plain[name].line(f"  {PLAIN}"), flush=True)
+    return Result(
+        NAME,
+        _figures(summaries, plain),
+        {
+            "quick": quick,
+            "weights": "shipped",
+            "policy": about,
+            "rows": {name: _changed(row) for name, row in ROWS.items()},
+            "push_N": PUSH,
+            "push_s": PUSH_DURATION,
+            "ropes": ropes,
+            "trial_periods": TRIAL_PERIODS,
+        },
+        [seed],
+        {
+            "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
+            "trained": "shipped weights, see the policy's manifest in the settings",
+            "evaluated": f"{ropes} ropes drawn around each row's from each start pose, "
+            f"seed {SEEDS + seed}",
+        },
+        spent,
+    )
+
+
+def _changed(row: Row) -> dict[str, Any]:
+    """What a row differs in from the nominal one."""
+    own, nominal = dataclasses.asdict(row.base), dataclasses.asdict(BASE)
+    changes = {name: value for name, value in own.items() if value != nominal[name]}
+    return changes | ({} if row.pushed is None else {"pushed_at_s": row.pushed})
+
+
+def _trials(row: Row, ropes: int, seed: int) -> list[Trial]:
+    """Sampled ropes from each start pose, each pushed from a side and at a place of its own."""
+    trials = evaluation_trials(row.base, ropes, seed)
+    if row.pushed is None:
+        return trials
+    random = np.random.default_rng((seed, 3))
+    pushed = []
+    for trial in trials:
+        angle, force = random.uniform(0, 2 * np.pi), random.uniform(*PUSH)
+        direction = force * np.cos(angle), force * np.sin(angle), 0.0
+        place = random.uniform(*PUSHED_BETWEEN)
+        push = Disturbance(row.pushed, PUSH_DURATION, direction, place)
+        rope = dataclasses.replace(trial.configuration, disturbances=(push,))
+        pushed.append(dataclasses.replace(trial, configuration=rope))
+    return pushed
+
+
+def _evaluated(
+    path: Path,
+    name: str,
+    row: Row,
+    trials: list[Trial],
+    policy: CommandPolicy,
+    about: dict[str, Any],
+    model: Rope,
+    seed: int,
+) -> tuple[Summary, Summary, float]:
+    """The row's trials, and a part of them with the policy as it is used otherwise."""
+    task = RopeStabilization()
+    noise = row.base.observation_noise
+    poses = [[trial for trial in trials if trial.start == start] for start in START_POSES]
+    some = [trial for of_pose in poses for trial in of_pose[:PLAIN_ROPES]]
+    summaries, spent = [], 0.0
+    for who, controller, chosen in (
+        (CONTROLLED, ObservedController(policy, task, model, noise), trials),
+        (PLAIN, LearnedController(policy, task), some),
+    ):
+        folder = path / who.replace(" ", "-")
+        configuration = {
+            "stage": name,
+            "controller": who,
+            "row": _changed(row),
+            "world": constants(row.base),
+            "trials": len(chosen),
+            "seed": seed,
+            "policy": about,
+        }
+        with Run.open(folder, configuration) as run:
+            episodes = evaluate({who: controller}, chosen, run)[who]
+            if not run.finished:
+                write_trial_evidence(run, chosen, {who: episodes}, (who,))
+                finish(run, NAME, name, {})
+            spent += wall_time(run)
+        summaries.append(summarise(chosen, _after_push(row, episodes)))
+    return summaries[0], summaries[1], spent
+
+
+def _after_push(row: Row, episodes: Episodes) -> Episodes:
+    """From the end of the push on: its 1 % is of the energy that the rope has then."""
+    if row.pushed is None:
+        return episodes
+    start = round((row.pushed + PUSH_DURATION) / row.base.control_period)
+    return dataclasses.replace(
+        episodes,
+        energy=episodes.energy[:, start:],
+        gripper_speed=episodes.gripper_speed[:, start:],
+    )
+
+
+def _figures(summaries: dict[str, Summary], plain: dict[str, Summary]) -> list[Figure]:
+    nominal = summaries["nominal"]
+    ratios = [_ratio(summary.periods, nominal.periods) for summary in summaries.values()]
+    seconds = [_ratio(summary.time, nominal.time) for summary in summaries.values()]
+    least = min(summaries.values(), key=lambda summary: summary.success_rate)
+    low, high = least.interval
+    rows = [
+        Figure(
+            "success_rate_worst",
+            least.success_rate,
+            "",
+            bar=SUCCESS_BAR,
+            better="higher",
+            seed_document="succeeds on three ropes",
+            rival=min(summary.success_rate for summary in plain.values()),
+            spread=max(least.success_rate - low, high - least.success_rate),
+        ),
+        Figure("time_ratio_worst", _worst(ratios), "", bar=TIME_BAR),
+        Figure("time_ratio_worst.seconds", _worst(seconds), ""),
+    ]
+    for (name, summary), ratio in zip(summaries.items(), ratios, strict=True):
+        suffix = f".{name.replace(' ', '_')}"
+        rows += figures(summary, suffix)
+        rows.append(Figure(f"time_ratio{suffix}", ratio, ""))
+        rows += figures(plain[name], f"{suffix}.as_shipped")[:2]
+    return rows
+
+
+def _ratio(own: float | None, nominal: float | None) -> float | None:
+    return None if own is None or nominal is None else own / nominal
+
+
+def _worst(ratios: Sequence[float | None]) -> float | None:
+    """The greatest; unknown where one is, because no rope of that row came to rest."""
+    known = [ratio for ratio in ratios if ratio is not None]
+    return max(known) if len(known) == len(ratios) else None

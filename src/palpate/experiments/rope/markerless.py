@@ -1,0 +1,283 @@
+"""`palpate reproduce rope-markerless`: a rope seen by one camera at 30 Hz, and brought to rest so.
+
+The nominal MuJoCo rope is recorded with markers and identified; from then on there are pictures
+only. Its nodes are followed while it swings, beside what a picture alone would say and what the
+model alone would; and the policy that ships brings ropes to rest that differ from the identified
+one, through the camera, beside the same policy with markers and a gripper held still.
+"""
+
+import dataclasses
+import functools
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.experiments.rope.stabilization import (
+    BASE,
+    FULL,
+    QUICK,
+    Size,
+    announce,
+    finish,
+    identified_rope,
+    shipped_policy,
+    wall_time,
+)
+from palpate.families.rope.recording import constants
+from palpate.models.rope import Rope
+from palpate.networks import CommandPolicy
+from palpate.numerics import devices
+from palpate.report.evidence import write_evidence
+from palpate.runs import Figure, Result, Run
+from palpate.runs.progress import interruptible, progress
+from palpate.runs.result import two_standard_errors
+from palpate.tasks.rope import RopeStabilization
+from palpate.trials.rope.baselines import HeldStill
+from palpate.trials.rope.evaluation import TRIAL_PERIODS, evaluation_trials, summarise
+from palpate.trials.rope.filming import Filming, film, frame_times
+from palpate.trials.rope.trials import Episodes, LearnedController, Trial, run_trials
+from palpate.worlds.camera import Sensor
+from palpate.worlds.rope.filmed import TRIPOD, Background
+from palpate.worlds.rope.rope import START_POSES
+
+NAME = "rope-markerless"
+SWINGING = 4.0  # s of a trial without control
+RMSE_BAR, SUCCESS_BAR = 1.0, 0.9  # cm, share
+SEEDS = 920_000  # of what is filmed; those of rope-stabilization are others
+KINDS = ("tracked", "centre line", "model alone", "hanging")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """Trials of one kind. `shaken`: the gripper moves at random from hanging, else it is still."""
+
+    background: Background = "clutter"
+    depth: bool = True
+    shaken: bool = False
+    controlled: bool = False
+
+
+ROWS = {
+    "released": Row(),
+    "shaken": Row(shaken=True),
+    "plain": Row("plain"),
+    "occluded": Row("occluder"),
+    "colour only": Row(depth=False),
+    "stabilised": Row(controlled=True),
+    "stabilised, colour only": Row(depth=False, controlled=True),
+}
+# Without depth, which has no bar, fewer ropes are controlled.
+TRIALS = {
+    "full": {"poses": 4, "swinging": 4, "ropes": 20, "ropes_without_depth": 5},
+    "quick": {"poses": 2, "swinging": 1, "ropes": 1, "ropes_without_depth": 1},
+}
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Identify below `out`, film all rows, and control through the camera with shipped weights.
+
+    `quick` is the same work at a smaller size. Every row is a run below `out` and resumes there.
+    Raises `PalpateError` when this installation has no shipped policy.
+    """
+    policy, about = shipped_policy()
+    counts = TRIALS["quick" if quick else "full"]
+    size: Size = QUICK if quick else FULL
+    filming = {"swinging": 1, "stabilising": 1} if quick else {"swinging": 8, "stabilising": 12}
+    announce(NAME, {"identification": 1 if quick else 4} | filming)
+    model, spent = identified_rope(out, size, seed)
+    filmed: dict[str, dict[str, np.ndarray]] = {}
+    for name, row in ROWS.items():
+        trials = _trials(row, counts, SEEDS + seed)
+        configuration = {
+            "stage": name,
+            "row": dataclasses.asdict(row),
+            "sensor": dataclasses.asdict(Sensor(has_depth=row.depth)),
+            "trials": len(trials),
+            "seed": seed,
+            "policy": about,
+            "world": constants(BASE),
+        }
+        with Run.open(out / name.replace(", ", "-").replace(" ", "-"), configuration) as run:
+            filmed[name] = _filmed(run, name, row, trials, model, policy)
+            if not run.finished:
+                write_evidence(run.path, _evidence(filmed[name]))
+                finish(run, NAME, name, {})
+            spent += wall_time(run)
+    controlled = _trials(ROWS["stabilised"], counts, SEEDS + seed)
+    began = time.monotonic()
+    rivals = {
+        "markers": run_trials(
+            controlled, LearnedController(policy, RopeStabilization()), _steps(controlled)
+        ),
+        "held still": run_trials(controlled, HeldStill(), _steps(controlled)),
+    }
+    return Result(
+        NAME,
+        _figures(filmed, rivals, counts, SEEDS + seed, frame_times(model)),
+        {
+            "quick": quick,
+            "weights": "shipped",
+            "policy": about,
+            "world": constants(BASE),
+            "camera": dataclasses.asdict(TRIPOD),
+            "sensor": dataclasses.asdict(Sensor()),
+            "rows": {name: dataclasses.asdict(row) for name, row in ROWS.items()},
+            "trials": counts,
+            "trial_periods": TRIAL_PERIODS,
+        },
+        [seed],
+        {
+            "identified": f"the nominal rope with markers, seeds from {seed}",
+            "trained": "shipped weights, see the policy's manifest in the settings",
+            "filmed": f"the nominal rope, seeds from {SEEDS + seed}; for stabilising "
+            f"{counts['ropes']} sampled ropes, {counts['ropes_without_depth']} without depth, "
+            f"seed {SEEDS + seed}",
+        },
+        spent + time.monotonic() - began,
+    )
+
+
+def _trials(row: Row, counts: dict[str, int], seed: int) -> list[Trial]:
+    """Sampled ropes where there is control, else the nominal one; from each pose, or hanging."""
+    poses = counts["poses"]
+    if row.controlled:
+        ropes = counts["ropes" if row.depth else "ropes_without_depth"]
+        return evaluation_trials(BASE, ropes, seed)[: poses * ropes]
+    starts = ("hanging",) * poses if row.shaken else START_POSES[:poses]
+    return [
+        Trial(BASE, start, seed + 100 * repeat + place)
+        for repeat in range(counts["swinging"])
+        for place, start in enumerate(starts)
+    ]
+
+
+def _steps(trials: list[Trial]) -> int:
+    return math.ceil(TRIAL_PERIODS * max(trial.period for trial in trials) / BASE.control_period)
+
+
+def _filmed(
+    run: Run, name: str, row: Row, trials: list[Trial], model: Rope, policy: CommandPolicy
+) -> dict[str, np.ndarray]:
+    """What happened in the trials of a row: arrays as in `Filming`, (trials, ...)."""
+    steps = _steps(trials) if row.controlled else round(SWINGING / BASE.control_period)
+    arrays = Filming.empty(len(trials), steps, model.nodes)
+    restored = run.restore(arrays)
+    done = 0
+    if restored is not None:
+        done, arrays = restored
+    work = [range(first, min(first + devices.cores(), len(trials)))
+            for first in range(0, len(trials), devices.cores())]  # fmt: skip
+    one = functools.partial(
+        film, model=model, policy=policy if row.controlled else None, steps=steps,
+        background=row.background, sensor=Sensor(has_depth=row.depth), shaken=row.shaken,
+    )  # fmt: skip
+    bar = progress(work[done:], f"filming: {name}", done=done)
+    with interruptible() as stop, ThreadPoolExecutor(devices.cores()) as threads:
+        for step, chosen in enumerate(bar, done + 1):
+            for place, filming in zip(chosen, threads.map(one, [trials[i] for i in chosen]),
+                                      strict=True):  # fmt: skip
+                for part in arrays:
+                    arrays[part][place] = getattr(filming, part)
+            tracked = _missed(arrays)[: chosen[-1] + 1]
+            bar.show(rmse_cm=_rmse(tracked))
+            run.log(step, rmse_cm=_finite(_rmse(tracked)))
+            run.save(step, arrays)
+            if stop:
+                break
+    return arrays
+
+
+def _missed(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Squared errors of the tracker (trials, times) in m^2; infinite where it knew no state.
+
+    NaN stays where there was no rope any more to be followed: a mean leaves that out.
+    """
+    known = np.isfinite(arrays["tracked"]).all((-2, -1))
+    there = np.isfinite(arrays["true"]).all((-2, -1))
+    return np.where(there & ~known, np.inf, arrays["squared_error"][:, 0])
+
+
+def _rmse(squared: np.ndarray) -> float:
+    """In cm, of mean squared errors in m^2 where there are any."""
+    return 100.0 * math.sqrt(np.nanmean(squared)) if np.isfinite(squared).any() else math.inf
+
+
+def _figures(
+    filmed: dict[str, dict[str, np.ndarray]],
+    rivals: dict[str, Episodes],
+    counts: dict[str, int],
+    seed: int,
+    took: np.ndarray,
+) -> list[Figure]:
+    swinging = np.concatenate([filmed[name]["squared_error"] for name in ("released", "shaken")])
+    missed = np.concatenate([_missed(filmed[name]) for name in ("released", "shaken")])
+    by_trial = np.sqrt(np.nanmean(missed, axis=-1)) * 100.0
+    spread = None
+    if np.isfinite(by_trial).all():
+        spread = two_standard_errors(by_trial)
+    rates = {
+        name: summarise(_trials(row, counts, seed), _episodes(filmed[name]))
+        for name, row in ROWS.items()
+        if row.controlled
+    }
+    controlled = _trials(ROWS["stabilised"], counts, seed)
+    rates |= {name: summarise(controlled, episodes) for name, episodes in rivals.items()}
+    low, high = rates["stabilised"].interval
+    rows = [
+        Figure(
+            "node_rmse_cm", _finite(_rmse(missed)), "cm", bar=RMSE_BAR,
+            rival=_finite(_rmse(swinging[:, 1])), spread=spread,
+        ),
+        Figure(
+            "success_rate", rates["stabilised"].success_rate, "", bar=SUCCESS_BAR, better="higher",
+            seed_document="succeeds", rival=rates["markers"].success_rate,
+            spread=0.5 * (high - low),
+        ),
+    ]  # fmt: skip
+    for place, kind in enumerate(KINDS[1:], 1):
+        name = f"node_rmse_cm.{kind.replace(' ', '_')}"
+        rows.append(Figure(name, _finite(_rmse(swinging[:, place])), "cm"))
+    for name, arrays in filmed.items():
+        suffix = name.replace(", ", ".").replace(" ", "_")
+        rows.append(Figure(f"node_rmse_cm.{suffix}", _finite(_rmse(_missed(arrays))), "cm"))
+        if not ROWS[name].controlled:
+            rows.append(Figure(f"hidden_share.{suffix}", float(np.nanmean(arrays["hidden"])), ""))
+    for name, summary in rates.items():
+        if name != "stabilised":
+            suffix = name.removeprefix("stabilised, ").replace(" ", "_")
+            rate = summary.success_rate
+            rows.append(Figure(f"success_rate.{suffix}", rate, "", better="higher"))
+    for name, summary in rates.items():
+        suffix = name.replace(", ", ".").replace(" ", "_")
+        rows.append(Figure(f"time_to_1pct_periods.{suffix}", summary.periods, "periods"))
+    for percent in (50, 99):
+        value = 1e3 * float(np.percentile(took, percent))
+        rows.append(Figure(f"frame_cpu_ms.p{percent}", value, "ms"))
+    return rows
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _episodes(arrays: dict[str, np.ndarray]) -> Episodes:
+    trials, times = arrays["energy"].shape
+    return dataclasses.replace(
+        Episodes.empty(trials, times, 0, 2),
+        energy=arrays["energy"],
+        gripper_speed=arrays["gripper_speed"],
+    )
+
+
+def _evidence(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The first trial as it was and as it was followed."""
+    time_axis = np.arange(arrays["true"].shape[1]) * BASE.control_period
+    return {
+        "motion.time": time_axis,
+        "motion.true": arrays["true"][0],
+        "motion.tracked": arrays["tracked"][0],
+    }

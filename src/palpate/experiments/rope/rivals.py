@@ -1,0 +1,313 @@
+"""`palpate reproduce rope-rivals`: the policy that ships, and what else brings a rope to rest.
+
+In MuJoCo ropes drawn as for `rope-stabilization`, from the same four start poses, side by side: the
+shipped policy; one trained with the same settings through the undamped model (Lv et al. 2017) that
+was identified from the same recording; MPPI, CEM and gradient MPC through the damped model, with
+what fits into 10 ms a decision and with more; SAC, which acts in the damped model and does not
+differentiate it; the tuned swing damper; a gripper held still. There is no bar: who is better is
+what is to be found out.
+
+SAC needs the extra `sac`, and is not run without it.
+
+Each stage is a run in a folder below `out`, and resumes there.
+"""
+
+import dataclasses
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from palpate.errors import PalpateError
+from palpate.experiments.experiment import suffix
+from palpate.experiments.rope.model import undamped
+from palpate.experiments.rope.stabilization import (
+    BASE,
+    FULL,
+    QUICK,
+    Size,
+    announce,
+    finish,
+    identified_rope,
+    shipped_policy,
+    trained_policy,
+    wall_time,
+)
+from palpate.families.rope.recording import GRIPPER, MARKERS, constants
+from palpate.identification.gradient.descent import Settings, identify
+from palpate.learning import Training
+from palpate.models.files import load_model, save_model
+from palpate.models.rope import Rope
+from palpate.networks import CommandPolicy
+from palpate.parameters import describe
+from palpate.planning.gradient import iterations_within
+from palpate.planning.sampling import samples_within
+from palpate.recordings.files import read_recording
+from palpate.runs import Figure, Result, Run
+from palpate.runs.run import RESULT
+from palpate.runs.storage import read_json, write_json
+from palpate.tasks.rope import RopeStabilization
+from palpate.trials.rope.baselines import TUNED, HeldStill, SwingDamper
+from palpate.trials.rope.evaluation import (
+    evaluate,
+    evaluation_trials,
+    figures,
+    one_of_each_pose,
+    summarise,
+    table,
+    write_trial_evidence,
+)
+from palpate.trials.rope.followers import decision_times
+from palpate.trials.rope.planners import (
+    TUNING,
+    PlannedStabiliser,
+    decision_about,
+    stabilising_planner,
+)
+from palpate.trials.rope.trials import Controller, Episodes, LearnedController, Trial
+
+NAME = "rope-rivals"
+BUDGET = 0.01  # s, a decision of a planner in a hurry
+EVALUATION_SEEDS = 960_000  # of ropes and noise, used by nothing else
+SHIPPED, UNDAMPED, SAC = "policy", "undamped policy", "SAC"
+METHODS = {"mppi": samples_within, "cem": samples_within, "gradient": iterations_within}
+UNHURRIED = {"mppi": 2048, "cem": 2048, "gradient": 5}  # samples; iterations
+SIZE = dataclasses.replace(
+    FULL,
+    ropes=2,
+    minutes={"recording": 1, "identification": 5, "training": 9, "SAC": 10, "evaluation": 10},
+)
+SMALL = dataclasses.replace(
+    QUICK,
+    training=dataclasses.replace(QUICK.training, iterations=60, batch=64, starts=1600),
+    ropes=1,
+    minutes={"recording and identification": 1, "training": 1, "SAC": 1, "evaluation": 2},
+)
+ROUNDS, FEW_ROUNDS = 60, 3  # of SAC: episodes that each of its environments goes through
+NOT_RUN = "not run: it needs the package stable-baselines3, pip install 'palpate[sac]'"
+# When quick: from how many start poses all are tried, and those unhurried, which have this share.
+POSES, SLOW_POSES, LESS = 2, 1, 4
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Identify with and without damping, train the rival policy and evaluate all below `out`.
+
+    `quick` is the same work at a smaller size. Raises `PalpateError` when `out` holds the stages of
+    another run, or when this installation has no shipped weights.
+    """
+    size = SMALL if quick else SIZE
+    installed = sac_installed()
+    announce(NAME, {name: time for name, time in size.minutes.items() if installed or name != SAC})
+    if not installed:
+        print(f"{SAC}: {NOT_RUN}", flush=True)
+    policy, about = shipped_policy()
+    model, spent = identified_rope(out, size, seed)
+    lively, took = _identified_undamped(out, model, size, seed)
+    command = f"palpate reproduce {NAME} --seed {seed}{' --quick' if quick else ''}"
+    rival, rival_about = trained_policy(
+        out / "train-undamped", RopeStabilization(), lively, size.training, seed, command
+    )
+    sizes, measured = _sizes_within(out / "planners", model, seed)
+    spent += took + rival_about["wall_time_s"] + measured
+    hurried = _planned(model, sizes, "10 ms", seed)
+    more = {method: -(-most // (LESS if quick else 1)) for method, most in UNHURRIED.items()}
+    unhurried = _planned(model, more, "unhurried", seed)
+    trials = evaluation_trials(BASE, size.ropes, EVALUATION_SEEDS + seed)
+    trials = [trials[index] for index in one_of_each_pose(trials)[:POSES]] if quick else trials
+    chosen = one_of_each_pose(trials)[: SLOW_POSES if quick else None]
+    settings = {
+        "quick": quick,
+        "policies": {SHIPPED: about, UNDAMPED: rival_about},
+        "planners": dataclasses.asdict(TUNING),
+        "within_10_ms": sizes,
+        "unhurried": more,
+        "swing_damper": dataclasses.asdict(TUNED),
+        "world": constants(BASE),
+        "ropes": size.ropes,
+    }
+    others = _learned(policy, rival) | {
+        "swing damper": SwingDamper(BASE),
+        "held still": HeldStill(),
+    }
+    work = settings | {"seed": seed, "trials": len(trials)}
+    whole, times, took = _evaluated(out / "evaluate", work, others | hurried, trials)
+    some = [trials[index] for index in chosen]
+    slow, slow_times, took_more = _evaluated(out / "evaluate-unhurried", work, unhurried, some)
+    free, free_about = {}, None
+    if installed:
+        rounds = FEW_ROUNDS if quick else ROUNDS
+        free[SAC], free_about, more_time = _model_free(out, model, size, rounds, trials, seed)
+        spent += more_time
+    unknown = [] if installed else [f"{SAC:28s} {NOT_RUN}"]
+    print("\n".join([*table(trials, whole | free), *unknown, *table(some, slow)]))
+    same = {name: _part(whole[name], chosen) for name in (SHIPPED, *hurried)}
+    return Result(
+        NAME,
+        [
+            *(row for name in whole for row in _rows(trials, whole[name], name)),
+            *(row for name in slow for row in _rows(some, slow[name], name)),
+            *(row for name in same for row in _rows(some, same[name], f"{name} same trials")),
+            *_times(times | slow_times),
+            *_model_free_rows(trials, free.get(SAC)),
+            *_effort(size.training, rival_about, free_about),
+        ],
+        settings | {SAC: free_about or NOT_RUN},
+        [seed],
+        {
+            "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
+            "trained": f"{UNDAMPED}: through the undamped model of the same recording alone",
+            f"{SAC} trained": "in the damped model alone, drawn as in our own training",
+            "planners tuned": "ropes of seed 7100, see `rope_planners`",
+            "evaluated": (
+                f"{len(trials)} trials of {size.ropes} sampled ropes, seed "
+                f"{EVALUATION_SEEDS + seed}; planners unhurried in the first of each pose"
+            ),
+        },
+        spent + took + took_more,
+    )
+
+
+def sac_installed() -> bool:
+    """Whether the library of SAC is there."""
+    return importlib.util.find_spec("stable_baselines3") is not None
+
+
+def _identified_undamped(out: Path, model: Rope, size: Size, seed: int) -> tuple[Rope, float]:
+    """The rope without damping that suits the same recording best, and the seconds that took.
+
+    It starts from what was identified with damping.
+    """
+    settings = Settings(iterations=size.identification, seed=seed)
+    configuration = {"stage": "identify undamped", **dataclasses.asdict(settings)}
+    with Run.open(out / "identify-undamped", configuration) as run:
+        path = run.path / "model.json"
+        if not run.finished:
+            recording = read_recording(out / "record" / "recording.npz")
+            aligned = recording.align(BASE.control_period, MARKERS, GRIPPER)
+            every = (aligned.observation.shape[2] - 1) // (model.nodes - 1)
+            seen = dataclasses.replace(aligned, observation=aligned.observation[:, :, ::every])
+            start = dataclasses.replace(undamped(model), drive="position").constrain()
+            lively = identify(start, seen, settings, run)
+            save_model(path, lively)
+            finish(run, NAME, "identify undamped", {"parameters": describe(lively)})
+        lively, _ = load_model(path)
+        if not isinstance(lively, Rope):
+            raise PalpateError(f"{path} is no rope but {type(lively).__name__}: give another --out")
+        return dataclasses.replace(lively, drive="velocity"), wall_time(run)
+
+
+def _sizes_within(path: Path, model: Rope, seed: int) -> tuple[dict[str, int], float]:
+    """How many samples or iterations each planner has within the budget on this machine.
+
+    Zero where not even the least fits. Kept in `path`; with the seconds it took to find out.
+    """
+    with Run.open(path, {"stage": "planners", "seed": seed, "budget_s": BUDGET}) as run:
+        file = run.path / "sizes.json"
+        if not run.finished:
+            sizes = {}
+            for method, within in METHODS.items():
+                try:
+                    sizes[method], _ = within(
+                        BUDGET,
+                        lambda count, method=method: decision_about(
+                            stabilising_planner(method, model, count)
+                        ),
+                    )
+                except PalpateError as error:
+                    print(f"{method} has no place within {BUDGET:g} s: {error}", flush=True)
+                    sizes[method] = 0
+            write_json(file, sizes)
+            finish(run, NAME, "planners", {"sizes": sizes})
+        return read_json(file), wall_time(run)
+
+
+def _model_free(
+    out: Path, model: Rope, size: Size, rounds: int, trials: Sequence[Trial], seed: int
+) -> tuple[Episodes, dict[str, Any], float]:
+    """What SAC does after so many rounds of training, how it was trained, and the seconds spent."""
+    from palpate.experiments.rivals.soft_actor_critic import Sac, trained_actor
+
+    actor, about = trained_actor(out / "train-sac", model, size.training, Sac(rounds), seed)
+    work = {"stage": "evaluate SAC", "seed": seed, "trials": len(trials), "policy": about}
+    controllers = {SAC: LearnedController(actor, RopeStabilization())}
+    evaluated, _, took = _evaluated(out / "evaluate-sac", work, controllers, trials)
+    return evaluated[SAC], about, about["wall_time_s"] + took
+
+
+def _model_free_rows(trials: Sequence[Trial], episodes: Episodes | None) -> list[Figure]:
+    if episodes is None:  # not run
+        return [Figure(f"success_rate.{suffix(SAC)}", None, "", better="higher")]
+    return _rows(trials, episodes, SAC)
+
+
+def _effort(
+    training: Training, own: Mapping[str, Any], free: Mapping[str, Any] | None
+) -> list[Figure]:
+    """Control periods simulated to train, and the seconds that took: our method's and SAC's."""
+    task = RopeStabilization()
+    steps = task.duration / BASE.control_period * sum(task.stages) / len(task.stages)
+    effort = {UNDAMPED: (training.iterations * training.batch * round(steps), own["wall_time_s"])}
+    if free is not None:
+        effort[SAC] = free["environment_steps"], free["wall_time_s"]
+    rows = []
+    for name, (simulated, seconds) in effort.items():
+        rows.append(Figure(f"simulated_steps.{suffix(name)}", simulated, ""))
+        rows.append(Figure(f"training_s.{suffix(name)}", seconds, "s"))
+    return rows
+
+
+def _learned(policy: CommandPolicy, rival: CommandPolicy) -> dict[str, Controller]:
+    task = RopeStabilization()
+    return {SHIPPED: LearnedController(policy, task), UNDAMPED: LearnedController(rival, task)}
+
+
+def _planned(
+    model: Rope, sizes: Mapping[str, int], when: str, seed: int
+) -> dict[str, PlannedStabiliser]:
+    """Those of the planners that have a size."""
+    return {
+        f"{method} {when}": PlannedStabiliser(stabilising_planner(method, model, size), seed)
+        for method, size in sizes.items()
+        if size
+    }
+
+
+def _evaluated(
+    path: Path,
+    configuration: dict[str, Any],
+    controllers: Mapping[str, Controller],
+    trials: Sequence[Trial],
+) -> tuple[dict[str, Episodes], dict[str, list[float]], float]:
+    """What each controller does, how long planners take to decide (ms), and the seconds spent."""
+    with Run.open(path, configuration | {"controllers": list(controllers)}) as run:
+        evaluated = evaluate(controllers, trials, run)
+        if not run.finished:
+            write_trial_evidence(run, trials, evaluated, tuple(controllers))
+            planned = {n: [c] for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
+            finish(run, NAME, path.name, {"decision_ms": decision_times(planned)})
+        return evaluated, read_json(run.path / RESULT)["decision_ms"], wall_time(run)
+
+
+def _part(episodes: Episodes, chosen: Sequence[int]) -> Episodes:
+    """Of some of the trials, in this order; without markers."""
+    failures = {
+        place: episodes.failures[trial]
+        for place, trial in enumerate(chosen)
+        if trial in episodes.failures
+    }
+    chosen = list(chosen)
+    return Episodes(
+        episodes.energy[chosen], episodes.gripper_speed[chosen], episodes.markers[:0], failures
+    )
+
+
+def _rows(trials: Sequence[Trial], episodes: Episodes, name: str) -> list[Figure]:
+    return figures(summarise(trials, episodes), f".{suffix(name)}")
+
+
+def _times(times: Mapping[str, Sequence[float]]) -> list[Figure]:
+    rows = []
+    for name, (median, late) in times.items():
+        rows.append(Figure(f"decision_ms_median.{suffix(name)}", median, "ms"))
+        rows.append(Figure(f"decision_ms_p99.{suffix(name)}", late, "ms"))
+    return rows

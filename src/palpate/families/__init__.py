@@ -1,0 +1,1 @@
+"""What each family of objects brings to every stage."""

@@ -1,0 +1,257 @@
+"""Options of the commands that families take part in, to be completed by each of them.
+
+Frozen dataclasses: a command's line and its configuration.
+
+Nothing here imports what computes, so that help is instant.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from tyro.conf import Positional, arg
+
+from palpate.errors import PalpateError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from palpate.models.model import Model
+    from palpate.networks import CommandPolicy
+    from palpate.recordings import Aligned, Recording
+    from palpate.runs import Figure, Run
+
+Number = Annotated[float | None, arg(metavar="NUMBER", help_behavior_hint="(default: none)")]
+Whole = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: as many as needed)")]
+Names = Annotated[tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="(default: none)")]
+Place = Annotated[
+    Path | None, arg(metavar="PATH", help_behavior_hint="(default: a folder below runs/)")
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What every command has."""
+
+    out: Place = None
+    """Where to write: a folder, or the file that is wanted."""
+    seed: int = 0
+    """Draws all randomness: the same seed gives the same result."""
+    fresh: bool = False
+    """Start over where an earlier run has left its work, instead of going on with it."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise PalpateError(f"a seed is a whole number, 0 or greater, not {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(Options, ABC):
+    """Recording from a simulated world; each family says in `record` how."""
+
+    family: ClassVar[str]
+
+    trials: int = 12
+    """Uninterrupted motions."""
+    duration: float = 5.0
+    """Seconds of each."""
+
+    @abstractmethod
+    def record(self) -> Recording:
+        """Run the world and keep what its sensors showed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading(Options):
+    """What a command has to be told about recordings that others have made."""
+
+    rate: Number = None
+    """Hz, for files that carry no time."""
+    unit: Annotated[
+        Literal["m", "cm", "mm"] | None,
+        arg(metavar="{m,cm,mm}", help_behavior_hint="(default: what the file says, else m)"),
+    ] = None
+    """Of positions."""
+    up: Annotated[
+        Literal["x", "y", "z"] | None,
+        arg(metavar="{x,y,z}", help_behavior_hint="(default: what the file says, else z)"),
+    ] = None
+    """The axis that points up."""
+    topics: Annotated[
+        tuple[str, ...] | None,
+        arg(metavar="TOPIC ...", help_behavior_hint="(default: the only one with markers)"),
+    ] = None
+    """Of a robot's log: that of the markers, and those of the gripper's pose and velocity."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identify(Reading, ABC):
+    """Identification from recordings; each family says which channels, and from which model."""
+
+    family: ClassVar[str]
+    observation: ClassVar[str]  # the channel that is predicted
+
+    recordings: Positional[
+        Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
+    ]
+    """What to fit: .npz of palpate, .npz with `positions`, .csv of a motion-capture system, or a
+    robot's log: .mcap, .db3, .bag, or the folder of a rosbag2."""
+    validate: Annotated[
+        tuple[Path, ...],
+        arg(metavar="FILE ...", help_behavior_hint="(default: a quarter of the trials)"),
+    ] = ()
+    """Recordings to score on and not to fit."""
+    free: Names = ()
+    """Parameters to identify that otherwise would not be."""
+    fixed: Names = ()
+    """Parameters to leave as they are."""
+    shared: Names = ()
+    """Parameters to give one value for all elements."""
+    method: Literal["adam", "levenberg-marquardt"] = "adam"
+    """How to descend."""
+    iterations: Annotated[
+        tuple[int, ...], arg(metavar="N ...", help_behavior_hint="(default: as many as needed)")
+    ] = ()
+    """At each of the growing horizons; fewer are faster and fit worse."""
+    residual: bool = False
+    """Fit a network to what the physics leaves over; kept if it helps on trials held out of it."""
+
+    @abstractmethod
+    def prepare(self, recording: Recording) -> Recording:
+        """The recording with the channels that the model needs."""
+
+    @abstractmethod
+    def action(self, recording: Recording) -> str:
+        """The channel of a prepared recording that drives the model."""
+
+    @abstractmethod
+    def start(self, aligned: Aligned) -> Model:
+        """The model an identification starts from."""
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Models to be compared, by name.
+
+    `by_itself`: for each part of what was recorded, how probable each is that it may be by itself,
+    where the models take it to be the most probable.
+    """
+
+    models: Mapping[str, Model]
+    by_itself: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyBayesian(Reading, ABC):
+    """Identification with a posterior; each family says which models are compared."""
+
+    family: ClassVar[str]
+    observation: ClassVar[str]  # the channel that is predicted
+    action: ClassVar[str]  # the channel that drives the model
+    worker: ClassVar[str] = "palpate.commands.identify_bayesian:run"
+
+    recordings: Positional[
+        Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
+    ]
+    """What to fit: .npz of palpate."""
+    validate: Annotated[
+        tuple[Path, ...], arg(metavar="FILE ...", help_behavior_hint="(default: none)")
+    ] = ()
+    """Recordings to score on and not to fit."""
+    draws: int = 100
+    """Of each chain, after its warm-up."""
+    chains: int = 32
+    """Independent of one another, so that it shows when they do not agree."""
+
+    @abstractmethod
+    def prepare(self, recording: Recording) -> Recording:
+        """The recording with the channels that the models need."""
+
+    @abstractmethod
+    def reference(self, recordings: Sequence[Recording], period: float) -> Model:
+        """A model of what was recorded, at once: by it recordings are checked.
+
+        The first recording is to be fitted, what follows only to be scored on.
+        """
+
+    @abstractmethod
+    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
+        """The models to compare; one is fitted without comparison. Arguments as of `reference`.
+
+        May take minutes.
+        """
+
+    def sufficient(self, model: Model, recordings: Sequence[Recording]) -> Model:
+        """The model without what cannot show in these recordings, for less work."""
+        return model
+
+    def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:
+        """Rows for `result.json` of what follows from parameters, "derived" in each.
+
+        `models` are the posterior's draws as one model, `prior` those of the prior.
+        """
+        return []
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Options, ABC):
+    """Training through an identified model; each task says in `prepare` how it needs the model."""
+
+    task: ClassVar[str]
+    action: ClassVar[str]  # what the policy's output is, for whoever reads its file
+
+    model: Annotated[Path, arg(metavar="MODEL")]
+    """What `palpate identify` wrote: its folder, or the model file in it."""
+    iterations: Whole = None
+    """Gradient steps; fewer are faster and train worse."""
+    batch: Whole = None
+    """Episodes in each of them."""
+    starts: Whole = None
+    """Start states to draw from."""
+    observation_noise: float = 0.0
+    """Standard deviation of what the policy will see, in the observation's unit."""
+
+    @abstractmethod
+    def prepare(self, model: Model) -> Model:
+        """The model as the task drives it."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found: figures, a table for a person, and how the trials were drawn.
+
+    `notes` are sentences about what could not be done.
+    """
+
+    figures: list[Figure]
+    table: list[str]
+    settings: dict[str, Any]
+    split: dict[str, Any]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Options, ABC):
+    """A trained policy in a world; each task says in `evaluate` what is tried and counted."""
+
+    task: ClassVar[str]
+
+    policy: Annotated[Path, arg(metavar="POLICY")]
+    """What `palpate train` wrote: its folder, or the policy file in it."""
+    model: Annotated[Path | None, arg(metavar="MODEL", help_behavior_hint="(default: none)")] = None
+    """Try the policy in this identified model too, to compare."""
+
+    @abstractmethod
+    def prepare(self, model: Model) -> Model:
+        """The model as the task drives it."""
+
+    @abstractmethod
+    def check(self, policy: CommandPolicy) -> None:
+        """Raise `PalpateError` where the world cannot be controlled by this policy."""
+
+    @abstractmethod
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """Try the policy in the world; leaves evidence and checkpoints in the run."""

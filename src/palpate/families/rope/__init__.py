@@ -1,0 +1,41 @@
+"""Ropes: deformable linear objects, held at one end or both."""
+
+from palpate.family import Family
+
+_OPTIONS, _EXPERIMENTS = "palpate.families.rope.options", "palpate.experiments.rope"
+
+FAMILY = Family(
+    name="rope",
+    about="deformable linear objects",
+    models={"rope": "palpate.models.rope:Rope"},
+    worlds={"rope": "palpate.worlds.rope.rope:RopeWorld"},
+    tasks={
+        "rope-stabilization": "palpate.tasks.rope:RopeStabilization",
+        "rope-tracking": "palpate.tasks.rope:RopeTracking",
+    },
+    options={
+        "record": {"rope": f"{_OPTIONS}:RecordRope"},
+        "track": {"rope": f"{_OPTIONS}:TrackRope"},
+        "identify": {"rope": f"{_OPTIONS}:IdentifyRope"},
+        "train": {
+            "rope-stabilization": f"{_OPTIONS}:TrainRopeStabilization",
+            "rope-tracking": f"{_OPTIONS}:TrainRopeTracking",
+        },
+        "evaluate": {
+            "rope-stabilization": f"{_OPTIONS}:EvaluateRopeStabilization",
+            "rope-tracking": f"{_OPTIONS}:EvaluateRopeTracking",
+        },
+    },
+    experiments={
+        "rope-model": f"{_EXPERIMENTS}.model:reproduce",
+        "rope-stabilization": f"{_EXPERIMENTS}.stabilization:reproduce",
+        "rope-ablation": f"{_EXPERIMENTS}.ablation:reproduce",
+        "rope-rivals": f"{_EXPERIMENTS}.rivals:reproduce",
+        "rope-bound": f"{_EXPERIMENTS}.bound:reproduce",
+        "rope-generalization": f"{_EXPERIMENTS}.generalization:reproduce",
+        "rope-tracking": f"{_EXPERIMENTS}.tracking:reproduce",
+        "rope-dagger": f"{_EXPERIMENTS}.dagger:reproduce",
+        "rope-residual": f"{_EXPERIMENTS}.residual:reproduce",
+        "rope-markerless": f"{_EXPERIMENTS}.markerless:reproduce",
+    },
+)

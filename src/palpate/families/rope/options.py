@@ -1,0 +1,362 @@
+"""What the commands can be told about ropes, and what they then do."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from tyro.conf import Positional, arg
+
+from palpate.errors import PalpateError
+from palpate.families.options import Evaluate, Evaluation, Identify, Number, Options, Record, Train
+
+if TYPE_CHECKING:
+    from palpate.models.rope import Rope
+    from palpate.networks import CommandPolicy
+    from palpate.recordings import Aligned, Recording
+    from palpate.runs import Run
+
+NOISE = 5e-4  # m, standard deviation of a marker's coordinate in the simulated world
+RENDERED = 3.0  # s of a trial in the moving picture
+GRIP = "grip"  # the channel that is made of gripped markers
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordRope(Record):
+    """Record a simulated rope whose gripper moves at random, and then holds still.
+
+    The world is a MuJoCo cable. The file holds the markers as a camera sees them, the gripper's
+    position as its encoder shows it, and the velocity it was ordered.
+
+    1. The default rope, 1 m and 100 g:         palpate record rope --out R.npz
+    2. A heavier one, with fewer markers:       palpate record rope --mass 0.2 --markers 11
+    """
+
+    family: ClassVar[str] = "rope"
+
+    length: float = 1.0
+    """Of the rope, m."""
+    mass: float = 0.1
+    """Of the rope without tip mass, kg."""
+    tip_mass: float = 0.0
+    """A point at its end, kg."""
+    bending_stiffness: float = 1e-4
+    """E I, N m^2."""
+    joint_damping: float = 3e-3
+    """Against bending, N m s/rad at each of 40 joints."""
+    air_viscosity: float = 3e-3
+    """Effective viscosity of the air, Pa s."""
+    markers: int = 21
+    """Spread evenly, gripper and tip included."""
+    observation_noise: float = NOISE
+    """Standard deviation of a marker's coordinate, m."""
+
+    def record(self) -> Recording:
+        """Trials of smooth random motion and stillness, each from hanging."""
+        import numpy as np
+
+        from palpate.families.rope.recording import record_rope
+        from palpate.worlds.rope.configuration import RopeConfiguration
+
+        if self.trials < 1:
+            raise PalpateError(f"a recording has at least one trial, not {self.trials}")
+        constants = {field.name for field in dataclasses.fields(RopeConfiguration)}
+        told = {name: value for name, value in vars(self).items() if name in constants}
+        seeds = np.random.SeedSequence(self.seed).generate_state(self.trials)
+        return record_rope(RopeConfiguration(**told), seeds.tolist(), self.duration)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackRope(Options):
+    """Follow a rope through a calibrated camera's pictures, with its identified model.
+
+    PICTURES is a folder with camera.json, times.csv, and colour/ (PNG or JPEG) or colour.mp4;
+    depth/ (16-bit PNG, millimetres) if the camera has it. docs/rope.md says what stands in them.
+
+    1. An orange rope, 1 cm thick:              palpate track rope PICTURES --colour 0.9 0.5 0.2
+                                                    --radius 0.005 --model M --out R.npz
+    """
+
+    pictures: Positional[Annotated[Path, arg(metavar="PICTURES", help_behavior_hint="")]]
+    """What the camera saw, and where the gripper was."""
+    model: Annotated[Path, arg(metavar="MODEL")]
+    """What `palpate identify` wrote: its folder, or the model file in it."""
+    colour: Annotated[tuple[float, float, float], arg(metavar="RED GREEN BLUE")]
+    """Of the rope in good light, each from 0 to 1."""
+    radius: float
+    """Of the rope, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyRope(Identify):
+    """Identify a rope: stiffness, damping and drag from recorded markers.
+
+    A recording of `palpate record` says itself how the gripper moved. In any other, one or more
+    markers are gripped: their positions are given to the model and the others are predicted.
+
+    1. A recording of palpate:                  palpate identify rope R.npz
+    2. Motion capture, both ends gripped:       palpate identify rope train.npz
+                                                    --validate eval.npz
+                                                    --driven 0 1 -2 -1 --rate 100
+    3. A rope that was weighed, 120 g:          palpate identify rope R.npz --mass 0.12
+    4. One bending stiffness for all joints:    palpate identify rope R.npz
+                                                    --shared bend_stiffness
+    """
+
+    family: ClassVar[str] = "rope"
+    observation: ClassVar[str] = "markers"
+
+    driven: Annotated[
+        tuple[int, ...],
+        arg(metavar="N ...", help_behavior_hint="(default: the recorded gripper, else 0)"),
+    ] = ()
+    """Markers that are gripped; negative ones count from the end."""
+    mass: Number = None
+    """Of the whole rope, kg; unknown, a node has 4 g, and only what is found per mass counts."""
+    nodes: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: one for each marker)")
+    ] = None
+    """Of the model: at every marker, at every second one, and so on."""
+    substeps: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: of about 1 ms)")
+    ] = None
+    """Steps of the model in a control period; few are fast and bound the stiffness."""
+
+    def prepare(self, recording: Recording) -> Recording:
+        """Keep the markers that are nodes, and make those that are gripped a driven channel."""
+        from palpate.families.rope.recording import GRIPPER
+        from palpate.recordings.markers import with_driven
+
+        recording = self._thinned(recording)
+        if self.driven or GRIPPER not in recording.trials[0].channels:
+            return with_driven(recording, self.driven or (0,), self.observation, GRIP)
+        return recording
+
+    def action(self, recording: Recording) -> str:
+        """The gripped markers where there are any, else the gripper that was recorded."""
+        from palpate.families.rope.recording import GRIPPER
+
+        return GRIP if GRIP in recording.trials[0].channels else GRIPPER
+
+    def start(self, aligned: Aligned) -> Rope:
+        """See `starting_rope`."""
+        from palpate.families.rope.recording import starting_rope
+        from palpate.recordings.recording import resolve_indices
+
+        driven = resolve_indices(self.driven or (0,), aligned.observation.shape[2], "marker")
+        rope = starting_rope(aligned, driven, self.mass)
+        if self.substeps is not None:
+            rope = dataclasses.replace(rope, substeps=self.substeps).constrain()
+        return rope
+
+    def _thinned(self, recording: Recording) -> Recording:
+        if self.nodes is None:
+            return recording
+        if not set(self.driven) <= {0, -1}:
+            raise PalpateError(
+                f"--nodes keeps every so many markers, so only the ends can be driven: expected "
+                f"--driven 0, -1 or both with it, got {' '.join(map(str, self.driven))}"
+            )
+        count = recording.trials[0][self.observation].values.shape[1]
+        every, rest = divmod(count - 1, max(self.nodes - 1, 1))
+        if rest or not every:
+            fitting = [n + 1 for n in range(3, count) if (count - 1) % n == 0]
+            raise PalpateError(
+                f"{self.nodes} nodes do not fall on {count} markers; "
+                f"{', '.join(map(str, fitting)) or 'no number of'} nodes do"
+            )
+        trials = []
+        for trial in recording.trials:
+            markers = trial[self.observation]
+            kept = dataclasses.replace(markers, values=markers.values[:, ::every], notes=())
+            channels = {**trial.channels, self.observation: kept}
+            trials.append(dataclasses.replace(trial, channels=channels))
+        return dataclasses.replace(recording, trials=tuple(trials))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRopeStabilization(Train):
+    """Train a controller that brings a swinging rope to rest by moving its gripper.
+
+    1. After `palpate identify rope R.npz`:     palpate train rope-stabilization
+                                                    --model runs/identify-rope-001
+    """
+
+    task: ClassVar[str] = "rope-stabilization"
+    action: ClassVar[str] = "gripper velocity, m/s"
+
+    observation_noise: float = NOISE
+    """Standard deviation of a marker's coordinate as the policy will see it, m."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRopeStabilization(Evaluate):
+    """Try a controller in MuJoCo ropes it was not trained for, from four start poses.
+
+    Beside it, in the same trials: a gripper held still, and a tuned swing damper.
+
+    1. After `palpate train`:                   palpate evaluate rope-stabilization
+                                                    --policy runs/train-rope-stabilization-001
+    """
+
+    task: ClassVar[str] = "rope-stabilization"
+
+    ropes: int = 10
+    """Drawn around the rope that `palpate record` has by default; each from four poses."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+    def check(self, policy: CommandPolicy) -> None:
+        """The simulated rope takes a command every so often, and there has to be one."""
+        _check_simulated(policy, self.ropes)
+
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """See `rope_evaluation.evaluate`."""
+        from palpate.families.rope.recording import constants
+        from palpate.tasks.rope import RopeStabilization
+        from palpate.trials.rope import evaluation as rope_evaluation
+        from palpate.trials.rope.baselines import HeldStill, SwingDamper
+        from palpate.trials.rope.rendering import render_trial
+        from palpate.trials.rope.trials import LearnedController
+        from palpate.worlds.rope.configuration import RopeConfiguration
+
+        base = RopeConfiguration()
+        trials = rope_evaluation.evaluation_trials(base, self.ropes, self.seed)
+        controllers = {
+            "controlled": LearnedController(policy, RopeStabilization()),
+            "held still": HeldStill(),
+            "swing damper": SwingDamper(base),
+        }
+        evaluated = rope_evaluation.evaluate(controllers, trials, run)
+        rope_evaluation.write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
+        try:
+            picture = run.path / "rendering.webp"
+            render_trial(picture, trials[0], controllers["controlled"], RENDERED)
+            notes = ()
+        except PalpateError as error:  # a machine without OpenGL: the page draws the ropes itself
+            notes = (f"the rope is drawn, not rendered: {error}",)
+        figures = []
+        for name, episodes in evaluated.items():
+            suffix = "" if name == "controlled" else f".{name.replace(' ', '_')}"
+            summary = rope_evaluation.summarise(trials, episodes)
+            figures += rope_evaluation.figures(summary, suffix)
+        return Evaluation(
+            figures=figures,
+            table=rope_evaluation.table(trials, evaluated),
+            settings={"trials": len(trials), **constants(base)},
+            split={"evaluated": f"{self.ropes} sampled ropes, seed {self.seed}"},
+            notes=notes,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRopeTracking(Train):
+    """Train a controller that leads the tip of a hanging rope along a path by moving its gripper.
+
+    It is trained on random smooth paths and follows any.
+
+    1. After `palpate identify rope R.npz`:     palpate train rope-tracking
+                                                    --model runs/identify-rope-001
+    """
+
+    task: ClassVar[str] = "rope-tracking"
+    action: ClassVar[str] = "gripper velocity, m/s"
+
+    observation_noise: float = NOISE
+    """Standard deviation of a marker's coordinate as the policy will see it, m."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRopeTracking(Evaluate):
+    """Try a controller on paths and in MuJoCo ropes that it was not trained for.
+
+    Beside it, in the same trials: a gripper held still, one that moves as the path does, and one
+    that moves as would suit a limp chain.
+
+    1. After `palpate train`:                   palpate evaluate rope-tracking
+                                                    --policy runs/train-rope-tracking-001
+    2. Along a path of your own (time,x,y,z):   palpate evaluate rope-tracking
+                                                    --policy P --paths mine.csv
+    """
+
+    task: ClassVar[str] = "rope-tracking"
+
+    ropes: int = 5
+    """Drawn around the rope that `palpate record` has by default; each on every path."""
+    paths: Annotated[tuple[str, ...], arg(metavar="NAME|FILE.csv ...")] = (
+        "lemniscate",
+        "egg",
+        "sine",
+    )
+    """Of these three, of random size, speed and direction, or from files, as they stand there."""
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+    def check(self, policy: CommandPolicy) -> None:
+        """The simulated rope takes a command every so often, and there has to be one."""
+        _check_simulated(policy, self.ropes)
+
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """See `rope_tracking_trials.follow`."""
+        from palpate.families.rope.recording import constants
+        from palpate.tasks.rope import RopeTracking
+        from palpate.trials.rope import tracking
+        from palpate.trials.rope.followers import LearnedFollower, blind_followers
+        from palpate.worlds.rope.configuration import RopeConfiguration
+
+        base, task = RopeConfiguration(), RopeTracking()
+        trials = tracking.path_trials(base, self.ropes, self.seed, self.paths)
+        followers = {"controlled": lambda paths: LearnedFollower(policy, task, paths)}
+        followed = tracking.follow(followers | blind_followers(base), trials, run)
+        tracking.write_path_evidence(run, trials, followed, "controlled")
+        figures = []
+        for name, whole in followed.items():
+            suffix = "" if name == "controlled" else f".{name.replace(' ', '_')}"
+            figures += tracking.figures(tracking.summarise(trials, whole), suffix)
+        return Evaluation(
+            figures=figures,
+            table=tracking.table(trials, followed),
+            settings={"trials": len(trials), **constants(base)},
+            split={"evaluated": f"{self.ropes} sampled ropes, seed {self.seed}"},
+        )
+
+
+def _check_simulated(policy: CommandPolicy, ropes: int) -> None:
+    """Raise `PalpateError` without a rope, or where one takes its commands at another rate."""
+    from palpate.worlds.rope.configuration import RopeConfiguration
+
+    if ropes < 1:
+        raise PalpateError(f"an evaluation has at least one rope, not {ropes}")
+    period = RopeConfiguration().control_period
+    if not math.isclose(policy.period, period, rel_tol=1e-4):
+        raise PalpateError(
+            f"the policy decides every {policy.period:.4g} s and the simulated rope takes a "
+            f"command every {period:.4g} s: train through a model identified at "
+            f"{1 / period:.4g} Hz, the rate of `palpate record rope`"
+        )
+
+
+def _driven_by_velocity(rope: Rope) -> Rope:
+    from palpate.models.rope import Rope as Physics
+
+    if not isinstance(rope, Physics):
+        raise PalpateError(
+            "a policy is trained and tried through the physics of a rope: expected a model "
+            "identified without --residual"
+        )
+    return dataclasses.replace(rope, drive="velocity")

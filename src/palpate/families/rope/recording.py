@@ -1,0 +1,86 @@
+"""Recordings of MuJoCo ropes, and the rope model that an identification starts from."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.models.rope import Rope
+from palpate.parameters import declare
+from palpate.recordings import Aligned, Channel, Recording, Role, Trial
+from palpate.worlds.excitation import excitation, record
+from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
+
+MARKERS, GRIPPER, COMMAND = "markers", "gripper", "command"
+NODE_MASS = 4e-3  # kg, where nothing was weighed: the motion tells stiffness per mass and no more
+TIME_STEP = 1e-3  # s, about, of the model's integration
+
+
+def record_rope(
+    configuration: RopeConfiguration, seeds: Iterable[int], duration: float
+) -> Recording:
+    """Shake a MuJoCo rope from hanging, one trial of `duration` seconds for each seed.
+
+    Channels: `markers` (frames, markers, 3) as seen, `gripper` (frames, 1, 3) where the driven end
+    was, and `command` (steps, 1, 3) the velocity it was told. Raises `PalpateError` when the
+    simulation diverges.
+    """
+    world = RopeWorld(configuration)
+    trials = []
+    for seed in seeds:
+        motion = excitation(
+            seed, duration, world.control_period, world.speed_limit, world.acceleration_limit
+        )
+        data = record(world, motion, seed)
+        channels = (
+            Channel(MARKERS, Role.OBSERVATION, data["time"], data["markers"], "m"),
+            Channel(GRIPPER, Role.DRIVEN, data["time"], data["gripper_position"][:, None], "m"),
+            Channel(COMMAND, Role.COMMAND, data["command_time"], data["command"][:, None], "m/s"),
+        )
+        trials.append(Trial(f"seed {seed}", {channel.name: channel for channel in channels}))
+    return Recording(tuple(trials), {"source": "MuJoCo rope"} | constants(configuration))
+
+
+def constants(configuration: RopeConfiguration) -> dict[str, str | float | int]:
+    """The plain constants of a world, for provenance and results."""
+    return {
+        f"world.{name}": value
+        for name, value in dataclasses.asdict(configuration).items()
+        if isinstance(value, str | int | float)
+    }
+
+
+def starting_rope(
+    aligned: Aligned, driven: Sequence[int] = (0,), mass: float | None = None
+) -> Rope:
+    """The rope an identification starts from: as many nodes as markers, segments as long as seen.
+
+    `mass` (kg) is the whole rope's. Raises `PalpateError` for too few markers, or neighbouring ones
+    that coincide.
+    """
+    nodes = aligned.observation.shape[2]
+    if nodes < 4:
+        raise PalpateError(f"a rope needs at least 4 markers, the recording has {nodes}")
+    distance = np.linalg.norm(np.diff(aligned.observation, axis=2), axis=-1)
+    rest_length = np.nanmean(distance, axis=(0, 1))
+    if not np.all(rest_length > 0):
+        first = int(np.argmin(rest_length > 0))
+        raise PalpateError(
+            f"markers {first} and {first + 1} are never seen apart: give the markers in order "
+            "along the rope"
+        )
+    rope = Rope.from_rest_lengths(
+        rest_length,
+        NODE_MASS * nodes if mass is None else mass,
+        driven=tuple(driven),
+        drive="position",
+        control_period=aligned.period,
+        substeps=max(1, round(aligned.period / TIME_STEP)),
+    )
+    if rope.held_at_both_ends:
+        # Two grips show how a rope is bent at rest and how its mass is spread.
+        rope = declare(rope, rest_bend={"fixed": False}, node_mass={"fixed": False})
+    if 0 not in rope.driven or 1 in rope.driven:  # no grip, or it turns the first segment itself
+        rope = declare(rope, grip_stiffness={"fixed": True}, grip_damping={"fixed": True})
+    return rope

@@ -1,0 +1,146 @@
+"""A simulated rope and its robot in a process of its own, in real time, behind a link.
+
+`palpate serve POLICY --simulate` starts it; it stands for the program that a real robot's maker
+writes: publish what was seen every period, obey the newest command, and brake when none comes.
+"""
+
+import argparse
+import json
+import math
+import secrets
+import time
+from typing import Any
+
+import numpy as np
+
+from palpate.deployment.loop import Link
+from palpate.deployment.messages import (
+    CommandMessage,
+    StateMessage,
+    decode_command,
+    encode_state,
+)
+from palpate.deployment.scheduling import ROBOT, real_time
+from palpate.deployment.supervisor import PAUSE, Mode, slowed
+from palpate.deployment.transport import COMMAND, STATE, ZenohLink
+from palpate.errors import PalpateError
+from palpate.worlds.rope.rope import RopeConfiguration, RopeObservation, RopeWorld
+
+SERVO = 0.002  # s in which a new command is followed
+
+
+class RopeRobot:
+    """One rope from one start, held there until the loop runs its policy; then let go.
+
+    It publishes what it sees every `period` s, follows the newest command within `SERVO`, and
+    brakes when it hears nothing.
+
+    Args:
+        link: to the loop.
+        configuration, seed, start: of the rope; its control period is the servo's.
+        period: seconds between states.
+    """
+
+    def __init__(
+        self, link: Link, configuration: RopeConfiguration, seed: int, start: str, period: float
+    ):
+        self._link = link
+        self._world = RopeWorld(configuration)
+        self._steps = round(period / configuration.control_period)
+        self._seen: RopeObservation = self._world.reset(seed, start=start)
+        self._change = configuration.acceleration_limit * configuration.control_period
+        self._session, self._sequence = secrets.randbits(64), 0
+        self._deadline = self._heard_at = link.clock()
+        self.period = period
+        self.released = False
+        self.velocity = np.zeros(3)  # that it follows, m/s
+        self.published_at = self._deadline
+        self.heard: list[tuple[float, CommandMessage]] = []
+        self.speeds: list[tuple[float, float]] = []
+
+    @property
+    def gripper_speed(self) -> float:
+        """As its encoder shows it, m/s."""
+        return float(np.linalg.norm(self._seen.gripper_velocity))
+
+    @property
+    def energy(self) -> float:
+        """The rope's, J."""
+        return self._world.truth().energy
+
+    def advance(self, silent: bool = False) -> None:
+        """One period of real time, published unless `silent`.
+
+        Leaves in `heard` the commands of that period with their arrival, and in `speeds` the
+        gripper's, with their times.
+        """
+        self.heard, self.speeds = [], []
+        for step in range(self._steps):
+            time.sleep(max(0.0, self._deadline - self._link.clock()))
+            if not step and not silent:
+                self._publish()
+            self._listen()
+            if self.released:
+                self._seen = self._world.step(self.velocity)
+            self._deadline = max(self._deadline + self._world.control_period, self._link.clock())
+            self.speeds.append((self._deadline, self.gripper_speed))
+
+    def _publish(self) -> None:
+        self._sequence += 1
+        self.published_at = self._link.clock()
+        seen = self._seen
+        message = StateMessage(
+            self._session, self._sequence, self.published_at, seen.gripper_position, seen.markers
+        )
+        self._link.send(encode_state(message))
+
+    def _listen(self) -> None:
+        heard = [(arrived, decode_command(data)) for arrived, data in self._link.arrivals()]
+        if heard:
+            self._heard_at, command = heard[-1]
+            self.velocity = command.velocity
+            self.released = self.released or command.mode == Mode.RUNNING
+            self.heard += heard
+        elif self._link.clock() - self._heard_at > PAUSE * self.period:
+            self.velocity = slowed(self.velocity, self._change)
+
+
+def servoed(markers: int, period: float, **fields: Any) -> RopeConfiguration:
+    """The default rope with so many markers, behind a servo, for a loop of this period.
+
+    Raises `PalpateError` where that is no whole number of the servo's.
+    """
+    if abs(round(period / SERVO) * SERVO / period - 1) > 1e-3:
+        raise PalpateError(
+            f"the policy decides every {period:.4g} s and the simulated robot's servo every "
+            f"{SERVO:g} s: expected a whole number of these; serve it without --simulate"
+        )
+    return RopeConfiguration(markers=markers, control_period=SERVO, **fields)
+
+
+def main() -> None:
+    """Run until killed or for some seconds after the rope was let go; print its motion."""
+    parser = argparse.ArgumentParser(description="a simulated rope and its robot")
+    parser.add_argument("--connect", required=True, help="where the loop listens")
+    parser.add_argument("--markers", type=int, required=True)
+    parser.add_argument("--period", type=float, required=True)
+    parser.add_argument("--seconds", type=float, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--start", default="straight")
+    options = parser.parse_args()
+    # Urgent, because it stands for a robot with a computer of its own.
+    with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
+        rope = servoed(options.markers, options.period)
+        robot = RopeRobot(link, rope, options.seed, options.start, options.period)
+        energies, speeds, ends = [robot.energy], [robot.gripper_speed], math.inf
+        while link.clock() < ends:
+            robot.advance()
+            if robot.released:
+                ends = min(ends, link.clock() + options.seconds)
+                energies.append(robot.energy)
+                speeds.append(robot.gripper_speed)
+    print(json.dumps({"energy_j": energies, "gripper_speed_m_per_s": speeds}))
+
+
+if __name__ == "__main__":
+    main()

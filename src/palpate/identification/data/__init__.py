@@ -1,0 +1,1 @@
+"""Recordings as identification takes them: windows, and pieces with known starts."""

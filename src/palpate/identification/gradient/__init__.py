@@ -1,0 +1,1 @@
+"""Identification by descent: gradients, least squares, and a network for what is left over."""

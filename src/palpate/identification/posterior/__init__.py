@@ -1,0 +1,1 @@
+"""Bayesian identification: likelihood, modes, draws, predictions, calibration."""

@@ -1,0 +1,97 @@
+"""Hypotheses about what was recorded, compared by how probable they make it.
+
+All of them are alike before. The posterior of the most probable one is what is handed over.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+
+from palpate.identification.data.segments import Segments, cut, difference, noise_scale
+from palpate.identification.posterior.likelihood import (
+    MotionPosterior,
+    inferred_scales,
+    motion_posterior,
+)
+from palpate.identification.posterior.posterior import (
+    CHAINS,
+    Posterior,
+    check_numbers,
+    draw,
+    preparing,
+)
+from palpate.identification.posterior.settled import Settled, settle_each
+from palpate.models.model import Model
+from palpate.recordings import Aligned
+
+PIECE = 2.0  # s, of what is fitted, and of what is predicted open loop
+STILL = 0.1  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """The posterior of the most probable hypothesis, and how probable each is."""
+
+    posterior: Posterior
+    structure: str
+    probability: dict[str, float]
+
+
+def compare(
+    targets: Mapping[str, MotionPosterior],
+    draws: int = 100,
+    chains: int = CHAINS,
+    seed: int = 0,
+) -> Comparison:
+    """Compare hypotheses by their evidence and sample the posterior of the most probable.
+
+    All of them are alike before. The evidence is Laplace's at the best mode of each: tempered
+    particles (`tempered.temper`) give it without the assumption of a normal posterior, and take
+    many times as long. Raises as `bayesian.draw`.
+    """
+    check_numbers(chains, draws)
+    with preparing(next(iter(targets.values())), chains):
+        explored = explore(targets, seed)
+    probability = shares({name: settled.evidence for name, settled in explored.items()})
+    structure = max(probability, key=probability.__getitem__)
+    posterior = draw(explored[structure], chains=chains, draws=draws, seed=seed)
+    return Comparison(posterior, structure, probability)
+
+
+def explore(targets: Mapping[str, MotionPosterior], seed: int = 0) -> dict[str, Settled]:
+    """The modes of each."""
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    return {name: settle_each(target, key) for name, target in targets.items()}
+
+
+def shares(logarithms: Mapping[str, float]) -> dict[str, float]:
+    """How probable each is given the logarithms of their evidence, all alike before."""
+    most = max(logarithms.values())
+    weights = {name: float(np.exp(value - most)) for name, value in logarithms.items()}
+    return {name: weight / sum(weights.values()) for name, weight in weights.items()}
+
+
+def posterior_of(model: Model, aligned: Aligned) -> MotionPosterior:
+    """What is to be sampled: of pieces of the trials, the first of each from rest if it is so."""
+    scales = inferred_scales(model, noise_scale(aligned, model))
+    return motion_posterior(model, cut_pieces(aligned, model), scales).with_one_rotation()
+
+
+def cut_pieces(aligned: Aligned, model: Model) -> Segments:
+    return cut(aligned, model, PIECE, begins_at_rest(aligned, model))
+
+
+def begins_at_rest(aligned: Aligned, model: Model) -> bool:
+    """Whether nothing moves beyond the noise in the first tenth of a second of any trial."""
+    frames = max(2, round(STILL / aligned.period))
+    noise = noise_scale(aligned, model)
+    for observed in aligned.observation:
+        early, late = observed[:frames], observed[frames : 2 * frames]
+        if len(late) < frames or not (np.isfinite(early).all() and np.isfinite(late).all()):
+            return False  # nobody knows
+        moved = difference(model, late.mean(axis=0), early.mean(axis=0))
+        if np.any(np.abs(moved) > 4.0 * noise * np.sqrt(2.0 / frames)):
+            return False
+    return True

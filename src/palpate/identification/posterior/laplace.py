@@ -1,0 +1,209 @@
+"""Where a posterior has its modes, and the normal distributions that touch it there.
+
+Fisher scoring with Levenberg's damping from many starts at once: chains then begin where the
+posterior is, with its shape known (Tierney and Kadane, J. Am. Stat. Assoc. 81, 1986).
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+
+from palpate.errors import PalpateError
+from palpate.identification.posterior.likelihood import MotionPosterior, initial_position
+from palpate.identification.samplers.target import Target
+from palpate.numerics.devices import compiled_at_once, over_devices
+
+LONGEST = 1.5  # prior standard deviations that a step may have
+DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
+SETTLED = 0.01  # gain of the density's logarithm in a few steps below which a climb has arrived
+HOPED = 1e3  # gain before the first step: nine refusals in a row do not end a climb
+MOST = 1e13  # information in one direction; the prior's is one
+ROUNDING = 1e-14  # of an eigenvalue by the size of the greatest
+ROUNDS = 3  # in which the start's errors are propagated anew
+WIDE = 2.0  # prior standard deviations: scales while starts are screened
+STARTS, SCREENING = 24, 25  # of a search, and the steps of each
+FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on for
+
+
+class Modes(eqx.Module):
+    """Normal approximations at stationary points, best density first.
+
+    `slope` is the density's, near zero; `covariance` the inverse of the target's curvature, in
+    float64: rounded to float32 that of a narrow ridge is no longer positive definite; `evidence`
+    Laplace's logarithm of the data's density by each mode alone.
+    """
+
+    position: Float[Array, "modes free"]
+    density: Float[Array, " modes"]
+    slope: Float[Array, "modes free"]
+    covariance: Float[np.ndarray | Array, "modes free free"]
+    evidence: Float[Array, " modes"]
+
+    def draw(self, key: PRNGKeyArray, count: int) -> Array:
+        """Draws (count, free) from the mixture, modes weighted by their evidence."""
+        which, where = jax.random.split(key)
+        chosen = jax.random.categorical(which, self.evidence, shape=(count,))
+        noise = jax.random.normal(where, (count, self.position.shape[1]), self.position.dtype)
+        root = np.linalg.cholesky(np.asarray(self.covariance, np.float64))[np.asarray(chosen)]
+        off = np.einsum("nij,nj->ni", root, np.asarray(noise, np.float64))
+        return jnp.asarray(np.asarray(self.position)[np.asarray(chosen)] + off, noise.dtype)
+
+
+def find_modes(target: Target, key: PRNGKeyArray, starts: int = 8, steps: int = 40) -> Modes:
+    """Climb from the prior's centre and `starts` - 1 draws of the prior.
+
+    Raises `PalpateError` when the density is finite at none of them.
+    """
+    noise = jax.random.normal(key, (starts, target.dimension))
+    return climb(target, noise.at[0].set(0.0), steps)
+
+
+def climb(target: Target, position: Float[Array, "starts free"], steps: int = 40) -> Modes:
+    """Climb from given positions; raises `PalpateError` when all of them fail."""
+    return _found(target, climb_each(functools.partial(_each, target), np.asarray(position), steps))
+
+
+def _found(target: Target, modes: Modes) -> Modes:
+    if not np.any(np.isfinite(modes.density)):
+        raise PalpateError(
+            "the likelihood is not finite anywhere a search began: expected data that the model "
+            f"can predict; the coordinates are {', '.join(target.names)}"
+        )
+    return modes
+
+
+def climb_each(
+    curvature: Callable[[Array], tuple[ArrayLike, ...]],
+    position: Float[np.ndarray, "starts free"],
+    steps: int = 40,
+    moving: Bool[np.ndarray, " free"] | None = None,
+) -> Modes:
+    """Climb side by side, with density, slope and `curvature` at positions shaped like these.
+
+    Coordinates that are not `moving`, if that is given, stay where they are.
+    """
+    here = np.array(position, np.float64)
+    moves = np.ones(here.shape[-1]) if moving is None else np.asarray(moving, float)
+    value, slope, information = _finite(curvature, here)
+    damping = np.full(value.shape, DAMPING[0])
+    gained = np.full(value.shape, HOPED)
+    for _ in range(steps):
+        if np.all(gained < SETTLED):
+            break
+        diagonal = np.einsum("...ii->...i", information)
+        matrix = information + np.eye(here.shape[-1]) * (damping[..., None] * diagonal)[..., None]
+        matrix = matrix * np.outer(moves, moves) + np.diag(1.0 - moves)
+        change = np.linalg.solve(matrix, (moves * slope)[..., None])[..., 0]
+        length = np.linalg.norm(change, axis=-1, keepdims=True)
+        proposed = here + change * np.minimum(1.0, LONGEST / (length + 1e-12))
+        after = _finite(curvature, proposed)
+        better = after[0] > value
+        # Over a few steps: one that is refused gains nothing and may be followed by one that does.
+        gain = np.where(better, after[0], value) - np.where(np.isfinite(value), value, -1e300)
+        gained = np.where(np.isfinite(value), np.maximum(0.3 * gained, gain), 0.0)
+        damping = np.clip(np.where(better, damping / 5.0, damping * 8.0), *DAMPING[1:])
+        here[better] = proposed[better]
+        for kept, new in zip((value, slope, information), after, strict=True):
+            kept[better] = new[better]
+    _, volume = np.linalg.slogdet(information / (2.0 * np.pi))
+    order = np.argsort(-value)
+    dtype = jnp.zeros(()).dtype
+
+    def rounded(part: np.ndarray) -> Array:
+        return jnp.asarray(part[order], dtype)
+
+    return Modes(
+        position=rounded(here),
+        density=rounded(value),
+        slope=rounded(slope),
+        covariance=_inverse(information)[order],
+        evidence=rounded(value - 0.5 * volume),
+    )
+
+
+def _inverse(information: Float[np.ndarray, "starts free free"]) -> np.ndarray:
+    """Of what is at least the prior's identity; positive definite however far eigenvalues part."""
+    values, vectors = np.linalg.eigh(information)
+    inverse = (vectors / np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
+
+
+def search(
+    curvature: Callable[[Array], tuple[ArrayLike, ...]],
+    position: Float[np.ndarray, "starts free"],
+    moving: Bool[np.ndarray, " free"],
+) -> Modes:
+    """Climb from many starts for a few steps, and from where the best of them are to the top.
+
+    Most starts of a body that may stick end where it sticks for ever, and climb no further. Only
+    `moving` coordinates climb at first: scales that are free as well would grow until all that
+    happened is the model's discrepancy, and leave most climbs there.
+    """
+    screened = climb_each(curvature, position, SCREENING, moving)
+    return climb_each(curvature, np.asarray(screened.position[:FOLLOWED]), CLIMBING)
+
+
+def look(
+    target: Target, position: Float[np.ndarray, "starts free"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Density, slope and curvature at several positions, in float64.
+
+    A position where any of them is not finite has no density, no slope, and the prior's curvature.
+    """
+    return _finite(functools.partial(_each, target), position)
+
+
+def _finite(
+    curvature: Callable[[Array], tuple[ArrayLike, ...]], position: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    here = jnp.asarray(position, jnp.zeros(()).dtype)
+    value, slope, information = (np.array(x, np.float64) for x in curvature(here))
+    finite = np.isfinite(value) & np.isfinite(slope).all(-1)
+    finite &= np.isfinite(information).all((-2, -1))
+    value[~finite], slope[~finite] = -np.inf, 0.0
+    information[~finite] = np.eye(position.shape[-1])
+    # At least the prior's, which rounding may take away where the data say a million times more;
+    # what is rounding itself beside the most is not known either; and never so much that adding
+    # the prior's is lost and the matrix has no inverse.
+    values, vectors = np.linalg.eigh(information)
+    values[values < ROUNDING * values[..., -1:]] = 1.0
+    scaled = vectors * np.clip(values, 1.0, MOST)[..., None, :]
+    return value, slope, scaled @ np.swapaxes(vectors, -1, -2)
+
+
+def _each(target: Target, position: ArrayLike) -> tuple[np.ndarray, ...]:
+    """Density, slope and curvature at positions, in parts of one size: it is compiled once."""
+    here = np.asarray(position)
+    count, more = len(here), -len(here) % FOLLOWED
+    parts = np.concatenate([here, *[here[-1:]] * more]).reshape(-1, FOLLOWED, here.shape[-1])
+    found = [_look(target, part) for part in parts]
+    return tuple(np.concatenate(of)[:count] for of in zip(*found, strict=True))
+
+
+@compiled_at_once
+def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
+    return over_devices(lambda target, part: target.curvatures(part))(target, position)
+
+
+def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior, Modes]:
+    """Modes, and the target linearised about the best of them, by turns.
+
+    The reference model is among the starts. Raises `PalpateError` when the density is finite at
+    none of them.
+    """
+    noise = jax.random.normal(key, (STARTS, target.dimension))
+    position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
+    parameters = np.arange(target.dimension) < target.parameters
+    position = np.where(parameters, position, WIDE)
+    modes = _found(target, search(functools.partial(_each, target), position, parameters))
+    if target.sensitivity is None:
+        return target, modes
+    for _ in range(ROUNDS - 1):
+        target = target.linearised(modes.position[0])
+        modes = climb(target, modes.position, CLIMBING)
+    return target, modes

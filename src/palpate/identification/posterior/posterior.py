@@ -1,0 +1,348 @@
+"""Bayesian identification of any model with declared priors.
+
+    posterior = identify(model, recording.align(model.control_period), at_rest=True)
+    posterior.table                    # medians, intervals, R-hat, what the data left undecided
+    posterior.predict(cut(held_out, model, 2.0, at_rest=True))
+
+The likelihood is that of `likelihood`, of pieces of a second or so; chains begin at the posterior's
+modes, and walk it in steps of its local shape (`local_global`), or are those of the no-U-turn
+sampler (`hamiltonian`) where there are too many coordinates to learn proposals in.
+Other samplers of the same target: Metropolis (`metropolis`), tempered particles with evidence
+(`tempered`), and particles that follow data as they arrive (`online`).
+"""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from palpate.errors import PalpateError
+from palpate.identification.data.segments import Segments, cut, noise_scale
+from palpate.identification.posterior import predictive
+from palpate.identification.posterior.diagnostics import FEWEST, bulk_size, rhat, tail_size
+from palpate.identification.posterior.likelihood import (
+    MotionPosterior,
+    inferred_scales,
+    motion_posterior,
+)
+from palpate.identification.posterior.predictive import Predicted, Score
+from palpate.identification.posterior.settled import Settled, factors_of, joined, settle_each
+from palpate.identification.samplers.draws import Draws
+from palpate.identification.samplers.hamiltonian import no_u_turn
+from palpate.identification.samplers.local_global import CHAINS, compiled_meanwhile, local_global
+from palpate.identification.verdicts import UNDECIDED
+from palpate.models.model import Model
+from palpate.parameters import value_of
+from palpate.recordings import Aligned
+
+MIXED, ENOUGH = 1.01, 400.0  # R-hat and effective sizes that chains should reach (Vehtari et al.)
+WIDEST = 40  # coordinates among which a mixture that proposes can be learnt
+PRIOR_DRAWS = 1000  # that the posterior's spread is held against
+PREDICTING = 400  # draws that a prediction is made of
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One coordinate of a posterior, in the parameter's own unit.
+
+    `lower` to `upper` holds 90 % of the draws; `share` is the posterior's standard deviation over
+    the prior's, both in whitened coordinates: 1 says that the data told nothing.
+    """
+
+    name: str
+    unit: str
+    about: str
+    median: float
+    lower: float
+    upper: float
+    share: float
+    rhat: float
+    bulk: float
+    tail: float
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the data left this where the prior had it."""
+        return self.share > UNDECIDED
+
+
+@dataclasses.dataclass(frozen=True)
+class Posterior:
+    """Draws of a model's parameters given recordings, and how far to trust them.
+
+    `probes` are the pieces at whose ends the chains' predictions are compared: labels of wheels
+    may swap between draws that predict the same.
+    """
+
+    settled: Settled
+    draws: Draws
+    probes: Segments
+
+    @property
+    def target(self) -> MotionPosterior:
+        """What was sampled."""
+        return self.settled.target
+
+    @property
+    def flat(self) -> Float[np.ndarray, "draws free"]:
+        """Draws of all chains in whitened coordinates, chain after chain."""
+        return self.draws.position.reshape(-1, self.draws.position.shape[-1])
+
+    def thinned(self, count: int) -> Float[np.ndarray, "count free"]:
+        """About evenly spaced draws over all chains."""
+        return self.flat[spread_out(len(self.flat), count)]
+
+    def models(self, count: int | None = None) -> Model:
+        """Legal models as one, all draws or about `count` evenly spaced; free parameters lead.
+
+        What is fixed has no batch axis.
+        """
+        return self.target.models(jnp.asarray(self.flat if count is None else self.thinned(count)))
+
+    @cached_property
+    def prior(self) -> Model:
+        """Models as one, as `models`, of draws from the prior."""
+        return self.target.models(self._prior_draws)
+
+    @cached_property
+    def _prior_draws(self) -> Float[Array, "draws free"]:
+        return jax.random.normal(jax.random.key(0), (PRIOR_DRAWS, self.target.dimension))
+
+    @cached_property
+    def values(self) -> dict[str, Float[np.ndarray, "chains draws ..."]]:
+        """Legal values of the free parameters by path, in their units."""
+        models = self.models()
+        lead = self.draws.position.shape[:2]
+        found = {}
+        for path in self.target.coordinates.declarations:
+            value = np.asarray(value_of(models, path))
+            found[path] = value.reshape(*lead, *value.shape[1:])
+        return found
+
+    @cached_property
+    def predictions(self) -> Float[np.ndarray, "chains draws segments ..."]:
+        """What each draw says is observed at the end of each probe, without noise."""
+        return predictive.final_poses(self.target, self.draws.position, self.probes)
+
+    @cached_property
+    def rhat_of_predictions(self) -> float:
+        """Greatest R-hat over everything observed at the ends of the probes."""
+        return float(np.max(rhat(self.predictions)))
+
+    @cached_property
+    def size_of_predictions(self) -> float:
+        """Least effective sample size, bulk and tail, over the ends of the probes."""
+        return float(min(np.min(bulk_size(self.predictions)), np.min(tail_size(self.predictions))))
+
+    @cached_property
+    def table(self) -> tuple[Row, ...]:
+        """A row for each coordinate: the parameters by element, then the noise scales."""
+        position = self.draws.position
+        legal = _legal(self.target, jnp.asarray(self.flat))
+        share = np.std(legal, axis=0) / np.std(_legal(self.target, self._prior_draws), axis=0)
+        judged = rhat(position), bulk_size(position), tail_size(position)
+        values = self._by_name()
+        rows = []
+        for index, name in enumerate(self.target.names):
+            unit, about, draws = values[name]
+            lower, median, upper = np.quantile(draws, (0.05, 0.5, 0.95))
+            rows.append(
+                Row(
+                    name, unit, about, float(median), float(lower), float(upper),
+                    float(share[index]), *(float(column[index]) for column in judged),
+                )
+            )  # fmt: skip
+        return tuple(rows)
+
+    @property
+    def undecided(self) -> tuple[str, ...]:
+        """Names of the coordinates that the data left where the prior had them."""
+        return tuple(row.name for row in self.table if row.undecided)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """How far not to trust this posterior, a sentence each; none when there is no reason."""
+        said = []
+        if self.rhat_of_predictions >= MIXED:
+            said.append(
+                f"the chains do not agree on what will happen: R-hat of predictions is "
+                f"{self.rhat_of_predictions:.3f}, expected below {MIXED}; draw more, or compare "
+                "hypotheses if there are several modes"
+            )
+        if self.size_of_predictions < ENOUGH:
+            said.append(
+                f"predictions rest on {self.size_of_predictions:.0f} effective draws, expected at "
+                f"least {ENOUGH:.0f}: draw more"
+            )
+        unmixed = [row.name for row in self.table if row.rhat >= MIXED]
+        if unmixed:
+            said.append(
+                f"the chains differ on {', '.join(unmixed)}: if predictions agree, labels that "
+                "mean the same motion were swapped, and only the predictions should be read"
+            )
+        if self.draws.divergences:
+            said.append(
+                f"{self.draws.divergences} of {self.draws.density.size} trajectories diverged: "
+                "the posterior has corners that were not explored, and intervals may be too narrow"
+            )
+        if self.undecided:
+            said.append(
+                f"the data say next to nothing of {', '.join(self.undecided)}: what is printed "
+                "for them is the prior"
+            )
+        return tuple(said)
+
+    def predict(self, segments: Segments, count: int = PREDICTING, seed: int = 0) -> Predicted:
+        """Predict pieces with about `count` draws; see `predictive.predict`."""
+        return predictive.predict(self.target, self.thinned(count), segments, seed)
+
+    def score(self, segments: Segments, count: int = PREDICTING, seed: int = 0) -> Score:
+        """Coverage, log score and errors on pieces it was not fitted to."""
+        return predictive.score(self.target, self.predict(segments, count, seed), segments)
+
+    def _by_name(self) -> dict[str, tuple[str, str, np.ndarray]]:
+        """Unit, meaning and values (chains x draws) of each coordinate."""
+        found = {}
+        for path, declaration in sorted(self.target.coordinates.declarations.items()):
+            values = self.values[path]
+            first = values.reshape(*values.shape[:2], -1)
+            if declaration.shared or values.ndim == 2:
+                found[path] = declaration.unit, declaration.about, first[..., 0]
+                continue
+            for index in np.ndindex(values.shape[2:]):
+                name = f"{path}[{', '.join(map(str, index))}]"
+                element = values[(..., *index)]
+                found[name] = declaration.unit, declaration.about, element
+        noise, growth = (np.asarray(x) for x in _scales(self.target, jnp.asarray(self.flat)))
+        scales = self.target.scales
+        for kind, of, values in (
+            ("noise", scales.of_channel, noise),
+            ("discrepancy", scales.of_channel, growth),
+        ):
+            labels = [label for label in scales.labels if label.startswith(kind)]
+            for group, label in enumerate(labels):
+                unit = label.partition("(")[2].removesuffix(")")
+                about = "sensor noise" if kind == "noise" else "what the model does not explain"
+                found[label] = unit, about, values[:, of.index(group)]
+        return found
+
+
+def spread_out(size: int, count: int | None = None) -> Int[np.ndarray, " count"]:
+    """Indices of about `count` of `size` draws, evenly spaced; of all where no count is given."""
+    count = size if count is None else min(count, size)
+    return np.linspace(0, size - 1, count).round().astype(int)
+
+
+def identify(
+    model: Model,
+    aligned: Aligned,
+    *,
+    seconds: float = 1.0,
+    at_rest: bool = False,
+    chains: int = CHAINS,
+    draws: int = 100,
+    seed: int = 0,
+    probes: Segments | None = None,
+    tell: Callable[[int, int], None] = lambda done, blocks: None,
+) -> Posterior:
+    """Infer a model's free parameters and the noise scales from aligned trials.
+
+    Trials are cut into pieces of `seconds`; `at_rest` says that each begins at rest. Chains are
+    compared by what they predict at the ends of `probes`, by default the pieces themselves.
+    `tell(done, blocks)` is called as the sampling goes on. The same seed gives the same draws.
+
+    Raises `PalpateError` when no piece can be cut, the likelihood is not finite anywhere, or so few
+    chains or draws are asked for that they cannot be judged.
+    """
+    check_numbers(chains, draws)
+    segments = cut(aligned, model, seconds, at_rest)
+    scales = inferred_scales(model, noise_scale(aligned, model))
+    target = motion_posterior(model, segments, scales).with_one_rotation()
+    return sample(target, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+
+
+def sample(
+    target: MotionPosterior,
+    *,
+    chains: int = CHAINS,
+    draws: int = 100,
+    seed: int = 0,
+    probes: Segments | None = None,
+    tell: Callable[[int, int], None] = lambda done, blocks: None,
+) -> Posterior:
+    """As `identify`, for a target that was made apart."""
+    check_numbers(chains, draws)
+    climbing, _ = jax.random.split(jax.random.key(seed))
+    with preparing(target, chains):
+        settled = settle_each(target, climbing)
+    return draw(settled, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+
+
+def preparing(target: MotionPosterior, chains: int) -> AbstractContextManager[None]:
+    """Within it modes may be searched for, while the sampler of such a target is compiled."""
+    first, _ = factors_of(target)[0]
+    if first.dimension > WIDEST:
+        return contextlib.nullcontext()
+    return compiled_meanwhile(first, chains)
+
+
+def draw(
+    settled: Settled,
+    *,
+    chains: int = CHAINS,
+    draws: int = 100,
+    seed: int = 0,
+    probes: Segments | None = None,
+    tell: Callable[[int, int], None] = lambda done, blocks: None,
+) -> Posterior:
+    """As `sample`, for a target whose modes are known."""
+    check_numbers(chains, draws)
+    _, sampling = jax.random.split(jax.random.key(seed))
+    found = []
+    for number, part in enumerate(settled.parts):
+        sampler = local_global if part.target.dimension <= WIDEST else no_u_turn
+        key = jax.random.fold_in(sampling, number) if number else sampling
+        told = functools.partial(_told, tell, number, len(settled.parts))
+        found.append(sampler(part.target, part.modes, key, chains, draws, told))
+    every = joined(settled, found, jax.random.fold_in(sampling, len(found)))
+    return Posterior(settled, every, settled.target.segments if probes is None else probes)
+
+
+def _told(tell: Callable[[int, int], None], part: int, parts: int, done: int, rounds: int) -> None:
+    """Tell how much is done of all parts, when so much is of one."""
+    tell(part * rounds + done, parts * rounds)
+
+
+def check_numbers(chains: int, draws: int) -> None:
+    """Raise `PalpateError` for so few chains or draws that nothing says how far to trust them."""
+    if chains < 1 or draws < FEWEST:
+        raise PalpateError(
+            f"expected at least 1 chain of {FEWEST} draws, by which it can be judged, got {chains} "
+            f"of {draws}: {CHAINS} of 100 are usual"
+        )
+
+
+@eqx.filter_jit
+def _legal(target: MotionPosterior, position: Array) -> Array:
+    """Whitened coordinates of the legal models, noise scales as they are."""
+    flat, unravel = ravel_pytree(target.coordinates.initial)
+
+    def one(position: Array) -> Array:
+        projected = target.coordinates.project(unravel(position[: flat.size]))
+        return jnp.concatenate([ravel_pytree(projected)[0], position[flat.size :]])
+
+    return jax.vmap(one)(position)
+
+
+@eqx.filter_jit
+def _scales(target: MotionPosterior, position: Array) -> tuple[Array, Array]:
+    return jax.vmap(target.noise)(position), jax.vmap(target.growth)(position)

@@ -1,0 +1,1 @@
+"""Predictions learnt from examples without physics."""

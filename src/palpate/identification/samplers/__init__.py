@@ -1,0 +1,1 @@
+"""Markov chains and particles that sample any posterior."""

@@ -1,0 +1,1 @@
+"""A rope in pictures and among markers."""

@@ -1,0 +1,1 @@
+"""Maps to plan on: what stands where, and how files of several kinds say it."""

@@ -1,0 +1,330 @@
+"""Robot, objects, start and goals as JSON or YAML says them: our own maps and side-car files.
+
+A map file holds everything; a side-car `NAME.movables.json` (or .yaml) adds what a drawing or an
+occupancy grid cannot say. Every other key than these is refused:
+
+    a map of our own    format, robot, start, bounds, cell_size; maybe name, movables, goals,
+                        margin, walls
+    beside a grid       robot, start; maybe movables, goals, margin, cell_size
+    beside a drawing    movables, and of them only hints: {name: {hints: {...}}}
+
+    robot:     {radius} or {footprint: [[x, y], ...]}; maybe drive, reach,
+               push_only
+    movables:  {name: [[x, y], ...]} or {name: {polygon: [[x, y], ...]}}, maybe with pose, hints
+    start, each of goals, pose:  [x, y, theta]
+    bounds:    [left, bottom, right, top]
+    walls:     [[[x, y], ...], ...], each an outline or {outline, holes}
+
+A polygon is in the world; one with a `pose` is in body coordinates, whose origin is put at x, y and
+which are turned by theta, wherever the centroid is.
+"""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from palpate.errors import PalpateError
+from palpate.numerics.polygons import (
+    LEAST_AREA,
+    centred,
+    checked_polygon,
+    checked_pose,
+    circumscribed_radius,
+    corners_of,
+    listed,
+    placed,
+    shown,
+)
+from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose, Robot, map_of
+from palpate.runs.storage import read_json, write_json
+
+FORMAT = "palpate map 1"
+SIDE_CAR = ".movables"
+_LARGEST = 5_000_000  # bytes of YAML
+_DEEPEST = 50  # collections in collections
+GRID_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin"}
+_MAP_KEYS = GRID_KEYS | {"bounds", "walls", "format", "name"}
+_DRAWING_KEYS = {"movables"}
+_ROBOT_KEYS = {"radius", "footprint", "drive", "reach", "push_only"}
+_TRUTHS = {"yes": True, "on": True, "true": True, "1": True}
+_TRUTHS |= {"no": False, "off": False, "false": False, "0": False}
+_CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
+
+
+def read_described(path: str | Path) -> Map:
+    """A map of our own format; raises `PalpateError` for a file that is none."""
+    path = Path(path)
+    content = checked_keys(read_json(path), str(path), _MAP_KEYS)
+    if content.get("format") != FORMAT:
+        raise PalpateError(
+            f"{path} has the format {shown(content.get('format'))}: expected {FORMAT!r}, as "
+            "`write_map` writes it"
+        )
+    for key in ("robot", "start", "bounds", "cell_size"):
+        if key not in content:
+            raise PalpateError(f"{path} lacks {key}")
+    walls = content.get("walls", [])
+    if not isinstance(walls, list):
+        raise PalpateError(f"{path} has walls that are no list of outlines")
+    name = content.get("name", path.stem)
+    if not isinstance(name, str):
+        raise PalpateError(f"{path} has the name {shown(name)}: expected a text")
+    return map_of(
+        name,
+        walls=shapely.union_all([_wall(wall, f"wall {k}") for k, wall in enumerate(walls)]),
+        movables=movables_from(content.get("movables", {}), str(path)),
+        robot=robot_from(content["robot"], str(path)),
+        start=content["start"],
+        goals=goals_from(content.get("goals", []), str(path)),
+        bounds=_bounds(content["bounds"], str(path)),
+        cell_size=number(content["cell_size"], f"cell_size of {path}"),
+        margin=None if "margin" not in content else number(content["margin"], f"margin of {path}"),
+    )
+
+
+def write_map(path: str | Path, world: Map) -> None:
+    """Put a map into a JSON file that `read_described` reads back.
+
+    Objects are written as outlines about their centroids, with their poses; pieces of walls and
+    holes in them of less than a square millimetre, which no reader takes, are left out.
+    """
+    robot: dict[str, Any] = {"radius": world.robot.radius, "drive": world.robot.drive}
+    if world.robot.reach is not None:
+        robot["reach"] = world.robot.reach
+    if world.robot.push_only:
+        robot["push_only"] = True
+    walls = [
+        {
+            "outline": np.asarray(part.exterior.coords)[:-1],
+            "holes": [
+                np.asarray(hole.coords)[:-1]
+                for hole in part.interiors
+                if shapely.Polygon(hole).area >= LEAST_AREA
+            ],
+        }
+        for part in shapely.get_parts(world.walls)
+        if part.area >= LEAST_AREA
+    ]
+    movables = {
+        name: {"polygon": movable.outline, "pose": movable.pose, "hints": dict(movable.hints)}
+        for name, movable in world.movables.items()
+    }
+    write_json(
+        path,
+        {
+            "format": FORMAT,
+            "name": world.name,
+            "bounds": world.bounds,
+            "cell_size": world.cell_size,
+            "margin": world.margin,
+            "robot": robot,
+            "start": world.start,
+            "goals": world.goals,
+            "walls": walls,
+            "movables": movables,
+        },
+    )
+
+
+def side_car(path: Path, known: set[str]) -> dict[str, Any]:
+    """What stands beside a map's file, as `NAME.movables.json` or .yaml; empty if nothing does.
+
+    Raises `PalpateError` for two of them, and for other keys than `known`.
+    """
+    suffixes = (".json", ".yaml", ".yml")
+    every = [path.with_name(path.stem + SIDE_CAR + suffix) for suffix in suffixes]
+    found = [beside for beside in every if beside.exists()]
+    if len(found) > 1:
+        raise PalpateError(f"{found[0]} and {found[1]} are of the same map: expected one of them")
+    if not found:
+        return {}
+    beside = found[0]
+    content = read_json(beside) if beside.suffix == ".json" else read_yaml(beside)
+    return checked_keys(content, str(beside), known)
+
+
+def with_hints(world: Map, path: Path) -> Map:
+    """A drawing's map with what the side-car of its file says of the objects' dynamics.
+
+    Raises `PalpateError` for a side-car that says anything else, and for hints on an object that
+    is not on the map.
+    """
+    what = f"the side-car of {path}"
+    given = _mapping(side_car(path, _DRAWING_KEYS).get("movables", {}), f"movables in {what}")
+    movables = dict(world.movables)
+    for key, item in given.items():
+        name = str(key)
+        if name not in movables:
+            raise PalpateError(
+                f"{what} has hints for {shown(name)}, which is not on the map; there are: "
+                + listed(world.movables)
+            )
+        said = checked_keys(item, f"movable {shown(name)} in {what}", {"hints"})
+        hints = _hints(said.get("hints"), f"hints of {shown(name)} in {what}")
+        movables[name] = dataclasses.replace(movables[name], hints=hints)
+    return dataclasses.replace(world, movables=movables)
+
+
+def read_yaml(path: Path) -> Any:
+    """The plain data of a YAML file; raises `PalpateError` for tags, and for what is no YAML.
+
+    Aliases are refused as well: a few lines of them stand for gigabytes.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
+
+    try:
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:  # no path has a null character
+        reason = getattr(error, "strerror", None) or error
+        raise PalpateError(f"cannot read {path}: {reason}") from error
+    if len(content) > _LARGEST:
+        raise PalpateError(f"{path} is of {len(content)} bytes: expected at most {_LARGEST}")
+    try:
+        events = YAML(typ="safe", pure=True).parse(content) if b"*" in content else ()
+        depth = 0
+        for event in events:  # before the load, which is where they grow
+            depth += isinstance(event, CollectionStartEvent)
+            depth -= isinstance(event, CollectionEndEvent)
+            if depth > _DEEPEST:
+                raise PalpateError(f"{path} is nested more than {_DEEPEST} deep")
+            if isinstance(event, AliasEvent):
+                raise PalpateError(
+                    f"{path} has the alias {shown(event.anchor)}: expected what it stands for"
+                )
+        return YAML(typ="safe", pure=True).load(content)
+    except PalpateError:
+        raise
+    except (YAMLError, ValueError, LookupError, ArithmeticError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise PalpateError(f"{path} is no plain YAML: {reason}") from error
+
+
+# --- parts ------------------------------------------------------------------------------------
+
+
+def checked_keys(content: Any, what: str, known: set[str]) -> dict[str, Any]:
+    """A mapping with no other keys; raises `PalpateError` otherwise."""
+    if not isinstance(content, Mapping):
+        raise PalpateError(f"{what} holds a {type(content).__name__}: expected keys and values")
+    unknown = sorted({str(key) for key in content} - known)
+    if unknown:
+        raise PalpateError(
+            f"{what} has the unknown key {shown(unknown[0])}; there are: "
+            + ", ".join(sorted(known))
+        )
+    return dict(content)
+
+
+def robot_from(content: Any, what: str) -> Robot:
+    """The robot that `content` describes; see the head of this file."""
+    item = checked_keys(content, f"robot of {what}", _ROBOT_KEYS)
+    if ("radius" in item) == ("footprint" in item):
+        raise PalpateError(f"robot of {what}: expected either a radius or a footprint")
+    outline = None
+    if "footprint" in item:
+        outline = corners_of(checked_polygon(item["footprint"], f"the robot's footprint in {what}"))
+        radius = circumscribed_radius(outline)
+    else:
+        radius = number(item["radius"], f"the robot's radius in {what}")
+    reach = None if item.get("reach") is None else number(item["reach"], f"reach in {what}")
+    push_only = truth(item.get("push_only", False), f"push_only in {what}")
+    return Robot(radius, str(item.get("drive", "differential")), reach, outline, push_only)
+
+
+def movables_from(content: Any, what: str) -> list[Movable]:
+    """The objects that `content` describes; see the head of this file."""
+    movables = []
+    for key, value in _mapping(content, f"movables of {what}").items():
+        name = str(key)
+        called = f"movable {shown(name)} of {what}"
+        item: Any = value if isinstance(value, Mapping) else {"polygon": value}
+        item = checked_keys(item, called, {"polygon", "pose", "hints"})
+        if "polygon" not in item:
+            raise PalpateError(f"{called} lacks its polygon: expected [[x, y], ...] in m")
+        hints = _hints(item.get("hints"), f"hints of {called}")
+        if "pose" in item:
+            pose = checked_pose(item["pose"], f"the pose of {called}")
+            movables.append(_at(name, item["polygon"], pose, hints, called))
+        else:
+            movables.append(Movable.from_corners(name, item["polygon"], hints))
+    return movables
+
+
+def _at(name: str, corners: Any, pose: Pose, hints: dict[str, Any], what: str) -> Movable:
+    """An object from corners in body coordinates, whose origin is put at `pose`."""
+    polygon = checked_polygon(corners, what)
+    outline, centroid = centred(polygon)
+    if np.linalg.norm(centroid) <= _CENTRED:  # as `write_map` writes it: the same numbers again
+        return Movable(name, corners_of(polygon), pose, hints)
+    ((x, y),) = placed(np.array([centroid]), pose)
+    return Movable(name, outline, (float(x), float(y), pose[2]), hints)
+
+
+def goals_from(content: Any, what: str) -> list[Any]:
+    """A list of goal poses; raises `PalpateError` for anything else."""
+    if not isinstance(content, list):
+        raise PalpateError(f"goals of {what}: expected a list of [x, y, theta]")
+    return content
+
+
+def number(value: Any, what: str) -> float:
+    """A finite number; raises `PalpateError` for anything else."""
+    found = math.nan
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
+            found = float(value)
+    if not math.isfinite(found):
+        raise PalpateError(f"{what} is {shown(value)}: expected a number")
+    return found
+
+
+def truth(value: Any, what: str) -> bool:
+    """0, 1, true or false; also those in a string, and the words that are truths in YAML 1.1."""
+    if isinstance(value, str) and value.strip().lower() in _TRUTHS:
+        return _TRUTHS[value.strip().lower()]
+    if isinstance(value, bool | int) and value in (0, 1):
+        return bool(value)
+    raise PalpateError(f"{what} is {shown(value)}: expected 0, 1, true or false")
+
+
+def _mapping(content: Any, what: str) -> Mapping[Any, Any]:
+    if not isinstance(content, Mapping):
+        raise PalpateError(
+            f"{what} are of type {type(content).__name__}: expected names with polygons or hints"
+        )
+    return content
+
+
+def _hints(content: Any, what: str) -> dict[str, Any]:
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise PalpateError(f"{what} are {shown(content)}: expected keys and values")
+    return dict(content)
+
+
+def _bounds(value: Any, what: str) -> tuple[float, float, float, float]:
+    if not isinstance(value, list) or len(value) != 4:
+        raise PalpateError(f"bounds of {what}: expected [left, bottom, right, top] in m")
+    left, bottom, right, top = (number(side, f"bounds of {what}") for side in value)
+    return left, bottom, right, top
+
+
+def _wall(value: Any, what: str) -> BaseGeometry:
+    item = value if isinstance(value, Mapping) else {"outline": value}
+    item = checked_keys(item, what, {"outline", "holes"})
+    outline = checked_polygon(item.get("outline", []), what)
+    holes = item.get("holes", [])
+    if not isinstance(holes, list):
+        raise PalpateError(f"{what} has holes that are no list of outlines")
+    every = [checked_polygon(hole, f"a hole of {what}") for hole in holes]
+    return outline.difference(shapely.union_all(every)) if every else outline

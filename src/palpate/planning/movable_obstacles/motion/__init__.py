@@ -1,0 +1,1 @@
+"""What objects and the robot do when one moves the other: carrying, constraints, belief."""

@@ -1,0 +1,143 @@
+"""Planning with a belief of how objects move: the draws of a posterior, each with its constraint.
+
+What comes of a motion of a hand that is driven by velocity and limited in force is, for a piece
+that moves slowly, decided by the constraint and by what it takes to overcome friction: the object
+follows where its wheels and anchors let it, and else stays where it is. Inertia is left out,
+because a hand at a quarter of a metre a second has time to overcome it.
+"""
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate.numerics.polygons import placed
+from palpate.planning.movable_obstacles.maps.map import Movable
+from palpate.planning.movable_obstacles.motion.manipulation import (
+    BACKWARD,
+    FORWARD,
+    LEFT,
+    RIGHT,
+    Grasp,
+    Motion,
+    Primitive,
+    base_poses,
+    carried,
+    outline_grasps,
+)
+from palpate.planning.movable_obstacles.motion.primitives import (
+    AXIS,
+    FACING,
+    FREE,
+    LEVER,
+    Constraint,
+    Turn,
+    grasp_share,
+    turns,
+    twist,
+)
+
+YIELDING = 0.35  # of the hand's way may go against a constraint: the hand gives way that much
+SPACING = 0.3  # m between grasps
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is believed of one object: a constraint for each draw, and the belief's version."""
+
+    constraints: tuple[Constraint, ...]
+    version: int = 0
+
+
+class ConstrainedManipulation:
+    """A `ManipulationModel` of draws by object name; `force` in N is the most that the hand exerts.
+
+    Every object has as many draws. With one draw each it is a planner that knows, or thinks so.
+    """
+
+    def __init__(self, drawn: Mapping[str, Drawn], force: float) -> None:
+        self.drawn = dict(drawn)
+        self.force = force
+        self.draws = len(next(iter(self.drawn.values())).constraints)
+        self._turns: dict[tuple[str, int], list[Turn]] = {}
+
+    def belief(self, name: str) -> Hashable:
+        """The version of what is believed of it."""
+        return self.drawn[name].version
+
+    def grasps(self, movable: Movable, spacing: float) -> Sequence[Grasp]:
+        """Points on the outline where any draw would hold it."""
+        every = outline_grasps(movable.outline, max(spacing, SPACING))
+        shares = [grasp_share(one, every) for one in set(self.drawn[movable.name].constraints)]
+        total = np.sum(shares, axis=0)
+        return [grasp for grasp, share in zip(every, total, strict=True) if share > 0]
+
+    def primitives(self, movable: Movable, grasp: Grasp, drive: str) -> Sequence[Primitive]:
+        """What moves it in any draw: straight if one is free or along an axis, and turns."""
+        drawn = self.drawn[movable.name]
+        key = movable.name, drawn.version
+        if key not in self._turns:
+            self._turns[key] = turns(drawn.constraints)
+        if any(one.kind == FREE for one in drawn.constraints):
+            return [BACKWARD, FORWARD, LEFT, RIGHT, *self._turns[key]]
+        straight: list[Primitive] = []
+        axes = [one.direction for one in drawn.constraints if one.kind == AXIS]
+        across = np.abs(np.cos(grasp.normal - np.array(axes)))
+        if (across > FACING).any():
+            straight += [BACKWARD, FORWARD]
+        if (np.sqrt(1 - across**2) > FACING).any():
+            straight += [LEFT, RIGHT]
+        turned = [one for one in self._turns[key] if math.dist(grasp.point, one.anchor) >= LEVER]
+        return [*straight, *turned]
+
+    def motion(
+        self,
+        movable: Movable,
+        object_pose: np.ndarray,
+        robot_pose: np.ndarray,
+        primitive: Primitive,
+        lengths: np.ndarray,
+        draw: int,
+    ) -> Motion:
+        """See `ManipulationModel.motion`; the arm keeps its posture, so the base goes with it."""
+        constraint = self.drawn[movable.name].constraints[draw]
+        if isinstance(primitive, Turn):
+            x, y = primitive.anchor
+            wanted = primitive.turn * np.array([y, -x, 1.0])
+            hand = placed(np.array([primitive.anchor]), object_pose)[0] - robot_pose[:2]
+            lever = float(np.hypot(*hand))
+        else:
+            step = base_poses(robot_pose, primitive, np.ones(1))[0] - robot_pose
+            wanted, lever = _into_body(step, object_pose[2]), 0.0
+        rate = twist(constraint, wanted, lever, YIELDING)
+        if constraint.force > self.force:
+            rate = np.zeros(3)
+        objects = swept(object_pose, rate, lengths)
+        # The robot keeps its place by the object, as the object keeps its place in the hand.
+        robots = carried(robot_pose, object_pose, objects)
+        return Motion(objects, robots, constraint.force * _way(objects, object_pose))
+
+
+def swept(pose: np.ndarray, rate: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Poses (steps, 3) after a constant twist (3,) of the body frame for `lengths` (steps,)."""
+    angle = rate[2] * lengths
+    if rate[2]:
+        sine, versine = np.sin(angle) / rate[2], (1 - np.cos(angle)) / rate[2]
+    else:
+        sine, versine = lengths, np.zeros_like(lengths)
+    local = np.stack([rate[0] * sine - rate[1] * versine, rate[0] * versine + rate[1] * sine], -1)
+    cosine, turned = math.cos(pose[2]), math.sin(pose[2])
+    world = local @ np.array([[cosine, turned], [-turned, cosine]])
+    return np.concatenate([pose[:2] + world, (pose[2] + angle)[:, None]], axis=1)
+
+
+def _into_body(step: np.ndarray, angle: float) -> np.ndarray:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return np.array([cosine * step[0] + sine * step[1], cosine * step[1] - sine * step[0], step[2]])
+
+
+def _way(poses: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """How far the centroid has gone at each step, m."""
+    steps = np.diff(np.vstack([start, poses])[:, :2], axis=0)
+    return np.cumsum(np.linalg.norm(steps, axis=1))

@@ -1,0 +1,294 @@
+"""What a planner hands out: where to drive, what to carry where; and whether that still holds."""
+
+import time
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from palpate.errors import PalpateError
+from palpate.numerics.polygons import corners_of, length_of, lines, placed, polygons
+from palpate.planning.movable_obstacles.maps.map import Map, Pose
+from palpate.planning.movable_obstacles.motion.collisions import SHRUNK, TOUCHING
+from palpate.planning.movable_obstacles.motion.manipulation import Grasp
+from palpate.runs.storage import read_json, write_json
+
+TRANSIT, TRANSFER = "transit", "transfer"
+FORMAT = "palpate plan among movable obstacles 1"
+_TOLERANCE = 1e-5  # m: of clearances that are compared
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One stretch of a plan: driving alone ("transit"), or with an object ("transfer").
+
+    `poses` (points, 3) are the robot's: corners of a way that is straight between them in a
+    transit, every step in a transfer, where `object_poses` (points, 3) goes with them. m and rad.
+    `cost` is in metres as planning counts them, `energy` in J, `probability` that of success.
+    """
+
+    kind: str
+    poses: np.ndarray
+    cost: float
+    name: str | None = None
+    grasp: Grasp | None = None
+    object_poses: np.ndarray | None = None
+    primitives: tuple[str, ...] = ()
+    probability: float = 1.0
+    energy: float = 0.0
+
+    @property
+    def distance(self) -> float:
+        """That the robot drives, m."""
+        return length_of(self.poses)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Segments from the start to the goal, on the map named `map_name`.
+
+    `planning_s` is the wall time it took; `regions`, `borders`, `evaluations` and `sweeps` say of
+    what size the problem was: free regions, borders between abstract states, abstract actions that
+    got rollouts, sweeps of value iteration. `beliefs` is what the model believed of the objects
+    that are moved; it is not written to files.
+    """
+
+    map_name: str
+    goal: Pose
+    segments: tuple[Segment, ...]
+    planning_s: float
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    beliefs: Mapping[str, Hashable] = field(default_factory=dict)
+
+    # --- figures ------------------------------------------------------------------------------
+
+    @property
+    def distance(self) -> float:
+        """That the robot drives in all, carrying or not, m."""
+        return sum((segment.distance for segment in self.segments), 0.0)
+
+    @property
+    def carried(self) -> float:
+        """That the robot drives while it carries something, m."""
+        return sum((s.distance for s in self.segments if s.kind == TRANSFER), 0.0)
+
+    @property
+    def object_distance(self) -> float:
+        """That the objects' centroids are moved in all, m: more than `carried` where they turn."""
+        bodies = [s.object_poses for s in self.segments if s.object_poses is not None]
+        return sum(map(length_of, bodies), 0.0)
+
+    @property
+    def transfers(self) -> int:
+        """How often an object is taken up."""
+        return sum(segment.kind == TRANSFER for segment in self.segments)
+
+    @property
+    def moved(self) -> list[str]:
+        """The objects that are moved, in that order, each once."""
+        return list(dict.fromkeys(s.name for s in self.segments if s.name is not None))
+
+    @property
+    def probability(self) -> float:
+        """That all of it succeeds as planned."""
+        return float(np.prod([segment.probability for segment in self.segments]))
+
+    def leaves(self, world: Map) -> Map:
+        """The map after the plan was carried out on it: objects moved, the robot at the goal."""
+        last = {
+            s.name: s.object_poses[-1]
+            for s in self.segments
+            if s.name is not None and s.object_poses is not None
+        }
+        x, y, theta = (float(value) for value in self.segments[-1].poses[-1])
+        return world.moved(last, (x, y, theta))
+
+    def path_efficiency(self, direct: float) -> float:
+        """Interactive Gibson's (Xia et al. 2020), 0 to 1: the shortest way over the one taken.
+
+        `direct` (m) is the shortest way with no movable there.
+        """
+        return min(1.0, direct / self.distance) if self.distance > 0 else 1.0
+
+    # --- validity -----------------------------------------------------------------------------
+
+    def valid_on(self, world: Map, begin: int = 0) -> bool:
+        """Whether the segments from index `begin` on can still be carried out on that map."""
+        return self.conflict_on(world, begin) is None
+
+    def conflict_on(self, world: Map, begin: int = 0) -> tuple[int, str] | None:
+        """The first segment that cannot be carried out, and what is in its way; None if all can.
+
+        Objects are where the map has them, and where earlier segments leave them. Ways are
+        checked exactly, transfers at every step; both end-points may be as near to something as
+        they are. A few milliseconds.
+        """
+        standing = {name: movable.polygon for name, movable in world.movables.items()}
+        for index in range(begin, len(self.segments)):
+            segment = self.segments[index]
+            held = segment.name
+            if held is not None and held not in world.movables:
+                return index, f"there is no '{held}'"
+            beside = [s.name for s in self.segments[max(begin, index - 1) : index + 2]]
+            touched = {name for name in beside if name is not None}
+            obstacles = [shape for name, shape in standing.items() if name != held]
+            hit = _way_hit(segment, world, standing, touched, held)
+            if hit is None and held is not None:
+                assert segment.object_poses is not None
+                expected = world.movables[held].polygon_at(segment.object_poses[0])
+                off = expected.hausdorff_distance(standing[held])
+                if not expected.intersects(standing[held]) or off > world.cell_size:
+                    return index, f"'{held}' is not where it would be taken up"
+                # Held where it stands, it stays as far off on the way as it is.
+                x, y, theta = segment.object_poses[0]
+                outline = placed(corners_of(standing[held]) - (x, y), (0.0, 0.0, -theta))
+                bodies = polygons(placed(outline, segment.object_poses))
+                hit = _body_hit(bodies, world, obstacles)
+                standing[held] = bodies[-1]
+            if hit is not None:
+                return index, hit
+        return None
+
+    # --- files --------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it stands in JSON."""
+        segments = []
+        for segment in self.segments:
+            item: dict[str, Any] = {
+                "kind": segment.kind,
+                "poses": segment.poses.round(6),
+                "distance_m": segment.distance,
+                "cost_m": segment.cost,
+            }
+            if segment.grasp is not None:
+                assert segment.object_poses is not None
+                item |= {
+                    "object": segment.name,
+                    "object_poses": segment.object_poses.round(6),
+                    "grasp": {"point": segment.grasp.point, "normal": segment.grasp.normal},
+                    "primitives": segment.primitives,
+                    "probability": segment.probability,
+                    "energy_J": segment.energy,
+                }
+            segments.append(item)
+        return {
+            "format": FORMAT,
+            "map": self.map_name,
+            "goal": self.goal,
+            "units": "m, rad, J",
+            "distance_m": self.distance,
+            "carried_m": self.carried,
+            "transfers": self.transfers,
+            "probability": self.probability,
+            "planning_s": self.planning_s,
+            "sizes": dict(self.sizes),
+            "segments": segments,
+        }
+
+
+def write_plan(path: str | Path, plan: Plan) -> None:
+    """Put a plan into a JSON file."""
+    write_json(path, plan.to_dict())
+
+
+def read_plan(path: str | Path) -> Plan:
+    """A plan that `write_plan` wrote; raises `PalpateError` for a file that is none."""
+    document = read_json(path)
+    try:
+        if document["format"] != FORMAT:
+            raise PalpateError(f"{path} has the format {document['format']!r}: expected {FORMAT!r}")
+        segments = []
+        for item in document["segments"]:
+            segment = Segment(item["kind"], _poses(item["poses"]), float(item["cost_m"]))
+            if segment.kind == TRANSFER:
+                x, y = (float(value) for value in item["grasp"]["point"])
+                segment = Segment(
+                    segment.kind,
+                    segment.poses,
+                    segment.cost,
+                    str(item["object"]),
+                    Grasp((x, y), float(item["grasp"]["normal"])),
+                    _poses(item["object_poses"]),
+                    tuple(map(str, item["primitives"])),
+                    float(item["probability"]),
+                    float(item["energy_J"]),
+                )
+            elif segment.kind != TRANSIT:
+                raise ValueError(f"a segment is a transit or a transfer, not {segment.kind!r}")
+            segments.append(segment)
+        x, y, theta = (float(value) for value in document["goal"])
+        return Plan(
+            str(document["map"]),
+            (x, y, theta),
+            tuple(segments),
+            float(document["planning_s"]),
+            {str(key): int(value) for key, value in document["sizes"].items()},
+        )
+    except PalpateError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise PalpateError(f"{path} is no plan: {error!r}") from error
+
+
+def _poses(value: Any) -> np.ndarray:
+    poses = np.asarray(value, float)
+    if poses.ndim != 2 or poses.shape[1] != 3 or not len(poses) or not np.isfinite(poses).all():
+        raise ValueError("expected poses as [[x, y, theta], ...]")
+    return poses
+
+
+def timed() -> float:
+    """The clock that planning times are taken with, s."""
+    return time.perf_counter()
+
+
+# --- what is in the way -----------------------------------------------------------------------
+
+
+def _way_hit(
+    segment: Segment,
+    world: Map,
+    standing: Mapping[str, BaseGeometry],
+    touched: set[str],
+    held: str | None,
+) -> str | None:
+    """What the robot's disc comes too near to on a segment."""
+    places = segment.poses[:, :2]
+    if len(places) == 1:
+        places = np.repeat(places, 2, axis=0)
+    way = lines(np.stack([places[:-1], places[1:]], axis=1))
+    ends = shapely.points(places[[0, -1]])
+    names = [name for name in standing if name != held]
+    shapes = np.array([standing[name] for name in names] + [world.walls], object)
+    for name, shape in zip([*names, "a wall"], shapes, strict=True):
+        if shapely.is_empty(shape):
+            continue
+        gap = float(shapely.distance(way, shape).min())
+        allowed = world.clearance
+        if name in touched:
+            allowed = min(allowed, world.robot.radius + world.reach)
+        if gap < allowed - _TOLERANCE:
+            near = float(shapely.distance(ends, shape).min())
+            if near < world.robot.radius - _TOLERANCE or gap < near - _TOLERANCE:
+                return name
+    return None
+
+
+def _body_hit(bodies: np.ndarray, world: Map, obstacles: Sequence[BaseGeometry]) -> str | None:
+    """What the carried object, a polygon at every step, comes too near to."""
+    tree = shapely.STRtree([*world.wall_edges, *obstacles])
+    step, which = tree.query(bodies, predicate="dwithin", distance=world.margin)
+    near = tree.geometries[which]
+    began, now = shapely.distance(bodies[0], near), shapely.distance(bodies[step], near)
+    hit = now < np.minimum(world.margin, began) - _TOLERANCE
+    touching = began < TOUCHING  # it may slide along, but not enter
+    inner = shapely.buffer(bodies, -SHRUNK)
+    entered = shapely.intersects(inner[step], near) & ~shapely.intersects(inner[0], near)
+    if (hit | (touching & entered)).any():
+        return "something that stands nearer than the margin to where it would be carried"
+    return None

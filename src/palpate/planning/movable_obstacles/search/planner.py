@@ -1,0 +1,357 @@
+"""The planner: value iteration over regions, and tree search for the openings it cares about.
+
+Abstract actions begin with the least they could cost. Value iteration finds the best policy; what
+it would do from where the robot stands is worked out below, in order, each on the map as the
+earlier actions leave it; what is found replaces what was hoped for, and value iteration is solved
+anew, until the whole policy consists of actions that have been worked out (the lazy evaluation of
+LAO*, Hansen and Zilberstein 2001). Objects that the policy never needs are never simulated.
+
+An object is held once for each way that it opens. Only where no plan is found so, it may be put
+down halfway and held elsewhere. Where the cells leave no way at all, smaller ones are tried.
+"""
+
+import dataclasses
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate.planning.movable_obstacles.maps.map import Map, Pose
+from palpate.planning.movable_obstacles.maps.occupancy import Space, Window
+from palpate.planning.movable_obstacles.motion.manipulation import ManipulationModel, RigidCarry
+from palpate.planning.movable_obstacles.search.judgement import open_way
+from palpate.planning.movable_obstacles.search.openings import OpeningSearch
+from palpate.planning.movable_obstacles.search.plan import TRANSIT, Plan, timed
+from palpate.planning.movable_obstacles.search.policy import (
+    Move,
+    NoWayError,
+    PolicyGraph,
+    WalledError,
+)
+from palpate.planning.movable_obstacles.search.regrasps import stops_of
+from palpate.planning.movable_obstacles.search.situation import (
+    Situation,
+    at_hand,
+    beside,
+    carried_out,
+    driven_to,
+    whole,
+)
+from palpate.planning.movable_obstacles.search.transfers import Opening
+from palpate.planning.movable_obstacles.search.tree_search import Settings
+
+_MOST_KNOWN = 10_000  # searches whose outcome is kept
+_SEARCHES = 20, 6  # searches for an opening in one plan: some, and some more for every object
+_STALE = 2  # times in a row that moving something has not led nearer
+_DEPTH = 2  # blockers of blockers that are cleared away
+_MOST_BLOCKING = 4  # objects in the way of one
+_HALVINGS = 2  # of cells that walls alone seem to close
+_GROWN = 2.5  # sizes of object and robot that a window reaches beyond what it holds
+
+
+@dataclass(frozen=True)
+class _Resolved:
+    """A move made, with whatever had to be moved before: `cost_m` in m as costs are counted."""
+
+    ahead: Situation
+    cost_m: float
+    probability: float
+
+
+class Planner:
+    """Plans on maps; what it finds out about an object's openings is kept from plan to plan.
+
+    `model` says what becomes of an object that is moved; `settings` are those of the tree search;
+    the same `seed` gives the same plan.
+    """
+
+    def __init__(
+        self,
+        model: ManipulationModel | None = None,
+        settings: Settings | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.model = model or RigidCarry()
+        self.settings = settings or Settings()
+        self.seed = seed
+        self._known: dict[Hashable, tuple[Opening | None, bool]] = {}
+        self._world: Hashable = None
+
+    def plan(self, world: Map, goal: Pose | None = None, immovable: Iterable[str] = ()) -> Plan:
+        """From the map's start to `goal` (its first one if None); objects `immovable` are walls.
+
+        Raises `NoWayError` when none was found, and `PalpateError` when start or goal are
+        impossible.
+        """
+        began = timed()
+        goal = world.check(goal)
+        fixed = set(immovable)
+        world.check_names(fixed)
+        if len(self._known) > _MOST_KNOWN:
+            self._known.clear()
+        sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
+        done = self._found(world, goal, fixed, sizes, _HALVINGS)
+        segments = tuple(done.segments)
+        beliefs = {s.name: self.model.belief(s.name) for s in segments if s.name is not None}
+        return Plan(world.name, goal, segments, timed() - began, sizes, beliefs)
+
+    def replan(
+        self,
+        plan: Plan,
+        world: Map,
+        begin: int = 0,
+        immovable: Iterable[str] = (),
+    ) -> Plan:
+        """What is left of a plan from segment `begin` on, or another where that no longer holds.
+
+        `world` is the map as it now is. The rest is kept if the robot is where that segment begins,
+        nothing is in its way, no object that it carries counts as immovable, and the model believes
+        of these what it believed when the plan was made. Raises as `plan`.
+        """
+        fixed = set(immovable)
+        rest = plan.segments[begin:]
+        carried = {segment.name for segment in rest if segment.name is not None}
+        same = all(plan.beliefs.get(name) == self.model.belief(name) for name in carried)
+        begins = rest and np.allclose(rest[0].poses[0, :2], world.start[:2], atol=world.cell_size)
+        if same and begins and not carried & fixed and plan.valid_on(world, begin):
+            return dataclasses.replace(plan, segments=rest, planning_s=0.0)
+        return self.plan(world, plan.goal, fixed)
+
+    # --- above --------------------------------------------------------------------------------
+
+    def _found(
+        self, world: Map, goal: Pose, fixed: set[str], sizes: dict[str, int], halvings: int
+    ) -> Situation:
+        """The situation at the goal; raises `NoWayError`."""
+        self._world = unmoved(world)
+        begin = Situation(Space(world, fixed), np.array(world.start))
+        try:
+            return self._planned(begin, goal, sizes, regrasps=False)
+        except WalledError:
+            finer = world.finer if halvings else None
+            if finer is None:
+                raise
+        except NoWayError as closed:
+            try:
+                return self._planned(begin, goal, sizes, regrasps=True)
+            except NoWayError:
+                raise closed from None
+        return self._found(finer, goal, fixed, sizes, halvings - 1)
+
+    def _planned(
+        self, now: Situation, goal: Pose, sizes: dict[str, int], regrasps: bool
+    ) -> Situation:
+        """The situation at the goal, stage by stage; raises `NoWayError`."""
+        world = now.space.map
+        hoped, stale = np.inf, 0
+        for stage in range(2 * len(world.movables) + 3):
+            graph = PolicyGraph(now.space, now.robot, goal, beside(now))
+            # what was moved has to lead nearer, or it is moved to and fro without end
+            stale = stale + 1 if graph.hoped >= hoped - 1e-6 else 0
+            hoped = min(hoped, graph.hoped)
+            if stage == 0:
+                sizes |= {"regions": graph.regions.free, "borders": len(graph.regions.borders)}
+            reached = self._advance(graph, now, goal, sizes, regrasps)
+            if reached is None or stale == _STALE:
+                error = NoWayError if graph.tried else WalledError
+                raise error(graph.complaint(world.name))
+            now = reached
+            if len(now.segments) and now.segments[-1].kind == TRANSIT:
+                break
+        else:
+            raise NoWayError(graph.complaint(world.name))
+        return now
+
+    def _advance(
+        self,
+        graph: PolicyGraph,
+        now: Situation,
+        goal: Pose,
+        sizes: dict[str, int],
+        regrasps: bool,
+    ) -> Situation | None:
+        """To the goal, or as far as the policy leads before it needs another graph."""
+        farthest: Situation | None = None
+        while True:
+            moves = graph.policy(sizes)
+            if moves is None:
+                return farthest
+            ahead = Situation(now.space, now.robot, list(now.segments))
+            changed, failed = False, False
+            spent: dict[int, tuple[float, float]] = {}  # an action may need several moves
+            for move in moves:
+                resolved = self._resolve(ahead, move, sizes, _DEPTH)
+                if resolved is None and regrasps:
+                    resolved = self._regrasped(ahead, move, sizes)
+                if resolved is None:
+                    graph.fail(move.action)
+                    failed = True
+                    break
+                cost, probability = spent.get(move.action, (0.0, 1.0))
+                cost, probability = cost + resolved.cost_m, probability * resolved.probability
+                spent[move.action] = cost, probability
+                changed |= graph.learn(move, cost, probability)
+                ahead = resolved.ahead
+                if farthest is None or len(ahead.segments) > len(farthest.segments):
+                    farthest = ahead
+            if failed or (changed and not graph.good_enough(moves)):
+                continue
+            final = driven_to(ahead, goal)
+            if final is not None:
+                return final
+            if not moves:
+                return None
+            graph.fail(moves[-1].action)
+
+    # --- below --------------------------------------------------------------------------------
+
+    def _resolve(
+        self, ahead: Situation, move: Move, sizes: dict[str, int], depth: int
+    ) -> _Resolved | None:
+        """Make the move, after clearing what stands in its way if it is not possible at once.
+
+        What stands in its way is what the best transfer would hit if the object were the only one
+        on the map: an artificial constraint on where these may be (Stilman et al. 2007).
+        """
+        opening = self._open(ahead, move, sizes)
+        if opening is not None:
+            return _Resolved(carried_out(ahead, opening), opening.cost, opening.probability)
+        if depth == 0:
+            return None
+        others = set(ahead.space.movables) - {move.name}
+        near = at_hand(ahead) & others
+        for away in (near, others) if near != others else (others,):
+            resolved = self._cleared(ahead, move, away, sizes, depth) if away else None
+            if resolved is not None:
+                return resolved
+        return None
+
+    def _cleared(
+        self, ahead: Situation, move: Move, away: set[str], sizes: dict[str, int], depth: int
+    ) -> _Resolved | None:
+        """The move, planned as if the objects `away` were not there, and these put aside first."""
+        alone = Situation(ahead.space.without(away), ahead.robot)
+        lone_move = dataclasses.replace(move, ignored=move.ignored - away)
+        wanted = self._open(alone, lone_move, sizes)
+        if wanted is None:
+            return None
+        world = ahead.space.map
+        room = wanted.room(ahead.space.movables[move.name], world.robot.radius, world.margin)
+        names = ahead.space.names
+        hit = ahead.space.movable_tree.query(room, predicate="intersects")
+        blocking = sorted({names[index] for index in hit} & away - move.ignored)
+        if not blocking or len(blocking) > _MOST_BLOCKING:
+            return None
+        probability, cost = 1.0, 0.0
+        x, y = (float(value) for value in wanted.parts[0].robot_poses[0, :2])
+        for index, name in enumerate(blocking):
+            later = move.ignored | {move.name} | set(blocking[index + 1 :])
+            aside = Move(move.action, name, (x, y), frozenset(later), 0.0, room)
+            resolved = self._resolve(ahead, aside, sizes, depth - 1)
+            if resolved is None:
+                return None
+            ahead = resolved.ahead
+            probability, cost = probability * resolved.probability, cost + resolved.cost_m
+        opening = self._open(ahead, move, sizes)
+        if opening is None:
+            return None
+        return _Resolved(
+            carried_out(ahead, opening), cost + opening.cost, probability * opening.probability
+        )
+
+    def _regrasped(self, ahead: Situation, move: Move, sizes: dict[str, int]) -> _Resolved | None:
+        """The move in two carries of the same object, the cheaper the better."""
+        best: _Resolved | None = None
+        for stop in self._stops(ahead, move):
+            halfway = carried_out(ahead, stop)
+            opening = self._open(halfway, move, sizes)
+            if opening is None:
+                continue
+            cost, probability = stop.cost + opening.cost, stop.probability * opening.probability
+            if best is None or cost / probability < best.cost_m / best.probability:
+                best = _Resolved(carried_out(halfway, opening), cost, probability)
+        return best
+
+    def _stops(self, ahead: Situation, move: Move) -> list[Opening]:
+        """Where the object may be put down to be held elsewhere."""
+        for window in (window_of(ahead.space, ahead.robot, move), whole(ahead.space)):
+            below = self._below(ahead, move, window)
+            if below.reachable:
+                return stops_of(below)
+        return []
+
+    def _open(self, ahead: Situation, move: Move, sizes: dict[str, int]) -> Opening | None:
+        """What the tree search says of one move, in a window if that is enough."""
+        space = ahead.space
+        windows = [window_of(space, ahead.robot, move), whole(space)]
+        windows = windows[:1] if windows[0] == windows[1] else windows
+        for window in windows:
+            key = self._key(ahead, move, window)
+            if key not in self._known:
+                most = _SEARCHES[0] + _SEARCHES[1] * len(space.map.movables)
+                if sizes["evaluations"] == most:
+                    raise NoWayError(
+                        f"no way to the goal on map '{space.map.name}' within {most} searches for "
+                        "an opening: its objects stand too much in one another's way"
+                    )
+                sizes["evaluations"] += 1
+                below = self._below(ahead, move, window)
+                self._known[key] = open_way(below, self.settings, self.seed), below.reachable
+            opening, reachable = self._known[key]
+            if opening is not None or reachable:
+                return opening
+        return None
+
+    def _below(self, ahead: Situation, move: Move, window: Window) -> OpeningSearch:
+        return OpeningSearch(
+            ahead.space,
+            self.model,
+            move.name,
+            ahead.robot,
+            np.array(move.towards),
+            move.ignored,
+            window,
+            move.keep_out,
+        )
+
+    def _key(self, ahead: Situation, move: Move, window: Window) -> Hashable:
+        """All that decides what a search finds."""
+        space = ahead.space
+        inside = []
+        for name, movable in space.movables.items():
+            rows, columns = space.covers[name].window
+            if (
+                rows.start < window[0].stop
+                and rows.stop > window[0].start
+                and columns.start < window[1].stop
+                and columns.stop > window[1].start
+            ):
+                inside.append((name, movable.pose, self.model.belief(name)))
+        return (
+            self._world,
+            move.name,
+            move.towards,
+            move.ignored,
+            None if move.keep_out is None else move.keep_out.wkb,
+            tuple(ahead.robot.round(9)),
+            tuple(inside),
+            tuple((name, movable.pose) for name, movable in space.fixed.items()),
+            (window[0].start, window[0].stop, window[1].start, window[1].stop),
+        )
+
+
+def window_of(space: Space, robot: np.ndarray, move: Move) -> Window:
+    """Around the robot, the object and the aim, with room to carry and to pass."""
+    movable = space.movables[move.name]
+    points = np.array([robot[:2], movable.pose[:2], move.towards])
+    grown = _GROWN * (space.map.clearance + movable.radius)
+    (left, bottom), (right, top) = points.min(axis=0) - grown, points.max(axis=0) + grown
+    return space.window_of(left, bottom, right, top)
+
+
+def unmoved(world: Map) -> Hashable:
+    """All of a map that stays as it is while objects are moved."""
+    robot = world.robot
+    outlines = tuple((name, one.outline.tobytes()) for name, one in world.movables.items())
+    sizes = (world.bounds, world.cell_size, world.margin, robot.radius, world.reach)
+    return world.walls.wkb, outlines, sizes, robot.drive, robot.push_only

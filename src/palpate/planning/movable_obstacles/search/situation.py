@@ -1,0 +1,102 @@
+"""The map as a plan leaves it part of the way, and the steps that lead on from there."""
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from scipy import ndimage
+
+from palpate.planning.movable_obstacles.maps.map import Pose
+from palpate.planning.movable_obstacles.maps.occupancy import Space, Window
+from palpate.planning.movable_obstacles.search.paths import distances, links
+from palpate.planning.movable_obstacles.search.plan import TRANSFER, TRANSIT, Segment
+from palpate.planning.movable_obstacles.search.transfers import Opening
+
+
+@dataclass
+class Situation:
+    """The map as it is simulated so far, and the robot on it."""
+
+    space: Space
+    robot: np.ndarray
+    segments: list[Segment] = field(default_factory=list)
+
+
+def at_hand(now: Situation) -> set[str]:
+    """The objects that the robot can drive up to."""
+    space = now.space
+    labels, _ = ndimage.label(space.free, np.ones((3, 3), int))
+    joined = links(space, whole(space), now.robot, space.free, beside(now), standing=True)
+    own = {int(labels.ravel()[node]) for node, _ in joined}
+    found = set()
+    for name, cover in space.covers.items():
+        window = tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in cover.window)
+        if own & set(np.unique(labels[window]).tolist()):
+            found.add(name)
+    return found
+
+
+def beside(now: Situation) -> dict[str, float]:
+    """The object that was let go last is as near as the robot held it."""
+    last = now.segments[-1].name if now.segments else None
+    world = now.space.map
+    return {} if last is None else {last: world.robot.radius + world.reach}
+
+
+def carried_out(ahead: Situation, opening: Opening) -> Situation:
+    """The situation after an opening."""
+    way = opening.way
+    robot = opening.parts[0].robot_poses[0]
+    transit = Segment(TRANSIT, headed(way, ahead.robot[2], robot[2]), opening.approach)
+    poses = np.vstack(
+        [opening.parts[0].robot_poses, *(p.robot_poses[1:] for p in opening.parts[1:])]
+    )
+    bodies = np.vstack(
+        [opening.parts[0].object_poses, *(p.object_poses[1:] for p in opening.parts[1:])]
+    )
+    transfer = Segment(
+        TRANSFER,
+        poses,
+        opening.cost - opening.approach,
+        opening.name,
+        opening.grasp,
+        bodies,
+        tuple(part.primitive.name for part in opening.parts),
+        opening.probability,
+        opening.energy,
+    )
+    return Situation(
+        ahead.space.moved(opening.name, opening.object_pose),
+        opening.robot_pose,
+        [*ahead.segments, transit, transfer],
+    )
+
+
+def driven_to(ahead: Situation, goal: Pose) -> Situation | None:
+    """The last stretch; None if the goal cannot be got to."""
+    point = np.array(goal[:2])
+    space = ahead.space
+    reached = distances(space, whole(space), ahead.robot, nearby=beside(ahead), standing=True)
+    way = reached.path_to(point)
+    if way is None:
+        return None
+    poses = headed(way, float(ahead.robot[2]), goal[2])
+    segment = Segment(TRANSIT, poses, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()))
+    return Situation(ahead.space, np.array(goal), [*ahead.segments, segment])
+
+
+def headed(way: np.ndarray, first: float, last: float) -> np.ndarray:
+    """Poses (2 points, 3) along a way (points, 2): turned before each straight and at the end."""
+    poses = [(way[0, 0], way[0, 1], first)]
+    for here, there in pairwise(way):
+        if np.linalg.norm(there - here) < 1e-9:
+            continue
+        angle = math.atan2(there[1] - here[1], there[0] - here[0])
+        poses += [(here[0], here[1], angle), (there[0], there[1], angle)]
+    poses.append((way[-1, 0], way[-1, 1], last))
+    return np.array(poses)
+
+
+def whole(space: Space) -> Window:
+    return slice(0, space.shape[0]), slice(0, space.shape[1])

@@ -1,0 +1,80 @@
+"""Recordings as files of the Rerun viewer, to be looked at in space and time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.recordings.recording import Channel, Recording
+from palpate.runs.storage import write_bytes
+
+PAUSE = 0.5  # s between trials
+RADIUS = 0.005  # m of a point
+TIMELINE = "time"
+
+
+def write_rerun(path: str | Path, recording: Recording) -> None:
+    """Write `recording` to a `.rrd` file; atomic.
+
+    Trials follow one another on the timeline "time", half a second apart. A channel of points, in
+    metres, is an entity of 3D points that has its name; what was not seen is not drawn. Any other
+    channel is a plot. The entity "trial" tells which trial runs.
+
+    Raises `PalpateError` when rerun-sdk is missing or the file cannot be written.
+    """
+    try:
+        import rerun
+    except ImportError as error:
+        raise PalpateError(
+            "Rerun files are written by the package rerun-sdk, which is not installed: "
+            "pip install 'palpate[viz]'"
+        ) from error
+    stream = rerun.RecordingStream("palpate")
+    memory = stream.memory_recording()
+    stream.set_log_time_enabled(False)  # when the file was written is of no interest
+    stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for channel in recording.trials[0].channels.values():
+        if _is_points(channel):
+            stream.log(_entity(channel), rerun.Points3D.from_fields(radii=RADIUS), static=True)
+    begin = 0.0
+    for trial in recording.trials:
+        first = min(channel.time[0] for channel in trial.channels.values())
+        stream.set_time(TIMELINE, duration=begin)
+        stream.log("trial", rerun.TextLog(trial.name))
+        for channel in trial.channels.values():
+            _send(stream, channel, channel.time - first + begin)
+        begin += trial.duration
+        stream.set_time(TIMELINE, duration=begin)
+        for channel in trial.channels.values():
+            stream.log(_entity(channel), rerun.Clear(recursive=False))
+        begin += PAUSE
+    write_bytes(path, memory.drain_as_bytes())
+
+
+def _entity(channel: Channel) -> str:
+    from rerun import escape_entity_path_part
+
+    return escape_entity_path_part(channel.name)
+
+
+def _is_points(channel: Channel) -> bool:
+    return channel.unit == "m" and channel.values.shape[-1] == 3
+
+
+def _send(stream: Any, channel: Channel, time: np.ndarray) -> None:
+    import rerun
+
+    values = channel.values.reshape(len(channel.values), -1)
+    if _is_points(channel):
+        points = channel.values.reshape(len(channel.values), -1, 3)
+        seen = np.isfinite(points).all(axis=-1)
+        columns = rerun.Points3D.columns(positions=points[seen]).partition(seen.sum(axis=1))
+    else:
+        columns = rerun.Scalars.columns(scalars=values.ravel()).partition(
+            np.full(len(values), values.shape[1])
+        )
+    clock = rerun.TimeColumn(TIMELINE, duration=time)
+    stream.send_columns(_entity(channel), indexes=[clock], columns=columns)

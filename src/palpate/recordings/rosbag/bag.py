@@ -1,0 +1,139 @@
+"""Logs of robots as recordings: which topics are the markers and the gripper, cut into trials.
+
+Reads MCAP files, rosbag2 folders and databases, and ROS 1 bags. No ROS has to be installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.recordings.csv import MarkerTable
+from palpate.recordings.recording import DRIVEN_GAP, ON_STAMP, Role
+from palpate.recordings.rosbag.files import Bag, open_bag
+from palpate.recordings.rosbag.topics import Chosen, Track, choose, some, tracks_of
+
+CLOCKS_APART = 0.5  # s between clocks; less is what cameras and networks take
+SHORTEST = 1.0  # s of a piece between two gaps that is worth being a trial
+GRIPPER, COMMAND = "gripper", "command"
+
+
+@dataclass(frozen=True, eq=False)
+class InputTable:
+    """What drove the object, in the file's own unit and axes: `values` (frames, 1, 3)."""
+
+    name: str
+    role: Role
+    time: np.ndarray
+    values: np.ndarray
+
+
+def read_bag(
+    path: str | Path, topics: Sequence[str] = ()
+) -> list[tuple[str, MarkerTable, tuple[InputTable, ...]]]:
+    """Trials of a log: a name, markers, and what drove them, in the file's own unit and axes.
+
+    Markers come from a topic whose messages list several places; which, is plain when there is
+    only one. A gripper comes from a topic of poses in the same frame that stays within a segment of
+    the first marker, when there is only one. `topics` names others, and those of the gripper's pose
+    and ordered velocity; a transform is named "TOPIC:CHILD_FRAME".
+
+    Markers with names are told apart by them and are NaN where a message lacks them. Without names
+    they are told apart by their place in the list; messages with fewer or more show nothing.
+
+    Time is that of the messages' own stamps, or that of their receipt if there are none or the
+    topics' clocks disagree by more than half a second; it starts at 0. A new trial begins after a
+    gap of more than 10 periods, which no driven state may have.
+
+    Raises `PalpateError` when topics are missing or ambiguous, or when the file is damaged.
+    """
+    path = Path(path)
+    bag = open_bag(path)
+    tracks = tracks_of(bag, topics)
+    return _trials(path, bag, choose(tracks, bag.contents, topics))
+
+
+def _trials(
+    path: Path, bag: Bag, chosen: Chosen
+) -> list[tuple[str, MarkerTable, tuple[InputTable, ...]]]:
+    times, notes = _times(chosen)
+    pieces = _pieces([time for track, time in times.items() if track is not chosen.command], chosen)
+    long = [piece for piece in pieces if piece[1] - piece[0] >= SHORTEST] or pieces
+    if len(long) < len(pieces):
+        notes.append(
+            f"{len(pieces) - len(long)} pieces of less than {SHORTEST:g} s between gaps in the "
+            "stamps were left out"
+        )
+    trials = []
+    for number, (begin, end) in enumerate(long):
+        rows = _within(times[chosen.markers], begin, end)
+        table = MarkerTable(
+            f"{bag.format}, topic {chosen.markers.topic}",
+            times[chosen.markers][rows],
+            chosen.positions[rows],
+            chosen.names,
+            notes=tuple(notes) if number == 0 else (),
+        )
+        inputs = []
+        for name, role, track in (
+            (GRIPPER, Role.DRIVEN, chosen.gripper),
+            (COMMAND, Role.COMMAND, chosen.command),
+        ):
+            if track is not None:
+                # An order given before the piece began is in force when it does.
+                earlier = times[track][times[track] <= begin]
+                since = max(earlier) if role is Role.COMMAND and len(earlier) else begin
+                rows = _within(times[track], since, end)
+                values = np.stack([sight.points for sight in track.sights])[rows]
+                inputs.append(InputTable(name, role, times[track][rows], values))
+        name = path.stem if len(long) == 1 else f"{path.stem}/{number}"
+        trials.append((name, table, tuple(inputs)))
+    return trials
+
+
+def _within(time: np.ndarray, begin: float, end: float) -> np.ndarray:
+    return (time >= begin) & (time <= end)
+
+
+def _times(chosen: Chosen) -> tuple[dict[Track, np.ndarray], list[str]]:
+    """Seconds from the first marker on, for each message of each track, and notes."""
+    notes = [*chosen.notes]
+    delays = [track.delay for track in chosen.tracks]
+    by_receipt = max(delays) - min(delays) > CLOCKS_APART
+    if by_receipt:
+        notes.append(
+            f"the clocks of the topics are {max(delays) - min(delays):.4g} s apart, so time is "
+            "that of receipt"
+        )
+    elif not chosen.markers.stamped:
+        notes.append("the messages have no stamps of their own, so time is that of receipt")
+    nanoseconds = {track: track.time(by_receipt) for track in chosen.tracks}
+    start = nanoseconds[chosen.markers].min()
+    return {track: (time - start) * 1e-9 for track, time in nanoseconds.items()}, notes
+
+
+def _pieces(times: list[np.ndarray], chosen: Chosen) -> list[tuple[float, float]]:
+    """(begin, end) of what all `times` cover without a gap."""
+    begin, end = max(time.min() for time in times), min(time.max() for time in times)
+    gaps = []
+    for time in map(np.unique, times):
+        steps = np.diff(time)
+        wide = steps > DRIVEN_GAP * np.median(steps) * (1 + ON_STAMP) if len(steps) else steps > 0
+        gaps += zip(time[:-1][wide].tolist(), time[1:][wide].tolist(), strict=True)
+    pieces = []
+    for before, after in sorted(gaps):
+        if begin < min(before, end):
+            pieces.append((begin, min(before, end)))
+        begin = max(begin, after)
+    if begin < end:
+        pieces.append((begin, end))
+    if not pieces:
+        raise PalpateError(
+            f"{some([track.topic for track in chosen.tracks])}: no time is covered by all of them "
+            "without gaps"
+        )
+    return pieces

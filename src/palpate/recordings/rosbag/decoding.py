@@ -1,0 +1,111 @@
+"""Bytes of a message into a tree of named fields: ROS 1, ROS 2 (CDR) and JSON.
+
+`rosbags`, which knows the formats of ROS, turns the definition of a message type into Python code
+and runs it. A definition out of a foreign file is therefore checked here before: nothing but plain
+identifiers and small numbers gets into that code.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from palpate.errors import PalpateError
+from palpate.runs.storage import parse_json
+
+LONGEST_ARRAY = 4096  # elements of an array of fixed length, for each of which code is made
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*(?:/[A-Za-z]\w*)+", re.ASCII)
+_FIELD_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
+_IDL_RULE = "=" * 80 + "\n"
+
+Decode = Callable[[bytes], Any]
+
+
+def json_decoder() -> Decode:
+    """Decodes JSON into dictionaries, lists, texts and numbers."""
+    return parse_json
+
+
+def ros_decoder(kind: str, definition: str, encoding: str) -> Decode:
+    """Decodes messages of the ROS type `kind`, such as "geometry_msgs/msg/PoseArray".
+
+    `encoding` of the definition is that of an MCAP schema: "ros1msg", "ros2msg" or "ros2idl". An
+    empty definition means one of the types that come with ROS 2 Humble, the last release whose
+    bags do not hold their definitions.
+
+    Raises `PalpateError` for a definition that cannot be used.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys.msg import normalize_msgtype
+
+    kind = normalize_msgtype(kind)
+    if not definition:
+        store = get_typestore(Stores.ROS2_HUMBLE)
+    else:
+        store = get_typestore(Stores.EMPTY)
+        try:
+            if encoding == "ros2idl":
+                types = _types_from_idl(definition)
+            else:
+                types = get_types_from_msg(definition, kind)
+            _check(types)
+            store.register(types)
+        except PalpateError:
+            raise
+        except Exception as error:  # parsers of a grammar, and Python's own
+            reason = str(error).partition("\n")[0]
+            raise PalpateError(f"its definition is damaged ({reason})") from error
+    if kind not in store.fielddefs:
+        raise PalpateError("its definition is not in the file: record it again with ROS 2 Iron+")
+    if encoding == "ros1msg":
+        return lambda data: store.deserialize_ros1(data, kind)
+    return lambda data: store.deserialize_cdr(data, kind)
+
+
+def _types_from_idl(definition: str) -> dict[str, Any]:
+    """The types of one or several IDL files, which a rule and a line "IDL: name" separate."""
+    from rosbags.typesys import get_types_from_idl
+
+    if not definition.startswith(_IDL_RULE):
+        return get_types_from_idl(definition)
+    types = {}
+    for part in definition.split(_IDL_RULE)[1:]:
+        types |= get_types_from_idl(part.partition("\n")[2])
+    return types
+
+
+def _check(types: dict[str, Any]) -> None:
+    """Refuse names that are no identifiers, and arrays of fixed length that are too long."""
+    for kind, (constants, fields) in types.items():
+        for name in (kind, *(name for _, field in fields for name in _references(field))):
+            if not _TYPE_NAME.fullmatch(name):
+                raise PalpateError(f"its definition has a type called {name[:40]!r}")
+        for name in (*(constant[0] for constant in constants), *(field[0] for field in fields)):
+            if not _FIELD_NAME.fullmatch(name):
+                raise PalpateError(f"its definition has a field called {name[:40]!r}")
+        for name, field in fields:
+            if _length(field) > LONGEST_ARRAY:
+                raise PalpateError(
+                    f"its field '{name}' is an array of {_length(field)} elements; at most "
+                    f"{LONGEST_ARRAY} are read"
+                )
+
+
+def _references(field: Any) -> Iterator[str]:
+    """The names of other types in a parsed field: (node, its details)."""
+    from rosbags.interfaces import Nodetype
+
+    node, details = field
+    if node == Nodetype.NAME:
+        yield details
+    elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        yield from _references(details[0])
+
+
+def _length(field: Any) -> int:
+    """Of an array of fixed length; 0 for anything else."""
+    from rosbags.interfaces import Nodetype
+
+    node, details = field
+    return details[1] if node == Nodetype.ARRAY else 0

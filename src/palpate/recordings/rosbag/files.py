@@ -1,0 +1,271 @@
+"""Messages out of log files: MCAP, rosbag2 folders and databases, ROS 1 bags.
+
+The containers are read by the `mcap` and `rosbags` libraries, of the extra `io`. Files are foreign:
+what they unpack to is checked before memory is taken.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from palpate.errors import PalpateError
+from palpate.recordings.recording import LARGEST
+from palpate.recordings.rosbag.decoding import Decode, json_decoder, ros_decoder
+from palpate.runs.storage import DamagedFileError
+
+CHUNK = 2**30  # bytes of one record or one unpacked chunk; writers make them a thousandth of this
+_LZ4_RATIO = 255  # nothing that LZ4 packs is smaller by more than that
+_SUFFIXES = (".mcap", ".bag", ".db3")
+
+
+@dataclass
+class Contents:
+    """What a log says of itself: message types by topic, and how many messages its index promises.
+
+    `read` counts those that came out, and `unreadable` says of a topic why others did not. All of
+    it is complete once all messages were read.
+    """
+
+    types: dict[str, str] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    read: Counter[str] = field(default_factory=Counter)
+    unreadable: dict[str, str] = field(default_factory=dict)
+
+
+class Packed(NamedTuple):
+    """A message as it was recorded: `decode(data)` was `received` at a time in ns."""
+
+    topic: str
+    received: int
+    decode: Decode
+    data: bytes
+
+
+class Bag(ABC):
+    """A log that can be read once; `format` is what a person calls its kind."""
+
+    def __init__(self, format: str):
+        self.format = format
+        self.contents = Contents()
+
+    @abstractmethod
+    def messages(self, skipped: Collection[str]) -> Iterator[Packed]:
+        """All messages but those of `skipped` topics, which may grow meanwhile.
+
+        What damaged files make the libraries raise comes out as it is.
+        """
+
+
+def is_bag(path: Path) -> bool:
+    """Whether `path` is called like a log, or is a folder, such as `ros2 bag record` writes."""
+    return path.suffix.lower() in _SUFFIXES or path.is_dir()
+
+
+def open_bag(path: Path) -> Bag:
+    """The log at `path`: a file, or a folder with metadata.yaml and .mcap or .db3 files.
+
+    Raises `PalpateError` without the extra `io` and for what is no log, `OSError` as the file
+    system does, and whatever the libraries raise for damaged files.
+    """
+    try:
+        import mcap  # noqa: F401
+        import rosbags  # noqa: F401
+    except ImportError as error:
+        raise PalpateError(
+            "logs of robots are read by the packages mcap and rosbags, which are not installed: "
+            "pip install 'palpate[io]'"
+        ) from error
+    if path.is_dir():
+        if not (path / "metadata.yaml").exists():
+            raise PalpateError(
+                "the folder has no metadata.yaml: expected one that `ros2 bag record` has written "
+                "(`ros2 bag reindex` writes a lost one again)"
+            )
+        files = sorted(path.glob("*.mcap"))
+        return McapBag(files, "rosbag2 folder") if files else RosBag(path, "rosbag2 folder")
+    if path.stat().st_size == 0:
+        raise DamagedFileError("the file is empty")
+    if path.suffix.lower() == ".mcap":
+        return McapBag([path], "MCAP")
+    return RosBag(path, "ROS 1 bag" if path.suffix.lower() == ".bag" else "rosbag2 database")
+
+
+class McapBag(Bag):
+    """MCAP files that follow one another, as `ros2 bag record` splits long recordings."""
+
+    def __init__(self, paths: Sequence[Path], format: str):
+        super().__init__(format)
+        self._paths = paths
+
+    def messages(self, skipped: Collection[str]) -> Iterator[Packed]:
+        """See `Bag.messages`."""
+        for path in self._paths:
+            with path.open("rb") as file:
+                yield from self._of_file(file, skipped)
+
+    def _of_file(self, file: Any, skipped: Collection[str]) -> Iterator[Packed]:
+        from mcap.exceptions import EndOfFile, InvalidMagic
+        from mcap.reader import SeekingReader
+        from mcap.records import Channel, Message, Schema
+
+        try:
+            summary = SeekingReader(file, record_size_limit=CHUNK).get_summary()
+        except (EndOfFile, InvalidMagic, OSError) as error:
+            raise DamagedFileError(
+                "the file has no end: it was cut off, or its recording was never finished "
+                "(`mcap recover` saves what is there)"
+            ) from error
+        schemas: dict[int, Any] = dict(summary.schemas) if summary else {}
+        channels: dict[int, Any] = dict(summary.channels) if summary else {}
+        for channel in channels.values():
+            self._add(channel, schemas)
+        decoders: dict[int, Decode | None] = {}
+        for record in _records(file, summary, skipped):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+                self._add(record, schemas)
+            elif isinstance(record, Message):
+                channel = channels[record.channel_id]
+                if channel.topic in skipped:
+                    continue
+                if channel.id not in decoders:
+                    decoders[channel.id] = self._decoder(channel, schemas.get(channel.schema_id))
+                if decode := decoders[channel.id]:
+                    yield Packed(channel.topic, record.log_time, decode, record.data)
+        if summary and summary.statistics:
+            for identity, count in summary.statistics.channel_message_counts.items():
+                if identity in channels:
+                    self.contents.counts[channels[identity].topic] += count
+
+    def _add(self, channel: Any, schemas: dict[int, Any]) -> None:
+        schema = schemas.get(channel.schema_id)
+        self.contents.types[channel.topic] = schema.name if schema else channel.message_encoding
+
+    def _decoder(self, channel: Any, schema: Any) -> Decode | None:
+        """How to read the messages of a channel; None, with the reason kept, if nobody can."""
+        try:
+            if channel.message_encoding == "json":
+                return json_decoder()
+            if channel.message_encoding in ("cdr", "ros1") and schema is not None:
+                return ros_decoder(schema.name, schema.data.decode(), schema.encoding)
+            raise PalpateError(f"its messages are encoded as '{channel.message_encoding}'")
+        except PalpateError as error:
+            self.contents.unreadable[channel.topic] = str(error)
+            return None
+
+
+def _records(file: Any, summary: Any, skipped: Collection[str]) -> Iterator[Any]:
+    """The records of an MCAP file; where an index allows it, without chunks of `skipped` topics."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    if summary is None or not summary.chunk_indexes or not _knows_all(summary):
+        file.seek(0)
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=CHUNK)
+        for record in reader.records:
+            if isinstance(record, Chunk):
+                yield from _unpacked(record)
+            else:
+                yield record
+        return
+    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+        topics = {summary.channels[identity].topic for identity in index.message_index_offsets}
+        if not topics or not topics <= set(skipped):
+            file.seek(index.chunk_start_offset)
+            opcode, length = file.read(1), int.from_bytes(file.read(8), "little")
+            if opcode != b"\x06" or length > CHUNK:
+                raise DamagedFileError("the index of the file does not fit its content")
+            yield from _unpacked(Chunk.read(ReadDataStream(file)))
+
+
+def _knows_all(summary: Any) -> bool:
+    """Whether the index has every topic and definition, so that no chunk is needed for them."""
+    topics = {name for index in summary.chunk_indexes for name in index.message_index_offsets}
+    schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
+    return topics <= summary.channels.keys() and schemas <= summary.schemas.keys()
+
+
+def _unpacked(chunk: Any) -> list[Any]:
+    """The records in a chunk, after a look at how much memory they take."""
+    import zstandard
+    from lz4.frame import get_frame_info
+    from mcap.stream_reader import breakup_chunk
+
+    size = chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        size = max(size, zstandard.frame_content_size(chunk.data))
+    elif chunk.compression == "lz4":
+        said = get_frame_info(chunk.data)["content_size"]
+        size = max(size, said or _LZ4_RATIO * len(chunk.data))
+    if size > CHUNK:
+        raise PalpateError(
+            f"a chunk of the file unpacks to {size / 2**30:.3g} GiB; at most {CHUNK / 2**30:.0f} "
+            "GiB are read"
+        )
+    return breakup_chunk(chunk, validate_crc=True)
+
+
+class RosBag(Bag):
+    """A rosbag2 folder or database, or a ROS 1 bag."""
+
+    def __init__(self, path: Path, format: str):
+        super().__init__(format)
+        self._path = path
+
+    def messages(self, skipped: Collection[str]) -> Iterator[Packed]:
+        """See `Bag.messages`."""
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+
+        for packed in self._path.glob("*.zstd") if self._path.is_dir() else ():
+            _check_packed(packed)
+        with (Reader1 if self._path.suffix == ".bag" else Reader2)(self._path) as reader:
+            decoders = {}
+            for connection in reader.connections:
+                self.contents.types[connection.topic] = connection.msgtype
+                self.contents.counts[connection.topic] += connection.msgcount
+                decoders[connection.id] = self._decoder(connection)
+            for connection, received, data in reader.messages():
+                decode = decoders[connection.id]
+                if decode is not None and connection.topic not in skipped:
+                    yield Packed(connection.topic, received, decode, data)
+
+    def _decoder(self, connection: Any) -> Decode | None:
+        from rosbags.interfaces import MessageDefinitionFormat
+
+        definition = connection.msgdef
+        encoding = "ros1msg" if self._path.suffix == ".bag" else "ros2msg"
+        if definition.format == MessageDefinitionFormat.IDL:
+            encoding = "ros2idl"
+        try:
+            return ros_decoder(connection.msgtype, definition.data, encoding)
+        except PalpateError as error:
+            self.contents.unreadable[connection.topic] = str(error)
+            return None
+
+
+def _check_packed(path: Path) -> None:
+    """Refuse a database that is packed as a whole and would take too much room unpacked."""
+    import zstandard
+
+    with path.open("rb") as file:
+        size = zstandard.frame_content_size(file.read(32))
+        if size < 0:  # it does not say
+            file.seek(0)
+            size = 0
+            stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
+            while size <= LARGEST and (part := stream.read(2**20)):
+                size += len(part)
+    if size > LARGEST:
+        raise PalpateError(
+            f"{path.name} unpacks to more than {LARGEST / 2**30:.0f} GiB: convert it with "
+            "`ros2 bag convert` to one that is not packed"
+        )

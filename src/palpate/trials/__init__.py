@@ -1,0 +1,1 @@
+"""Closed loops: a controller in a world, judged by a task."""

@@ -1,0 +1,1 @@
+"""Agents and planners among furniture."""

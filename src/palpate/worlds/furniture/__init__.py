@@ -1,0 +1,1 @@
+"""Furniture on real wheels in a room, in MuJoCo."""

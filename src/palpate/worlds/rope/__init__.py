@@ -1,0 +1,1 @@
+"""A rope held by a gripper, in MuJoCo."""

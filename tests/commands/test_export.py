@@ -1,0 +1,70 @@
+"""`palpate export`: a file, a contract beside it, and sentences when it cannot be."""
+
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from deployed import manifest, rope_policy
+from palpate.cli import main
+from palpate.commands import export
+from palpate.deployment.contract import contract_of, read_contract
+from palpate.networks import save_policy
+from palpate.runs.result import read_result
+
+runtime = pytest.importorskip("onnxruntime")
+pytest.importorskip("onnx")
+
+
+@pytest.fixture(autouse=True)
+def policy(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    policy = rope_policy()
+    save_policy("policy.safetensors", policy, manifest())
+    return policy
+
+
+def refused(words, capsys):
+    assert main(["export", *words.split()]) == 2
+    return capsys.readouterr().err.removeprefix("palpate: ").rstrip()
+
+
+def test_export_and_again(policy, tmp_path, capsys):
+    for _ in range(2):  # the second time over the first
+        assert main(["export", "policy.safetensors", "--onnx", "out/rope.onnx"]) == 0
+    assert "policy: out/rope.onnx (commands differ by at most" in capsys.readouterr().out
+    assert read_contract("out/rope.json") == contract_of(policy, manifest())
+    session = runtime.InferenceSession("out/rope.onnx")
+    carry = np.zeros((1, 1, 3), np.float32)
+    features = np.ones((1, 30), np.float32)
+    (command,) = session.run(["command"], {"features": features, "carry": carry})
+    expected, _ = policy(jnp.asarray(carry[0]), jnp.asarray(features[0]))
+    np.testing.assert_allclose(command[0], expected, atol=1e-5)
+    result = read_result(tmp_path / "runs/export-001/result.json")
+    assert result.figures[0].name == "onnx_difference"
+    assert result.figures[0].met
+
+
+def test_sentences(capsys, tmp_path, monkeypatch):
+    words = "policy.safetensors --onnx"
+    assert refused(f"{words} a.tflite", capsys) == "--onnx a.tflite has to end in .onnx"
+    (tmp_path / "model.json").write_text('{"format": "palpate.model"}')
+    assert refused(f"{words} model.onnx", capsys) == (
+        "model.json, where the contract would go, holds something else: give another --onnx"
+    )
+    assert not (tmp_path / "runs").exists()
+    assert "there is no file other.safetensors" in refused(
+        "other.safetensors --onnx a.onnx", capsys
+    )
+    assert "--onnx FILE is missing" in refused("policy.safetensors", capsys)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert "pip install 'palpate[deploy]'" in refused(f"{words} a.onnx", capsys)
+
+
+def test_a_file_that_does_not_agree_is_not_handed_over(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(export, "difference", lambda *given: 2e-5)
+    sentence = refused("policy.safetensors --onnx a.onnx", capsys)
+    assert "gives commands that differ by 2e-05 m/s from the policy's" in sentence
+    assert not (tmp_path / "a.onnx").exists()
+    assert not (tmp_path / "a.json").exists()

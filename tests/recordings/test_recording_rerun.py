@@ -1,0 +1,76 @@
+"""Recordings as files of the Rerun viewer, read back by its own reader."""
+
+import builtins
+
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings.rerun import PAUSE, write_rerun
+
+pytest.importorskip("rerun")
+
+TIME = 5.0 + np.arange(10) / 10
+CHAIN = np.random.default_rng(0).normal(size=(10, 4, 3)).astype(np.float32)
+CHAIN[3, 1, 2] = CHAIN[4] = np.nan
+
+
+def sample():
+    channels = (
+        Channel("markers", Role.OBSERVATION, TIME, CHAIN, "m"),
+        Channel("order/1", Role.COMMAND, TIME[:2], np.array([[1.0, 2, 3]] * 2), "m/s"),
+    )
+    trials = [Trial(name, {c.name: c for c in channels}) for name in ("first", "second")]
+    return Recording(tuple(trials), {})
+
+
+def chunks(path, entity):
+    from rerun.chunk import RrdReader
+
+    found = [c for c in RrdReader(path).stream() if c.entity_path == entity and not c.is_static]
+    batches = [chunk.to_record_batch() for chunk in found]
+    times = [batch.column("time").cast("int64").to_numpy() * 1e-9 for batch in batches]
+    batches = [batch.drop_columns(["time"]).to_pydict() for batch in batches]
+    return [{**batch, "time": time} for batch, time in zip(batches, times, strict=True)]
+
+
+def test_points_are_where_and_when_they_were_seen(tmp_path):
+    write_rerun(tmp_path / "r.rrd", sample())
+    batches = [batch for batch in chunks(tmp_path / "r.rrd", "/markers") if len(batch["time"]) > 2]
+    assert len(batches) == 2
+    for number, batch in enumerate(batches):
+        begin = number * (TIME[-1] - TIME[0] + PAUSE)
+        np.testing.assert_allclose(batch["time"], TIME - TIME[0] + begin, atol=1e-6)
+        for drawn, points in zip(batch["Points3D:positions"], CHAIN, strict=True):
+            expected = points[np.isfinite(points).all(axis=1)]
+            np.testing.assert_array_equal(np.array(drawn, np.float32).reshape(-1, 3), expected)
+
+
+def test_other_channels_are_plots_and_trials_are_told(tmp_path):
+    write_rerun(tmp_path / "r.rrd", sample())
+    plots = chunks(tmp_path / "r.rrd", r"/order\/1")
+    assert [batch["Scalars:scalars"] for batch in plots if "Scalars:scalars" in batch] == [
+        [[1.0, 2.0, 3.0]] * 2
+    ] * 2
+    (told,) = chunks(tmp_path / "r.rrd", "/trial")
+    assert told["TextLog:text"] == [["first"], ["second"]]
+
+
+def test_a_file_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(PalpateError, match=r"cannot write .*r\.rrd"):
+        write_rerun(tmp_path / "file" / "r.rrd", sample())
+
+
+def test_without_rerun_a_sentence_says_what_to_install(tmp_path, monkeypatch):
+    importing = builtins.__import__
+
+    def without(name, *rest):
+        if name == "rerun":
+            raise ImportError(name)
+        return importing(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(PalpateError, match=r"rerun-sdk, which is .* pip install 'palpate\[viz\]'"):
+        write_rerun(tmp_path / "r.rrd", sample())

@@ -1,0 +1,17 @@
+"""The toys as a family of another package: what its entry point would name."""
+
+from palpate.family import Family
+
+FAMILY = Family(
+    name="toys",
+    about="a cart, a pendulum and a sled",
+    models={
+        "cart": "toys:Cart",
+        "pendulum": "toys:Pendulum",
+        "sled": "bayesian_toys:Sled",
+    },
+    tasks={
+        "cart-to-origin": "toys:CartToOrigin",
+        "pendulum-damping": "toys:PendulumDamping",
+    },
+)

@@ -25,7 +25,7 @@ from palpate.report import read_evidence
 from palpate.runs import Figure, Result, Run
 from palpate.runs.result import read_result
 from palpate.runs.run import read_metrics
-from palpate.runs.storage import read_json
+from palpate.runs.storage import read_json, write_json
 from palpate.trials.rope import evaluation as rope_evaluation
 from palpate.worlds.rope.rope import RopeWorld
 from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
@@ -339,12 +339,46 @@ def test_reproduce_writes_the_result_and_prints_a_line_for_each_figure(
 
 
 def test_a_quick_run_is_held_against_the_kept_one(experiment, tmp_path, monkeypatch, capsys):
-    kept = Result("rope-model", [Figure("error", 0.1, "m", spread=0.05)], {}, [0], None, 1.0)
-    assert reproduce.beside(experiment.reproduce(tmp_path, quick=True, seed=0), kept) == [
-        "error: 0.2 is outside the full run's 0.1 +- 0.05"
+    def kept(*figures, seeds=(0,)):
+        return Result("rope-model", list(figures), {}, list(seeds), None, 1.0)
+
+    run = experiment.reproduce(tmp_path, quick=True, seed=0)
+    same = [Figure("error", 0.20001, "m"), Figure("rate", 0.5, "")]
+    assert reproduce.compare(run, kept(*same)) == [
+        "error: as kept",
+        "rate: as kept",
+        "2 of 2 figures as kept; times are not compared",
     ]
-    near = Result("rope-model", [Figure("error", 0.19, "m", spread=0.05)], {}, [0], None, 1.0)
-    assert "within" in reproduce.beside(experiment.reproduce(tmp_path, quick=True, seed=0), near)[0]
+    others = Figure("error", 0.16, "m"), Figure("gone", 1.0, ""), Figure("real.wall_time_s", 9, "s")
+    assert reproduce.compare(run, kept(*others)) == [
+        "error: 0.2, kept 0.16 (+25 %)",
+        "rate: only in this run",
+        "gone: only in the kept run",
+        "0 of 3 figures as kept; times are not compared",
+    ]
+    assert reproduce.compare(run, kept(Figure("error", None, "m")))[0] == "error: 0.2, kept none"
+    assert "other seeds" in reproduce.compare(run, kept(*same, seeds=[1]))[0]
+    monkeypatch.setattr(reproduce, "KEPT", tmp_path)
+    write_json(tmp_path / "rope-model.json", kept(*same).to_dict())
+    reproduce.run(Reproduce(out=tmp_path / "out", quick=True), "rope-model")
+    assert "2 of 2 figures as kept" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "clock"),
+    [
+        ("real.wall_time_s", True),
+        ("100.planning_s", True),
+        ("planning_s_at_100", True),
+        ("decision_ms_p99.cem_10_ms", True),
+        ("ess_per_s_over_adapted", True),
+        ("mean_tip_error_cm.mppi_10_ms", False),
+        ("time_to_1pct_s", False),
+        ("ours.time", False),
+    ],
+)
+def test_times_of_a_clock_are_told_from_those_of_a_simulation(name, clock):
+    assert bool(reproduce.CLOCK.search(name)) == clock
 
 
 def test_report_tells_the_runs_below_a_folder(experiment, tmp_path, capsys):

@@ -1,6 +1,8 @@
 """`palpate reproduce`: a headline experiment from nothing, held against its bars."""
 
 import inspect
+import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,13 +18,19 @@ from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import write_json
 
-KEPT = Path(__file__).parents[3] / "results"  # of full runs, in a checkout
+KEPT = Path(__file__).parents[3] / "results" / "quick"  # of quick runs, in a checkout
+SAME = 1e-3  # relative: other processors add up in another order
+# What a clock measured, by how experiments name it; another run, another figure.
+CLOCK = re.compile(
+    r"(wall_time|planning|sampling|training)_s($|_)|(decision|cpu)_ms|_per_s_|^seconds$|^speedup|^exponent$"
+)
 
 
 def run(options: Reproduce, name: str) -> Path:
     """Reproduce the experiment `name`, print a line for each figure, and return its folder.
 
-    `reproduce(out, *, quick, seed, ...) -> Result`, which its family names, does the work.
+    `reproduce(out, *, quick, seed, ...) -> Result`, which its family names, does the work. A quick
+    run is held against the kept quick run, where this is a checkout that has one.
     Raises `PalpateError` for an option that this experiment does not have.
     """
     reproduce = find("experiments", name)
@@ -35,27 +43,44 @@ def run(options: Reproduce, name: str) -> Path:
     print("\n".join(result.lines()))
     kept = KEPT / f"{name}.json"
     if options.quick and kept.exists():
-        print("\n".join(beside(result, read_result(kept))))
+        print("\n".join(compare(result, read_result(kept))))
     page = build_report(runs_in(out), out / folders.REPORT, name)
     print(f"result: {out / RESULT}")
     print(f"report: {page}")
     return out
 
 
-def beside(result: Result, kept: Result) -> list[str]:
-    """Whether each figure that has a spread in the kept full run lies within it, a line each."""
-    known = {figure.name: figure for figure in kept.figures}
+def compare(result: Result, kept: Result) -> list[str]:
+    """Whether each figure is as in the kept run of the same size and seeds, a line each.
+
+    Figures that a clock measured are left out, and one that only one of them has is named.
+    """
+    if result.seeds != kept.seeds:
+        return [f"the kept quick run has other seeds, {kept.seeds}: nothing to compare"]
+    before = {figure.name: figure.value for figure in kept.figures}
+    now = {figure.name: figure.value for figure in result.figures}
     lines = []
-    for figure in result.figures:
-        full = known.get(figure.name)
-        if full is None or full.value is None or full.spread is None or figure.value is None:
+    for name in [*now, *(name for name in before if name not in now)]:
+        if CLOCK.search(name):
             continue
-        within = abs(figure.value - full.value) <= full.spread
-        lines.append(
-            f"{figure.name}: {figure.value:.4g} is {'within' if within else 'outside'} the full "
-            f"run's {full.value:.4g} +- {full.spread:.2g}"
-        )
-    return lines
+        if name not in now or name not in before:
+            lines.append(f"{name}: only in {'this' if name in now else 'the kept'} run")
+        else:
+            lines.append(f"{name}: {_difference(now[name], before[name])}")
+    same = sum(line.endswith("as kept") for line in lines)
+    return [*lines, f"{same} of {len(lines)} figures as kept; times are not compared"]
+
+
+def _difference(value: float | None, kept: float | None) -> str:
+    if value == kept:
+        return "as kept"
+    if value is None or kept is None:
+        shown = ("none" if number is None else f"{number:.4g}" for number in (value, kept))
+        return ", kept ".join(shown)
+    if math.isclose(value, kept, rel_tol=SAME):
+        return "as kept"
+    change = "" if kept == 0 else f" ({100 * (value - kept) / abs(kept):+.2g} %)"
+    return f"{value:.4g}, kept {kept:.4g}{change}"
 
 
 def _given(name: str, function: Callable[..., Result], options: Reproduce) -> dict[str, Any]:

@@ -156,7 +156,7 @@ def draw(path: Path, trials: list[Trial], evaluated: dict[str, Episodes]) -> Non
     for place, (name, summary) in enumerate(summaries.items()):
         colour = STYLES[1 if name == FULL_TRAINING else 2].light
         rate, (low, high) = summary.success_rate, summary.interval
-        error = [[rate - low], [high - rate]]
+        error = [[max(0.0, rate - low)], [max(0.0, high - rate)]]  # rounded, a limit may be past 1
         rates.barh(place, rate, xerr=error, color=colour, ecolor="black", capsize=3)
         if summary.periods is not None:
             margin = summary.margin or 0.0

@@ -80,9 +80,9 @@ class Sliders(Model):
         change = observations[..., -1, :, :] - observations[..., 0, :, :]
         return SlidersState(observations[..., -1, :, :], change / PERIOD)
 
-    def apart(self):
+    def independent_parts(self):
         if len(self.groups) == 1:
-            return super().apart()
+            return super().independent_parts()
         parts = []
         for group in self.groups:
             rows = np.array(group)

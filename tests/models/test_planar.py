@@ -336,7 +336,7 @@ def test_what_nothing_couples_moves_as_it_does_in_the_whole():
     first, second = np.asarray(model.pairs)[:, [0, 2]].T
     near = (second < 0) | ((first == 1) & (second == 3))
     model = dataclasses.replace(model, pairs=model.pairs[near])
-    parts = model.apart()
+    parts = model.independent_parts()
     assert [group for _, group in parts] == [(0, 2), (1, 3), (4,)]
     assert [part.link_to.shape[1] for part, _ in parts] == [1, 0, 0]
     wrench = np.zeros((60, 5, 3))

@@ -66,7 +66,7 @@ class Model(eqx.Module):
         Shape (frames, *observation_shape), with or without a batch axis before.
         """
 
-    def apart(self) -> tuple[tuple["Model", tuple[int, ...]], ...]:
+    def independent_parts(self) -> tuple[tuple["Model", tuple[int, ...]], ...]:
         """What moves by itself, whatever the rest does, as models, and where each is in this one.
 
         That is in the first axis of observations, of actions and of those parameters that each part

@@ -1,8 +1,8 @@
 """Posteriors whose modes are known, divided into what is independent of the rest.
 
 Furniture that is pushed about in one room has one posterior, of as many coordinates as a sampler
-can hardly walk. Where nothing couples two bodies (`Model.apart`) it is the product of theirs:
-each factor is searched and sampled by itself, and draws of the whole are made up of theirs.
+can hardly walk. Where nothing couples two bodies (`Model.independent_parts`) it is the product of
+theirs: each factor is searched and sampled by itself, and draws of the whole are made up of these.
 """
 
 import dataclasses
@@ -80,18 +80,19 @@ def factors_of(target: MotionPosterior) -> list[tuple[MotionPosterior, Int[np.nd
     """
     model, free = target.coordinates.reference, target.coordinates
     shared = any(declaration.shared for declaration in free.declarations.values())
-    apart = model.apart()
-    if len(apart) == 1 or shared or len(model.observation_shape) != 2:
+    parts = model.independent_parts()
+    if len(parts) == 1 or shared or len(model.observation_shape) != 2:
         return [(target, np.arange(target.dimension))]
     # The number of each coordinate in its place: what a part is made of tells which it has.
     flat, unravel = ravel_pytree(free.initial)
-    numbered = with_values(model, unravel(jnp.arange(flat.size, dtype=flat.dtype))).apart()
+    numbers = unravel(jnp.arange(flat.size, dtype=flat.dtype))
+    numbered = with_values(model, numbers).independent_parts()
     factors = []
-    for (part, entries), (numbers, _) in zip(apart, numbered, strict=True):
+    for (part, entries), (own_numbers, _) in zip(parts, numbered, strict=True):
         scales, of = _scales_of(target.scales, entries, model.observation_shape[0])
         factor = motion_posterior(part, _only(target.segments, entries), scales)
         paths = sorted(factor.coordinates.declarations)
-        own = [np.asarray(value_of(numbers, path)).ravel().astype(int) for path in paths]
+        own = [np.asarray(value_of(own_numbers, path)).ravel().astype(int) for path in paths]
         factors.append((factor, np.concatenate([*own, flat.size + of])))
     if target.rotation.shape[:2] == (1, 1):
         factors = [(factor.with_one_rotation(), where) for factor, where in factors]

@@ -121,7 +121,7 @@ class Planar(PlanarParameters):
 
         return step
 
-    def apart(self) -> tuple[tuple["Planar", tuple[int, ...]], ...]:
+    def independent_parts(self) -> tuple[tuple["Planar", tuple[int, ...]], ...]:
         """Groups of bodies that no link and no contact couples; without links, no room for them."""
         groups = coupled(self)
         return tuple((self._only(of) if len(groups) > 1 else self, of) for of in groups)

@@ -54,7 +54,14 @@ PLACE_KEEPERS = {"families", "family", "cli"}
 FAMILY_WORDS = {"rope", "ropes", "furniture", "appliance", "appliances", "maze", "mazes"}
 GENERAL = {
     *FOUNDATION,
-    *("identification", "planning", "learning", "safety"),
+    *("identification", "planning", "learning", "safety", "report", "cli"),
+    *(
+        f"commands/{name}.py"
+        for name in (
+            *("demo", "record", "convert", "track", "identify", "plan", "train", "evaluate"),
+            *("export", "report", "reproduce", "folders", "parsing"),
+        )
+    ),
     *("models/model.py", "models/residual.py", "models/files.py"),
     *("worlds/world.py", "worlds/gymnasium.py", "tasks/task.py"),
 }

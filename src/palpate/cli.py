@@ -21,13 +21,15 @@ class Command:
     """One command: its work, and its options, as "module:name".
 
     Where it works on one of several things, `subject` says what they are, and the families' tables
-    give the options of each; `options` then serve those that come without (experiments).
+    give the options of each; `options` then serve those that come without (experiments). With
+    `optional` the subject may be left out: the first that there is stands for it.
     """
 
     about: str
     run: str
     options: str = ""
     subject: str = ""
+    optional: bool = False
 
     def kinds(self, name: str) -> dict[str, str]:
         """Where the options of each thing that the command `name` works on are."""
@@ -42,9 +44,10 @@ _OPTIONS = "palpate.commands.options"
 
 COMMANDS = {
     "demo": Command(
-        "record a rope, identify it, train a controller, try it, write a report",
+        "record an object, identify it, train a controller, try it, write a report",
         "palpate.commands.demo:run",
-        f"{_OPTIONS}:Demo",
+        subject="family",
+        optional=True,
     ),
     "record": Command("record a simulated object", "palpate.commands.record:run", subject="family"),
     "convert": Command(
@@ -136,7 +139,9 @@ def _run(words: list[str]) -> int:
     command = COMMANDS[check_name("command", name, COMMANDS)]
     kind, program = "", f"palpate {name}"
     kinds = command.kinds(name)
-    if command.subject:
+    if command.optional and (not rest or rest[0].startswith("-")):
+        kind = next(iter(kinds))
+    elif command.subject:
         if not rest or rest[0].startswith("-"):
             if rest and rest[0] in ("-h", "--help"):
                 print(_subjects(name, command, kinds))

@@ -10,9 +10,10 @@ import pytest
 
 from palpate.cli import main
 from palpate.commands import demo, folders, identify, reproduce, train
-from palpate.commands.options import Demo, Reproduce
+from palpate.commands.options import Reproduce
 from palpate.errors import PalpateError
 from palpate.families.options import Identify, Train
+from palpate.families.rope.demo import PICTURE, DemoRope, Size
 from palpate.families.rope.options import IdentifyRope, RecordRope
 from palpate.identification.data.prediction import PredictionError, Windows
 from palpate.identification.gradient.least_squares import Intervals
@@ -442,16 +443,17 @@ def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.7)
     monkeypatch.setattr(RopeWorld, "render", blind)
-    tiny = demo.Size(
+    tiny = Size(
         trials=2, duration=0.6, identification=(1, 1, 1), training=2, batch=2, starts=32, ropes=1
     )
     tiny = dataclasses.replace(tiny, nodes=6)
-    folder = demo.run(Demo(out=tmp_path / "demo"), tiny)
+    monkeypatch.setattr(DemoRope, "size", tiny)
+    folder = demo.run(DemoRope(out=tmp_path / "demo"))
     said = capsys.readouterr().out
     assert "demo: about" in said.splitlines()[0]
     assert said.splitlines()[-1] == f"report: {folder / folders.REPORT}"
     assert "m per metre of rope" in said
-    assert (folder / demo.PICTURE).read_bytes().startswith(b"\x89PNG")
+    assert (folder / PICTURE).read_bytes().startswith(b"\x89PNG")
     figures = {figure.name: figure.value for figure in read_result(folder / "result.json").figures}
     assert 0.0 < figures["tip_rmse_per_length"] < 0.2
     assert "note: the rope is drawn, not rendered: no OpenGL here; install libegl1\n" in said
@@ -474,6 +476,6 @@ def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
     # nothing that is finished is done again, and the time it took stays what it was
     before = (folder / "train" / "result.json").stat().st_mtime_ns
     took = read_result(folder / "result.json").wall_time_s
-    demo.run(Demo(out=tmp_path / "demo"), tiny)
+    demo.run(DemoRope(out=tmp_path / "demo"))
     assert read_result(folder / "result.json").wall_time_s == took
     assert (folder / "train" / "result.json").stat().st_mtime_ns == before

@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 
 from namo_rooms import IN_DOOR, two_rooms
-from palpate.commands import plan as plan_namo
-from palpate.commands.plan import ANIMATION, PICTURE, run
+from palpate.commands.plan import run
 from palpate.errors import PalpateError
+from palpate.families.furniture import planning
 from palpate.families.furniture.plan_options import PlanNamo
+from palpate.families.furniture.planning import ANIMATION, PICTURE
 from palpate.planning.movable_obstacles.maps.description import write_map
 from palpate.planning.movable_obstacles.search.plan import read_plan
 from palpate.planning.movable_obstacles.search.verification import faults_of
@@ -41,7 +42,7 @@ def test_a_plan_its_picture_and_its_animation_are_written(tmp_path, map_file, ca
 
 
 def test_a_plan_that_does_not_hold_is_not_handed_over(tmp_path, map_file, monkeypatch):
-    monkeypatch.setattr(plan_namo, "faults_of", lambda plan, world: ["the robot flies"])
+    monkeypatch.setattr(planning, "faults_of", lambda plan, world: ["the robot flies"])
     with pytest.raises(PalpateError, match="the robot flies"):
         run(PlanNamo(map=map_file, out=tmp_path / "out"))
     assert not (tmp_path / "out" / "plan.json").exists()

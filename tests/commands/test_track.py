@@ -7,7 +7,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.commands import folders
-from palpate.commands.track import OVERLAY, followed
+from palpate.families.rope.tracking import OVERLAY, follow
 from palpate.models.files import save_model
 from palpate.models.rope import Rope
 from palpate.perception.image_folder import write_image_folder
@@ -66,6 +66,7 @@ def test_a_grey_rope_and_a_model_of_something_else_are_refused(tmp_path, capsys)
     words = said(tmp_path / "none.json", tmp_path / "pictures", tmp_path / "out")
     assert main(words) == 2
     assert "there is no file" in capsys.readouterr().err
+    save_model(tmp_path / "none.json", MODEL)
     grey = [word if word not in map(str, ROPE_COLOUR) else "0.5" for word in words]
     assert main(grey) == 2
     assert "is grey" in capsys.readouterr().err
@@ -75,6 +76,6 @@ def test_frames_faster_than_the_model_count_once_an_instant(filmed):
     pinhole, frames, grippers, _ = filmed
     slow = dataclasses.replace(MODEL, control_period=0.1, substeps=40)
     rope = Appearance(ROPE_COLOUR, ROPE.radius)
-    times, nodes, places, lost = followed(slow, pinhole, rope, frames, grippers)
+    times, nodes, places, lost = follow(slow, pinhole, rope, frames, grippers)
     assert len(times) == len(nodes) == len(places) == len(lost) < len(frames)
     np.testing.assert_allclose(np.diff(times), 0.1, atol=1e-6)

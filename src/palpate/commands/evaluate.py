@@ -32,7 +32,7 @@ def run(options: Evaluate) -> Path:
         )
     options.check(policy)
     task = named_task(options.task)
-    configuration = folders.told(options, f"evaluate {options.task}")
+    configuration = folders.configuration_of(options, f"evaluate {options.task}")
     configuration["policy"] = folders.fingerprint(file)
     model = None
     if options.model is not None:

@@ -31,7 +31,9 @@ def run(options: Export) -> Path:
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_policy(file)
     contract = contract_of(policy, manifest)
-    configuration = folders.told(options, "export") | {"policy": folders.fingerprint(file)}
+    configuration = folders.configuration_of(options, "export") | {
+        "policy": folders.fingerprint(file)
+    }
     with folders.open_run(options, "export", configuration) as run:
         made = run.path / ONNX
         write_onnx(made, policy)

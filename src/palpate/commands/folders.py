@@ -17,14 +17,15 @@ from palpate.runs.run import CONFIGURATION, ENVIRONMENT, RESULT
 from palpate.runs.storage import plain, read_json, write_bytes
 
 RUNS = Path("runs")
-RECORDING, MODEL, POLICY, REPORT, TABLE = (
+RECORDING, MODEL, PLAN, POLICY, REPORT, TABLE = (
     "recording.npz",
     "model.json",
+    "plan.json",
     "policy.safetensors",
     "report.html",
     "table.txt",
 )
-_TOLD = (REPORT, EVIDENCE, TABLE, *(f"rendering{suffix}" for suffix in RENDERINGS))
+_FOR_A_PERSON = (REPORT, EVIDENCE, TABLE, *(f"rendering{suffix}" for suffix in RENDERINGS))
 _WHERE = ("out", "fresh")  # options that do not decide the outcome
 _SUFFIXES = {Path(name).suffix for name in (RECORDING, MODEL, POLICY, REPORT)}
 
@@ -45,7 +46,7 @@ def open_run(
         again = options.fresh and (options.out / CONFIGURATION).exists()
         run = Run.open(options.out, configuration, fresh=options.fresh)
         if again:
-            _remove(run.path, (product, *_TOLD) if product else _TOLD)
+            _remove(run.path, (product, *_FOR_A_PERSON) if product else _FOR_A_PERSON)
         return run
     numbered = sorted(_numbered(name))
     if not options.fresh:
@@ -79,7 +80,7 @@ def hand_over(
     print(f"report: {report}")
 
 
-def told(options: Options, command: str) -> dict[str, Any]:
+def configuration_of(options: Options, command: str) -> dict[str, Any]:
     """What decides a command's outcome, for its configuration: all that was said but where to."""
     given = {"command": command, **dataclasses.asdict(options)}
     return {
@@ -116,7 +117,7 @@ def start_over(folder: Path, words: str) -> None:
             )
     for configuration in configurations:
         with Run.open(configuration.parent, read_json(configuration), fresh=True) as run:
-            _remove(run.path, (RECORDING, MODEL, POLICY, *_TOLD))
+            _remove(run.path, (RECORDING, MODEL, POLICY, *_FOR_A_PERSON))
             configuration.unlink()
         _remove(folder, (RESULT, REPORT, EVIDENCE))  # what was told of all of them
 

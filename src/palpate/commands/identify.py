@@ -229,7 +229,7 @@ def _settings(options: Identify) -> Settings:
 
 def _configuration(options: Identify, settings: Settings) -> dict[str, Any]:
     return {
-        **folders.told(options, f"identify {options.family}"),
+        **folders.configuration_of(options, f"identify {options.family}"),
         "recordings": [folders.fingerprint(path) for path in options.recordings],
         "validate": [folders.fingerprint(path) for path in options.validate],
         **dataclasses.asdict(settings),

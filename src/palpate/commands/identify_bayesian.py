@@ -53,7 +53,7 @@ def run(options: IdentifyBayesian) -> Path:
     scored = _read(options, options.validate)[0] if options.validate else None
     name = f"identify-{options.family}"
     configuration = {
-        **folders.told(options, f"identify {options.family}"),
+        **folders.configuration_of(options, f"identify {options.family}"),
         "recordings": [folders.fingerprint(path) for path in options.recordings],
         "validate": [folders.fingerprint(path) for path in options.validate],
     }

@@ -58,16 +58,6 @@ class Report(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Options):
-    """Record a simulated rope, identify it, train a controller through what was found, try it.
-
-    The controller is tried in other ropes than the one that was recorded, beside a gripper held
-    still. Everything is written to one folder, with one report. What was cut off goes on when the
-    command is given again.
-    """
-
-
-@dataclass(frozen=True, kw_only=True)
 class Reproduce(Options):
     """Repeat a headline experiment from nothing, and hold its figures against their bars.
 

@@ -21,7 +21,7 @@ def run(options: Record) -> Path:
     """
     configuration = {
         name: " ".join(value) if isinstance(value, tuple) else value  # provenance is text
-        for name, value in folders.told(options, f"record {options.family}").items()
+        for name, value in folders.configuration_of(options, f"record {options.family}").items()
     }
     if options.out is not None and _is_there(options.out, options, configuration):
         print(f"recording: {options.out} (it was there already)")
@@ -57,7 +57,7 @@ def _result(name: str, options: Record, recording: Recording, wall_time: float) 
     return Result(
         name=name,
         figures=[],  # nothing is claimed
-        settings=folders.told(options, f"record {options.family}")
+        settings=folders.configuration_of(options, f"record {options.family}")
         | {"trial_names": [trial.name for trial in recording.trials]},
         seeds=[options.seed],
         split=None,

@@ -50,7 +50,9 @@ def run(options: Serve) -> Path:
     supervisor = supervisor_of(policy, contract, markers, limits)
     if options.simulate:
         rope_robot.servoed(markers, contract.period)
-    configuration = folders.told(options, "serve") | {"policy": folders.fingerprint(file)}
+    configuration = folders.configuration_of(options, "serve") | {
+        "policy": folders.fingerprint(file)
+    }
     listen = free_endpoint() if options.simulate else options.listen
     with folders.open_run(options, "serve", configuration) as run:
         if run.finished:

@@ -38,7 +38,7 @@ def run(options: Train) -> Path:
     training = settings(options)
     name = f"train-{options.task}"
     configuration = {
-        **folders.told(options, f"train {options.task}"),
+        **folders.configuration_of(options, f"train {options.task}"),
         "model": folders.fingerprint(file),
         "task": _constants(task),
         "training": dataclasses.asdict(training),

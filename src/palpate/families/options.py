@@ -17,7 +17,9 @@ from tyro.conf import Positional, arg
 from palpate.errors import PalpateError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+
+    import numpy as np
 
     from palpate.models.model import Model
     from palpate.networks import CommandPolicy
@@ -62,6 +64,30 @@ class Record(Options, ABC):
     @abstractmethod
     def record(self) -> Recording:
         """Run the world and keep what its sensors showed."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What tracking gives: a recording, and whether the object was `lost` (frames,) in each."""
+
+    recording: Recording
+    lost: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track(Options, ABC):
+    """An object followed through a camera's pictures; each family says in `track` how."""
+
+    family: ClassVar[str]
+
+    pictures: Positional[Annotated[Path, arg(metavar="PICTURES", help_behavior_hint="")]]
+    """What the camera saw, and how the object was held."""
+    model: Annotated[Path, arg(metavar="MODEL")]
+    """What `palpate identify` wrote: its folder, or the model file in it."""
+
+    @abstractmethod
+    def track(self, model: Model, run: Run) -> Tracked:
+        """Follow the object by its model; leaves what a person looks at in the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,3 +281,69 @@ class Evaluate(Options, ABC):
     @abstractmethod
     def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
         """Try the policy in the world; leaves evidence and checkpoints in the run."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A planning problem as it was read from files.
+
+    `inputs` is what was read, for the run's configuration. `solve` writes the plan and what shows
+    it into a run; `describe` says a plan's steps to a person, a line each.
+    """
+
+    title: str
+    inputs: dict[str, Any]
+    solve: Callable[[Run], list[Figure]]
+    describe: Callable[[Path], list[str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(Options, ABC):
+    """Planning; each family says in `read` what is to be planned."""
+
+    problem: ClassVar[str]
+
+    @abstractmethod
+    def read(self) -> Problem:
+        """The problem that the options name; raises `PalpateError` for one that cannot be."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a demo found: figures, what they were measured on, and lines for a person."""
+
+    figures: list[Figure]
+    settings: dict[str, Any]
+    split: dict[str, Any]
+    lines: list[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Options, ABC):
+    """The whole loop once; each family gives the options of every stage.
+
+    `out` of a stage is the folder it works in, and what comes before is the stage before it.
+    """
+
+    title: ClassVar[str]  # of its page
+    minutes: ClassVar[int]  # on two cores
+
+    @abstractmethod
+    def record(self, out: Path) -> Record:
+        """What is recorded."""
+
+    @abstractmethod
+    def identify(self, recording: Path, out: Path) -> Identify:
+        """How it is identified."""
+
+    @abstractmethod
+    def train(self, model: Path, out: Path) -> Train:
+        """What is trained."""
+
+    @abstractmethod
+    def evaluate(self, policy: Path, out: Path) -> Evaluate:
+        """Where it is tried."""
+
+    @abstractmethod
+    def summarise(self, identified: Path, evaluated: Path, out: Path) -> Summary:
+        """What was found, from the folders of these stages; may draw a picture into `out`."""

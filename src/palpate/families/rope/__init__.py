@@ -14,6 +14,7 @@ FAMILY = Family(
         "rope-tracking": "palpate.tasks.rope:RopeTracking",
     },
     options={
+        "demo": {"rope": "palpate.families.rope.demo:DemoRope"},
         "record": {"rope": f"{_OPTIONS}:RecordRope"},
         "track": {"rope": f"{_OPTIONS}:TrackRope"},
         "identify": {"rope": f"{_OPTIONS}:IdentifyRope"},

@@ -5,15 +5,24 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from palpate.errors import PalpateError
-from palpate.families.options import Evaluate, Evaluation, Identify, Number, Options, Record, Train
+from palpate.families.options import (
+    Evaluate,
+    Evaluation,
+    Identify,
+    Number,
+    Record,
+    Track,
+    Tracked,
+    Train,
+)
 
 if TYPE_CHECKING:
+    from palpate.models.model import Model
     from palpate.models.rope import Rope
     from palpate.networks import CommandPolicy
     from palpate.recordings import Aligned, Recording
@@ -70,7 +79,7 @@ class RecordRope(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackRope(Options):
+class TrackRope(Track):
     """Follow a rope through a calibrated camera's pictures, with its identified model.
 
     PICTURES is a folder with camera.json, times.csv, and colour/ (PNG or JPEG) or colour.mp4;
@@ -80,14 +89,19 @@ class TrackRope(Options):
                                                     --radius 0.005 --model M --out R.npz
     """
 
-    pictures: Positional[Annotated[Path, arg(metavar="PICTURES", help_behavior_hint="")]]
-    """What the camera saw, and where the gripper was."""
-    model: Annotated[Path, arg(metavar="MODEL")]
-    """What `palpate identify` wrote: its folder, or the model file in it."""
+    family: ClassVar[str] = "rope"
+
     colour: Annotated[tuple[float, float, float], arg(metavar="RED GREEN BLUE")]
     """Of the rope in good light, each from 0 to 1."""
     radius: float
     """Of the rope, m."""
+
+    def track(self, model: Model, run: Run) -> Tracked:
+        """See `palpate.families.rope.tracking.track`."""
+        from palpate.families.rope.tracking import track
+        from palpate.perception.rope.segmentation import Appearance
+
+        return track(model, Appearance(self.colour, self.radius), self.pictures, run)
 
 
 @dataclass(frozen=True, kw_only=True)

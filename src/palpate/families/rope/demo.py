@@ -1,0 +1,121 @@
+"""The rope's part of `palpate demo`: how much work each stage is, and what is said in the end."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from palpate.families.options import Demo, Summary
+from palpate.families.rope.options import (
+    EvaluateRopeStabilization,
+    IdentifyRope,
+    RecordRope,
+    TrainRopeStabilization,
+)
+
+PICTURE = "picture.png"  # the README's
+INSTANTS = (0.8, 1.6, 2.4, 3.2)  # s, of the motion in the picture
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much work a demo is."""
+
+    trials: int = 6
+    duration: float = 5.0  # s of each
+    nodes: int = 11
+    substeps: int = 4
+    identification: tuple[int, ...] = (20, 20, 60)
+    training: int = 150  # gradient steps
+    batch: int = 128
+    starts: int = 2000
+    ropes: int = 3  # each from four poses
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoRope(Demo):
+    """Record a simulated rope, identify it, train a controller through what was found, try it.
+
+    The controller is tried in other ropes than the one that was recorded, beside a gripper held
+    still. Everything is written to one folder, with one report. What was cut off goes on when the
+    command is given again.
+    """
+
+    title: ClassVar[str] = "A rope, from recording to rest"
+    minutes: ClassVar[int] = 4
+    size: ClassVar[Size] = Size()
+
+    def record(self, out: Path) -> RecordRope:
+        """Trials of the default rope."""
+        size = self.size
+        return RecordRope(out=out, seed=self.seed, trials=size.trials, duration=size.duration)
+
+    def identify(self, recording: Path, out: Path) -> IdentifyRope:
+        """Every second marker is a node, which makes training fast; the rope was weighed."""
+        return IdentifyRope(
+            recordings=(recording,),
+            out=out,
+            seed=self.seed,
+            mass=RecordRope.mass,
+            nodes=self.size.nodes,
+            substeps=self.size.substeps,
+            iterations=self.size.identification,
+        )
+
+    def train(self, model: Path, out: Path) -> TrainRopeStabilization:
+        """To bring it to rest."""
+        return TrainRopeStabilization(
+            model=model,
+            out=out,
+            seed=self.seed,
+            iterations=self.size.training,
+            batch=self.size.batch,
+            starts=self.size.starts,
+        )
+
+    def evaluate(self, policy: Path, out: Path) -> EvaluateRopeStabilization:
+        """In ropes of another seed."""
+        return EvaluateRopeStabilization(
+            policy=policy, out=out, seed=self.seed + 1, ropes=self.size.ropes
+        )
+
+    def summarise(self, identified: Path, evaluated: Path, out: Path) -> Summary:
+        """The recorded motion beside its prediction, and the energy with and without control."""
+        from palpate.report import motion_figure, read_evidence
+        from palpate.runs import Figure
+        from palpate.runs.result import read_result
+        from palpate.runs.run import RESULT
+
+        known = {
+            figure.name: figure
+            for run in (identified, evaluated)
+            for figure in read_result(run / RESULT).figures
+        }
+        tip = known["tip_rmse_m"].value
+        share = None if tip is None else tip / RecordRope.length
+        names = "success_rate", "time_to_1pct_periods", "time_to_1pct_s", "success_rate.held_still"
+        figures = [Figure("tip_rmse_per_length", share, "m/m"), *(known[name] for name in names)]
+        success, periods, seconds, still = (known[name].value for name in names)
+        motion = read_evidence(identified).motions[0]
+        motion_figure(out / PICTURE, motion, INSTANTS, read_evidence(evaluated).energy)
+        error = "unknown" if share is None else f"{share:.4f} m per metre of rope"
+        rest = ": never; a longer training would help"
+        if seconds is not None:
+            rest = f" {seconds:.2f} s, {periods:.2f} periods"
+        return Summary(
+            figures=figures,
+            settings=dataclasses.asdict(self.size),
+            split={
+                "tip error": "motions of the recorded rope that were not fitted",
+                "time to 1 %": f"{self.size.ropes} other ropes from four poses each",
+            },
+            lines=[
+                f"tip error {error}, {self.size.duration:g} s ahead, unseen motions",
+                f"time to 1 % energy{rest}",
+                f"at rest in {success:.0%} of the trials; with the gripper held still in "
+                f"{still:.0%}",
+                f"picture: {out / PICTURE}",
+            ],
+        )

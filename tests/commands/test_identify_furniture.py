@@ -1,7 +1,6 @@
 """`palpate identify furniture`: what a recording has to bring, and the whole way on a short one."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -23,18 +22,19 @@ from palpate.families.furniture.recording import (
 )
 from palpate.families.furniture.structures import joints, structures
 from palpate.identification.posterior.comparison import begins_at_rest
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Channel, Labels, Polygons, Quantity, Recording, Role, Trial
+from palpate.recordings.facts import Fact
 
 RATE = 50.0
 
 
-def recording(pose: np.ndarray, wrench: np.ndarray, **provenance: str) -> Recording:
+def recording(pose: np.ndarray, wrench: np.ndarray, **facts: Fact) -> Recording:
     time = np.arange(len(pose)) / RATE
     channels = {
         POSE: Channel(POSE, Role.OBSERVATION, time, pose, "m, m, rad"),
         WRENCH: Channel(WRENCH, Role.COMMAND, time[:-1], wrench, "N, N, N m"),
     }
-    return Recording((Trial("one", channels),), provenance)
+    return Recording((Trial("one", channels, facts=facts),), {})
 
 
 def still(bodies: int = 1, frames: int = 20) -> tuple[np.ndarray, np.ndarray]:
@@ -61,10 +61,9 @@ def test_channels_of_another_shape_are_refused():
 def test_outlines_come_from_the_recording_or_from_a_size():
     pose, wrench = still()
     corners = [[-0.6, -0.3], [0.6, -0.3], [0.6, 0.3], [-0.6, 0.3]]
-    told = checked(
-        recording(pose, wrench, bodies='["table"]', outlines=json.dumps({"table": corners}))
-    )
-    half_extent = np.asarray(starting_furniture(told, 0.02).half_extent)
+    outlines = Polygons((np.array(corners),), ("table",), "body")
+    whole = checked(recording(pose, wrench, bodies=Labels(("table",)), outlines=outlines))
+    half_extent = np.asarray(starting_furniture(whole, 0.02).half_extent)
     np.testing.assert_allclose(half_extent, [[0.6, 0.3]], rtol=1e-6)
     bare = checked(recording(pose, wrench))
     with pytest.raises(PalpateError, match="--size LENGTH WIDTH"):
@@ -75,19 +74,12 @@ def test_outlines_come_from_the_recording_or_from_a_size():
         starting_furniture(bare, 0.02, (1.2, -1.0))
 
 
-@pytest.mark.parametrize(
-    ("provenance", "sentence"),
-    [
-        ({"bodies": "[1"}, "is not JSON"),
-        ({"bodies": '["a", "b"]'}, "expected names of its 1 bodies"),
-        ({"outlines": '{"body 1": [[0, 1], [2]]}'}, "not a list of points"),
-        ({"outlines": '{"body 1": [[0, 1, 2]]}'}, "expected finite points"),
-    ],
-)
-def test_damaged_provenance_is_refused_with_a_sentence(provenance, sentence):
+def test_names_are_those_of_the_bodies_in_the_channels():
     pose, wrench = still()
-    with pytest.raises(PalpateError, match=sentence):
-        starting_furniture(checked(recording(pose, wrench, **provenance)), 0.02)
+    with pytest.raises(PalpateError, match="expected names of its 1 bodies"):
+        names_of(checked(recording(pose, wrench, bodies=Labels(("a", "b")))))
+    with pytest.raises(PalpateError, match='"bodies" are Quantity: expected Labels'):
+        names_of(checked(recording(pose, wrench, bodies=Quantity(np.array(2.0), "1"))))
 
 
 def test_a_body_that_is_never_seen_is_refused():
@@ -122,12 +114,6 @@ def test_angles_may_be_wrapped():
     assert begins_at_rest(found.align(0.02), model)
 
 
-def test_bodies_of_one_name_are_refused():
-    pose, wrench = still(2)
-    with pytest.raises(PalpateError, match="expected a name for each"):
-        names_of(checked(recording(pose, wrench, bodies='["chair", "chair"]')))
-
-
 def test_what_may_be_is_asked_of_recordings_of_the_same_bodies():
     far, near = two_boxes(np.full(20, 2.0)), two_boxes(np.full(20, 0.1))
     options = IdentifyFurniture(recordings=(), structure="feet")
@@ -152,12 +138,13 @@ def two_boxes(apart: np.ndarray, seen: np.ndarray | bool = True) -> Recording:
     """Two boxes of 1 m whose sides are so far `apart`, m; only the second is not always `seen`."""
     pose = np.zeros((len(apart), 2, 3))
     pose[:, 1, 0] = np.where(seen, 1.0 + apart, np.nan)
-    corners = [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]
-    walls = [[[-9.0, -9.0], [9.0, -9.0], [0.0, -8.0]]]
-    return recording(
-        pose, np.zeros((len(apart) - 1, 2, 3)), bodies='["a", "b"]',
-        outlines=json.dumps({"a": corners, "b": corners}), walls=json.dumps(walls),
-    )  # fmt: skip
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    facts = {
+        "bodies": Labels(("a", "b")),
+        "outlines": Polygons((corners, corners), ("a", "b"), "body"),
+        "walls": Polygons((np.array([[-9.0, -9.0], [9.0, -9.0], [0.0, -8.0]]),)),
+    }
+    return recording(pose, np.zeros((len(apart) - 1, 2, 3)), **facts)
 
 
 @pytest.mark.parametrize(("nearest", "touch"), [(0.2, True), (0.4, False)])
@@ -188,12 +175,12 @@ def test_what_meets_in_any_recording_may_touch():
 
 def test_recordings_of_other_bodies_are_not_scored():
     pose, wrench = still(2)
-    two = checked(recording(pose, wrench, bodies='["a", "b"]'))
+    two = checked(recording(pose, wrench, bodies=Labels(("a", "b"))))
     check_alike(two, checked(recording(pose, wrench)))
     with pytest.raises(PalpateError, match="of a, b and of body 1: expected the same bodies"):
         check_alike(two, checked(recording(pose[:, :1], wrench[:, :1])))
     with pytest.raises(PalpateError, match="of a, b and of b, a"):
-        check_alike(two, checked(recording(pose, wrench, bodies='["b", "a"]')))
+        check_alike(two, checked(recording(pose, wrench, bodies=Labels(("b", "a")))))
 
 
 def test_recorded_pieces_bring_what_identification_needs():

@@ -21,13 +21,13 @@ from palpate.families.furniture.wheels import wheel_rows
 from palpate.models.planar import furniture
 from palpate.models.planar.wheels import turned_wheel
 from palpate.parameters import with_values
-from palpate.recordings import Channel, Recording, Role, Trial, join
-from palpate.recordings.files import read_recording
+from palpate.recordings import Channel, Labels, Polygons, Recording, Role, Trial, join
+from palpate.recordings.files import read_recording, write_recording
 
 SQUARE = [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]
 
 
-def made(period=0.02, outline=SQUARE, indent=None, **keys):
+def made(period=0.02, outline=SQUARE, **keys):
     """A recording of a box at rest; `keys` change both channels."""
     time = period * np.arange(50)
     roles = {POSE: Role.OBSERVATION, WRENCH: Role.COMMAND}
@@ -37,8 +37,8 @@ def made(period=0.02, outline=SQUARE, indent=None, **keys):
         )
         for name, role in roles.items()
     }
-    about = {"bodies": '["box"]', "outlines": json.dumps({"box": outline}, indent=indent)}
-    return Recording((Trial("one", channels),), about)
+    facts = {"bodies": Labels(("box",)), "outlines": Polygons((outline,), ("box",), "body")}
+    return Recording((Trial("one", channels, facts=facts),), {})
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_an_outline_in_millimetres_is_refused():
 
 
 def test_recordings_of_one_body_are_of_one_outline():
-    alike = join([made(), made(indent=1)])
+    alike = join([made(), made()])
     assert starting_furniture(checked(alike), 0.02).bodies == 1
     other = made(outline=[[-0.6, -0.5], [0.6, -0.5], [0.6, 0.5], [-0.6, 0.5]])
     with pytest.raises(PalpateError, match='say different things of "outlines"'):
@@ -85,11 +85,34 @@ def test_recordings_of_one_body_are_of_one_outline():
     check_alike(made(), made(outline=begun_elsewhere))
 
 
-@pytest.mark.parametrize("text", ["0.5 0.5; 0.5 -0.5", "[" * 100_000])
-def test_broken_json_is_not_taken_for_recordings_that_differ(text):
-    broken = dataclasses.replace(made(), provenance={"outlines": text})
-    with pytest.raises(PalpateError, match='"outlines" is not JSON'):
-        starting_furniture(checked(broken), 0.02)
+def test_files_with_outlines_as_json_in_their_provenance_mean_the_same(tmp_path):
+    """As palpate wrote them before facts were typed."""
+    outline = (np.array([1.2, 0.8]) * SQUARE).tolist()
+    new = made(outline=outline)
+    bare = [dataclasses.replace(trial, facts={}) for trial in new.trials]
+    texts = {"bodies": '["box"]', "outlines": json.dumps({"box": outline}), "walls": "[]"}
+    write_recording(tmp_path / "old.npz", Recording(tuple(bare), texts | {"world": "furniture"}))
+    old = read_recording(tmp_path / "old.npz")
+    assert old.provenance == {"world": "furniture"}
+    assert old.fact("outlines", Polygons) == new.fact("outlines", Polygons)
+    check_alike(checked(old), checked(new))
+    models = [starting_furniture(checked(each), 0.02) for each in (old, new)]
+    np.testing.assert_array_equal(models[0].outline, models[1].outline)
+    assert models[0].half_extent[0].tolist() == pytest.approx([0.6, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[" * 100_000, "fact 'outlines' is damaged: nested too deeply"),
+        ('{"box": [[0, 1], [2]]}', "polygon 'box' is no list of corners"),
+        ('["box"]', "fact 'outlines' is damaged"),
+    ],
+)
+def test_damaged_json_in_provenance_is_refused(tmp_path, text, says):
+    write_recording(tmp_path / "r.npz", Recording(made().trials, {"outlines": text}))
+    with pytest.raises(PalpateError, match=says):
+        read_recording(tmp_path / "r.npz")
 
 
 def test_what_was_put_right_in_a_channel_is_still_told():

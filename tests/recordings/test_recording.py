@@ -350,9 +350,6 @@ def test_joining_keeps_names_apart_and_provenance_together():
     both = join([first, Recording(many(3).trials, {"file": "b", "unit": "m", "seed": 3})])
     assert names(both) == ["0", "1", "0 (2)", "1 (2)", "2"]
     assert both.provenance == {"file": "a; b", "unit": "m", "seed": 3}
-    spaced = [Recording(many(1).trials, {"outlines": text}) for text in ('{"a": [1]}', '{"a":[1]}')]
-    assert join(spaced).provenance == {"outlines": '{"a": [1]}'}
-    deep = "[" * 100_000
-    for texts in (("3.10", "3.1"), ("1", "true"), (deep, "x")):
+    for texts in (("3.10", "3.1"), ("1", "true")):
         facts = [Recording(many(1).trials, {"software": text}) for text in texts]
         assert join(facts).provenance == {"software": "; ".join(texts)}

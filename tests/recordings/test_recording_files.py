@@ -172,7 +172,7 @@ def test_files_that_tell_their_units_want_no_others(tmp_path):
 @pytest.mark.parametrize(
     ("about", "sentence"),
     [
-        ('{"version": 2}', "has version 2, but this palpate reads 1: read it with the palpate"),
+        ('{"version": 3}', "has version 3, but this palpate reads up to 2: install a newer"),
         ('{"version": 1}', "damaged or not NPZ"),
         ("[1]", "damaged or not NPZ"),
         ("{", "damaged or not NPZ"),
@@ -284,8 +284,8 @@ def spoilt(value):
         ({"positions": CHAIN[:0]}, r"empty: its shape is \(0, 4, 3\)"),
         ({"positions": CHAIN.astype(str)}, "real numbers, but its dtype is <U"),
         ({"positions": CHAIN.astype(object)}, "'positions' holds Python objects, which are never"),
-        ({"positions": spoilt(np.inf)}, "marker 2 of trial 'r' is infinite in frame 3"),
-        ({"positions": CHAIN * np.nan}, "no marker is seen in any frame of trial 'r'"),
+        ({"positions": spoilt(np.inf)}, "trial 'r': marker 2 is infinite in frame 3"),
+        ({"positions": CHAIN * np.nan}, "trial 'r': no marker is seen in any frame"),
         ({"positions": CHAIN, "time": np.arange(4.0)}, r"'time' has to be .* but is \(4,\)"),
         ({"positions": CHAIN, "time": np.array(["a"] * 5)}, "'time' has to be seconds, but its"),
         ({"positions": CHAIN, "time": np.full(5, None)}, "'time' holds Python objects"),

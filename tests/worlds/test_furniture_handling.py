@@ -1,12 +1,10 @@
 """Handling and pushing furniture: how far it goes, and what a recording of it holds."""
 
-import json
-
 import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.recordings import Role
+from palpate.recordings import Labels, Polygons, Role
 from palpate.worlds.furniture.furniture import KINDS, FurnitureWorld, Piece
 from palpate.worlds.furniture.handling import Push, Wiggle, record, record_handling, record_pushes
 from trolley import sledge, trolley
@@ -84,10 +82,10 @@ def test_a_recording_fits_the_contract_and_aligns():
     assert aligned.observation.shape == (2, 51, 2, 3)
     assert aligned.action.shape == (2, 50, 2, 3)
     assert (aligned.action[1] == wrench.values).all()
-    assert json.loads(recording.provenance["bodies"]) == ["chair", "box"]
-    outlines = json.loads(recording.provenance["outlines"])
-    assert np.array(outlines["box"]) == pytest.approx(np.array(KINDS["box"].outline))
-    assert np.shape(json.loads(recording.provenance["walls"])) == (1, 4, 2)
+    assert recording.fact("bodies", Labels) == Labels(("chair", "box"))
+    outlines = recording.fact("outlines", Polygons)
+    assert outlines["box"] == pytest.approx(np.array(KINDS["box"].outline))
+    assert np.shape(recording.fact("walls", Polygons).polygons) == (1, 4, 2)
 
 
 def test_a_recorded_wrench_explains_the_recorded_motion():

@@ -1,35 +1,222 @@
-"""Stamped values on a uniform grid: in order, interpolated, or averaged over a period.
+"""Recordings on a uniform grid of control periods: interpolated, averaged, or looked up.
 
-Values are (stamps, *shape), times (stamps,) in s and ascending but for `in_order`.
+Algorithms do not work on channels but on `Aligned`, which `Recording.align` makes.
 """
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from palpate.errors import PalpateError
+from palpate.recordings.channel import Channel, Role
+from palpate.recordings.trial import Trial
 
-def in_order(
-    time: np.ndarray, values: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Rows sorted by stamp, the last of equal stamps kept, and what was done to get there."""
-    notes = []
-    behind = np.maximum.accumulate(time) - time
-    if late := int((behind > 0).sum()):
-        notes.append(
-            f"{late} of {len(time)} rows were out of order, by up to {behind.max():.4g} s, "
-            "and were sorted"
+OBSERVATION_GAP = 3  # nominal periods over which an observation may be interpolated
+DRIVEN_GAP = 10  # nominal periods over which a driven state may be interpolated
+ON_STAMP = 1e-3  # control periods by which a frame may miss a stamp and still stand on it
+LARGEST = 4 * 2**30  # bytes; more is a mistake in a clock, a period or a file, not a recording
+
+Names = str | Sequence[str] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """A recording on a uniform grid of `period` seconds, trials padded to the longest.
+
+    `observation` (trials, frames, *shape) is NaN where nothing was seen and past a trial's end.
+    `action` (trials, frames - 1, *shape) acts from frame t to t + 1; past a trial's end the last
+    one is repeated. `length` (trials,) counts the frames of each trial.
+
+    Of several channels, the numbers of a frame stand side by side, (trials, frames, numbers), and
+    `observations` and `actions` are views of each by its name, in its own shape. `observed` and
+    `acted` are these shapes. `events` (trials, frames) by name is the index of the newest event at
+    each frame: -1 before the first one and past a trial's end.
+    """
+
+    period: float
+    observation: np.ndarray
+    action: np.ndarray
+    length: np.ndarray
+    observed: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    acted: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    events: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def observations(self) -> dict[str, np.ndarray]:
+        """Each observation by its name, (trials, frames, *shape)."""
+        return _by_name(self.observation, self.observed)
+
+    @property
+    def actions(self) -> dict[str, np.ndarray]:
+        """Each action by its name, (trials, frames - 1, *shape)."""
+        return _by_name(self.action, self.acted)
+
+
+def align(
+    trials: Sequence[Trial], period: float, observation: Names, action: Names, events: Sequence[str]
+) -> Aligned:
+    """See `Recording.align`."""
+    if not (math.isfinite(period) and period > 0):
+        raise PalpateError(
+            f"the period has to be a positive number of seconds, not {period}: a channel of a "
+            "single stamp has none"
         )
-        order = np.argsort(time, kind="stable")
-        time, values = time[order], values[order]
-    last = np.append(np.diff(time) > 0, True)
-    if repeated := int((~last).sum()):
-        notes.append(f"{repeated} rows had the stamp of a later row and were dropped")
-        time, values = time[last], values[last]
-    return time, values, tuple(notes)
+    seen = _pick(trials, observation, "observation", (Role.OBSERVATION,))
+    acted = _pick(trials, action, "action", (Role.DRIVEN, Role.COMMAND))
+    if not seen[0]:
+        raise PalpateError("no observation is named: expected at least one")
+    spans = [_span(*of, period) for of in zip(trials, seen, acted, strict=True)]
+    count, frames = len(trials), max(length for _, length in spans)
+    sizes = [sum(channel.values[0].size for channel in of[0]) for of in (seen, acted)]
+    if 8 * count * frames * sum(sizes) > LARGEST:
+        longest = max(zip(spans, trials, strict=True), key=lambda pair: pair[0][1])[1]
+        raise PalpateError(
+            f"{count} trials of up to {frames} frames of {period:.4g} s do not fit in memory: "
+            f"trial '{longest.name}' is {longest.duration:.6g} s long, so check its time "
+            "stamps or take a longer period"
+        )
+    observations = np.full((count, frames, sizes[0]), np.nan, _dtype(seen))
+    actions = np.empty((count, frames - 1, sizes[1]), _dtype(acted))
+    newest = {name: np.full((count, frames), -1) for name in events}
+    for i, (trial, (start, length)) in enumerate(zip(trials, spans, strict=True)):
+        grid = start + period * np.arange(length)
+        slack = ON_STAMP * period
+        columns = [_interpolated(channel, grid, OBSERVATION_GAP, slack) for channel in seen[i]]
+        observations[i, :length] = _side_by_side(columns, length)
+        columns = [_actions(channel, grid, trial, slack) for channel in acted[i]]
+        actions[i, : length - 1] = _side_by_side(columns, length - 1)
+        actions[i, length - 1 :] = actions[i, length - 2]
+        for name, index in newest.items():
+            time = trial.event(name).time
+            index[i, :length] = np.searchsorted(time, grid + slack, side="right") - 1
+    observed, acting = ({c.name: c.values.shape[1:] for c in of[0]} for of in (seen, acted))
+    aligned = Aligned(
+        period=float(period),
+        observation=_shaped(observations, observed),
+        action=_shaped(actions, acting),
+        length=np.array([length for _, length in spans]),
+        observed=observed,
+        acted=acting,
+        events=newest,
+    )
+    for array in (aligned.observation, aligned.action, aligned.length, *newest.values()):
+        array.setflags(write=False)
+    return aligned
+
+
+def _pick(
+    trials: Sequence[Trial], names: Names, what: str, roles: tuple[Role, ...]
+) -> list[list[Channel]]:
+    """The channels to align in each trial: those called `names`, or the only one there is."""
+    wanted = [names] if names is None or isinstance(names, str) else list(names)
+    if len(set(wanted)) < len(wanted):
+        raise PalpateError(f"a channel is named twice as {what}: {', '.join(map(str, wanted))}")
+    picked = [[_one(trial, name, what, roles) for name in wanted] for trial in trials]
+    for trial, channels in zip(trials, picked, strict=True):
+        for first, channel in zip(picked[0], channels, strict=True):
+            for kind, there, here in (
+                ("shape", first.values.shape[1:], channel.values.shape[1:]),
+                ("role", first.role.value, channel.role.value),
+                ("unit", first.unit, channel.unit),
+                ("frame", first.frame, channel.frame),
+                ("axes", first.axes, channel.axes),
+            ):
+                if there != here:
+                    raise PalpateError(
+                        f"'{channel.name}' has the {kind} {here} in trial '{trial.name}' but "
+                        f"{there} in trial '{trials[0].name}': trials have to agree"
+                    )
+    return picked
+
+
+def _one(trial: Trial, name: str | None, what: str, roles: tuple[Role, ...]) -> Channel:
+    fitting = [c for c in trial.channels.values() if c.role in roles]
+    if name is not None:
+        fitting = [c for c in fitting if c is trial[name]]
+    if len(fitting) != 1:
+        kinds = " or ".join(role.value for role in roles)
+        there = ", ".join(f"{c.name} ({c.role.value})" for c in trial.channels.values())
+        raise PalpateError(
+            f"trial '{trial.name}' needs one {kinds} channel as its {what}"
+            + (f", which '{name}' is not" if name else "")
+            + f"; it has: {there}; "
+            + ("name one of them" if fitting else f"record one whose role is {kinds}")
+        )
+    return fitting[0]
+
+
+def _span(
+    trial: Trial, sensors: list[Channel], sources: list[Channel], period: float
+) -> tuple[float, int]:
+    """The time of the first frame and the number of frames that all channels cover."""
+    channels = [*sensors, *sources]
+    start = max(float(channel.time[0]) for channel in channels)
+    # An order outlives its stamp, a measured state does not.
+    end = min(float(c.time[-1]) for c in channels if c.role is not Role.COMMAND)
+    length = math.floor(min((end - start) / period + ON_STAMP, LARGEST)) + 1
+    if length < 2:
+        names = " and ".join(f"'{channel.name}'" for channel in channels)
+        raise PalpateError(
+            f"{names} of trial '{trial.name}' overlap for "
+            f"{max(end - start, 0.0):.4g} s, less than one period of {period:.4g} s"
+        )
+    return start, length
+
+
+def _interpolated(channel: Channel, grid: np.ndarray, gap: int, slack: float) -> np.ndarray:
+    """See `interpolate`; `gap` is in nominal periods."""
+    seconds = gap * channel.nominal_period * (1 + ON_STAMP)
+    return interpolate(channel.time, channel.values, grid, seconds, slack)
+
+
+def _actions(channel: Channel, grid: np.ndarray, trial: Trial, slack: float) -> np.ndarray:
+    """What acts from each frame of `grid` to the next, (len(grid) - 1, *shape)."""
+    if channel.role is Role.COMMAND:
+        return mean_in_force(channel.time, channel.values, grid, slack)
+    actions = _interpolated(channel, grid[1:], DRIVEN_GAP, slack)
+    unknown = np.isnan(actions).reshape(len(actions), -1).any(axis=1)
+    if unknown.any():
+        raise PalpateError(
+            f"'{channel.name}' of trial '{trial.name}' has no stamps around "
+            f"{grid[1:][unknown][0]:.4f} s for more than {DRIVEN_GAP} of its periods of "
+            f"{channel.nominal_period:.4g} s: cut the trial there"
+        )
+    return actions
+
+
+def _dtype(channels: list[list[Channel]]) -> np.dtype:
+    return np.result_type(np.float32, *(channel.values for of in channels for channel in of))
+
+
+def _side_by_side(parts: list[np.ndarray], frames: int) -> np.ndarray:
+    """Values (frames, *shape) of several channels as (frames, numbers)."""
+    return np.concatenate([np.empty((frames, 0)), *(p.reshape(frames, -1) for p in parts)], axis=1)
+
+
+def _shaped(array: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> np.ndarray:
+    """The numbers of a single channel in its own shape; those of several stay side by side."""
+    shape = next(iter(shapes.values())) if len(shapes) == 1 else array.shape[2:]
+    return array.reshape(*array.shape[:2], *shape)
+
+
+def _by_name(array: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    flat = array.reshape(*array.shape[:2], -1) if array.size else array
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()], dtype=int)
+    parts = np.split(flat, ends[:-1], axis=2)
+    return {
+        name: part.reshape(*part.shape[:2], *shape)
+        for (name, shape), part in zip(shapes.items(), parts, strict=False)
+    }
 
 
 def interpolate(
     time: np.ndarray, values: np.ndarray, grid: np.ndarray, gap: float, slack: float
 ) -> np.ndarray:
-    """Values (len(grid), *shape) at `grid`, NaN where a neighbour is unseen or over `gap` s away.
+    """Values (stamps, *shape) at `grid` (frames,); NaN by a neighbour unseen or over `gap` s away.
 
     A frame within `slack` seconds of a stamp stands on it and needs no other neighbour.
     """

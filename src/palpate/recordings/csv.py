@@ -1,7 +1,7 @@
 """Motion-capture tables as text: plain CSV, OptiTrack Motive, Vicon Nexus and Tracker.
 
 One file is one trial. A reader finds the columns and the unit that the file declares; what a
-marker's metres are and which way is up is settled in `palpate.recordings.files`.
+marker's metres are and which way is up is settled in `palpate.recordings.tables`.
 """
 
 from __future__ import annotations
@@ -11,35 +11,18 @@ import math
 import re
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.recordings.tables import MarkerTable
 
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
 _SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIME = re.compile(r"(?:time|t|timestamp)[\s_(\[]*(s|sec|seconds|ms|us|ns|)[)\]]?", re.IGNORECASE)
 _COORDINATE = re.compile(r"(?:(.*)[_.:\s])?([xyz])", re.IGNORECASE)
-
-
-@dataclass(frozen=True, eq=False)
-class MarkerTable:
-    """What a file tells about one trial, in the file's own unit and axes.
-
-    `positions` (frames, markers, 3) with NaN for what was not seen, `time` (frames,) in seconds or
-    None, `unit` ("m", "cm", "mm") or None and `up` ("y" or None) where the format says so.
-    """
-
-    format: str
-    time: np.ndarray | None
-    positions: np.ndarray
-    markers: tuple[str, ...] = ()
-    unit: str | None = None
-    up: str | None = None
-    notes: tuple[str, ...] = ()
 
 
 def read_csv(path: str | Path) -> MarkerTable:
@@ -129,14 +112,14 @@ def _plain(names: list[str], lines: _Lines) -> MarkerTable:
     if not triples:
         raise PalpateError(
             "no marker columns: expected three for each marker, such as m0_x, m0_y and m0_z, "
-            f"but the header has {_some(names)}"
+            f"but the header has {some(names)}"
         )
-    markers = _in_natural_order(list(triples))
+    markers = in_natural_order(list(triples))
     clock, second = clocks[0] if clocks else (None, 1.0)
     time, positions = _table(lines, len(names), clock, [triples[name] for name in markers])
     used = {clock, *chain.from_iterable(triples.values())}
     unused = [name for column, name in enumerate(names) if column not in used and name]
-    notes = (f"columns that are no markers were left out: {_some(unused)}",) if unused else ()
+    notes = (f"columns that are no markers were left out: {some(unused)}",) if unused else ()
     return MarkerTable(
         "CSV", None if clock is None else time * second, positions, markers, notes=notes
     )
@@ -170,14 +153,14 @@ def _motive(first: list[str], lines: _Lines) -> MarkerTable:
         ],
     )
     if not triples:
-        there = _some(sorted({kind for kind in kinds[2:] if kind and kind.lower() != "type"}))
+        there = some(sorted({kind for kind in kinds[2:] if kind and kind.lower() != "type"}))
         raise PalpateError(f"no columns of type Marker (there are: {there}): export the markers")
     labelled = {k: v for k, v in triples.items() if not k.lower().startswith("unlabeled")}
     notes = ()
     if labelled and len(labelled) < len(triples):
         notes = (f"{len(triples) - len(labelled)} unlabelled markers were left out",)
     triples = labelled or triples
-    markers = _in_natural_order(list(triples))
+    markers = in_natural_order(list(triples))
     time, positions = _table(lines, width, clock, [triples[name] for name in markers])
     unit = _unit(facts["length units"], 1) if "length units" in facts else None
     return MarkerTable("OptiTrack Motive CSV", time, positions, markers, unit, "y", notes)
@@ -201,8 +184,8 @@ def _vicon(first: list[str], lines: _Lines) -> MarkerTable:
         raise PalpateError(f"line {lines.number - 1} has no columns X, Y, Z")
     unit = {_unit(units[column], lines.number) for column in chain(*triples.values())}
     if len(unit) > 1:
-        raise PalpateError(f"line {lines.number} mixes the units {_some(sorted(unit))}")
-    markers = _in_natural_order(list(triples))
+        raise PalpateError(f"line {lines.number} mixes the units {some(sorted(unit))}")
+    markers = in_natural_order(list(triples))
     frame, positions = _table(lines, width, 0, [triples[name] for name in markers], block=True)
     return MarkerTable("Vicon CSV", frame / rate, positions, markers, unit.pop())
 
@@ -252,11 +235,11 @@ def _named(names: list[str], columns: list[int]) -> dict[str, list[int]]:
 
 def _unit(name: str, line: int) -> str:
     if name.lower() not in _UNITS:
-        raise PalpateError(f"line {line}: unknown unit '{name}'; known are {_some(list(_UNITS))}")
+        raise PalpateError(f"line {line}: unknown unit '{name}'; known are {some(list(_UNITS))}")
     return _UNITS[name.lower()]
 
 
-def _in_natural_order(names: list[str]) -> tuple[str, ...]:
+def in_natural_order(names: list[str]) -> tuple[str, ...]:
     """Names that differ in their last number are sorted by it; otherwise as they first appear."""
     parts = {name: re.fullmatch(r"(.*?)(\d*)(\D*)", name, re.DOTALL) for name in names}
     families: dict[tuple[str, str], list[tuple[int, str]]] = {}
@@ -266,6 +249,7 @@ def _in_natural_order(names: list[str]) -> tuple[str, ...]:
     return tuple(name for family in families.values() for _, name in sorted(family))
 
 
-def _some(names: Sequence[str], most: int = 6) -> str:
+def some(names: Sequence[str], most: int = 6) -> str:
+    """The first of `names`, and how many more there are, for a sentence."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.recordings.recording import Aligned, Channel, Recording, Role
+from palpate.recordings.alignment import Aligned
+from palpate.recordings.channel import Channel, Role
+from palpate.recordings.recording import Recording
 from palpate.runs.storage import write_json
 
 STATE, ACTION, SEEN = "observation.state", "action", "seen"

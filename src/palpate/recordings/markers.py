@@ -15,15 +15,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from palpate.errors import PalpateError
-from palpate.recordings.recording import (
-    DRIVEN_GAP,
-    ON_STAMP,
-    Channel,
-    Recording,
-    Role,
-    Trial,
-    resolve_indices,
-)
+from palpate.recordings.alignment import DRIVEN_GAP, ON_STAMP
+from palpate.recordings.channel import Channel, Role
+from palpate.recordings.recording import Recording, resolve_indices
+from palpate.recordings.trial import Trial
 
 EXCHANGE_RATIO = 0.25  # of the jump that exchanging two markers back may leave over
 FROZEN_FRAMES = 5  # identical positions in a row before a marker counts as frozen

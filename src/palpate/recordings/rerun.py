@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.recordings.recording import Channel, Recording
+from palpate.recordings.channel import Channel
+from palpate.recordings.recording import Recording
 from palpate.runs.storage import write_bytes
 
 PAUSE = 0.5  # s between trials

@@ -9,7 +9,6 @@ state, whole wrench) and in the piece's own axes; of both the better on these ve
 """
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from palpate.identification.posterior.likelihood import inferred_scales, motion_
 from palpate.identification.regression.model import RegressedModel, regressed
 from palpate.models.model import rollout
 from palpate.models.planar import Planar, PlanarState
-from palpate.recordings import Aligned, Recording
+from palpate.recordings import Aligned, Polygons, Recording
 from palpate.trials.furniture.planar_features import body_features, raw_features
 
 SAMPLE = 0.1  # s
@@ -96,7 +95,9 @@ def _theirs(handled: Recording, aligned: Aligned, pushes: Recording, kind: str, 
     """Of the better of two choices of inputs; the object-oriented kind needs the piece's own."""
     prototype = starting_furniture(handled, SAMPLE)
     fine = starting_furniture(handled, PERIOD)
-    outline = np.asarray(json.loads(str(handled.provenance["outlines"]))[names_of(handled)[0]])
+    outlines = handled.fact("outlines", Polygons)
+    assert outlines is not None  # the world's own recordings have them
+    outline = outlines[names_of(handled)[0]]
     before, wrench, after = transitions(aligned, fine, size)
     asked = pushes_of(pushes, fine)
     choices = [body_features([outline])] + ([] if kind == "oo-lwr" else [raw_features()])

@@ -1,7 +1,6 @@
 """What a recording of furniture says of itself, and the model that is fitted to it."""
 
 import dataclasses
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -14,8 +13,10 @@ import shapely
 from palpate.errors import PalpateError
 from palpate.models.planar import Planar, furniture
 from palpate.models.planar.geometry import Shapes, nearest
+from palpate.models.planar.shapes import rectangle
+from palpate.numerics.polygons import shown
 from palpate.parameters import as_floating
-from palpate.recordings import Channel, Recording, Role
+from palpate.recordings import Channel, Labels, Polygons, Recording, Role
 from palpate.worlds.furniture.furniture import FurnitureWorld
 from palpate.worlds.furniture.handling import record_handling, record_pushes
 from palpate.worlds.furniture.pieces import Piece
@@ -93,18 +94,17 @@ def _plain(unit: str) -> str:
 
 
 def names_of(recording: Recording) -> tuple[str, ...]:
-    """What the bodies are called: as the recording says, else "body 1" and so on."""
+    """What the bodies are called: as the fact "bodies" says, else "body 1" and so on."""
     count = recording.trials[0][POSE].values.shape[1]
-    told = _told(recording, "bodies")
-    if told is None:
+    bodies = recording.fact("bodies", Labels)
+    if bodies is None:
         return tuple(f"body {number + 1}" for number in range(count))
-    if not (isinstance(told, list) and len(told) == count and all(map(_is_name, told))):
+    if len(bodies.labels) != count:
         raise PalpateError(
-            f'the recording\'s "bodies" are {told!r}: expected names of its {count} bodies'
+            f'the recording\'s "bodies" are {shown(bodies.labels)}: expected names of its {count} '
+            "bodies"
         )
-    if len(set(told)) < count:
-        raise PalpateError(f'the recording\'s "bodies" are {told!r}: expected a name for each')
-    return tuple(told)
+    return tuple(bodies.labels)
 
 
 def check_alike(*recordings: Recording, sized: bool = False) -> None:
@@ -113,20 +113,16 @@ def check_alike(*recordings: Recording, sized: bool = False) -> None:
     Bodies that are `sized` in another way may have any outlines.
     """
     names = [names_of(recording) for recording in recordings]
-    named = {of for of, each in zip(names, recordings, strict=True) if "bodies" in each.provenance}
+    named = {of for of, each in zip(names, recordings, strict=True) if each.fact("bodies", Labels)}
     if len(named) > 1 or len(set(map(len, names))) > 1:
-        told = " and of ".join(dict.fromkeys(", ".join(of) for of in names))
+        bodies = " and of ".join(dict.fromkeys(", ".join(of) for of in names))
         raise PalpateError(
-            f"the recordings are of {told}: expected the same bodies in what is fitted and in what "
-            "is scored"
+            f"the recordings are of {bodies}: expected the same bodies in what is fitted and in "
+            "what is scored"
         )
-    outlines = [] if sized else [_told(each, "outlines") for each in recordings]
+    outlines = [] if sized else [each.fact("outlines", Polygons) for each in recordings]
     for name in names[0]:
-        corners = [
-            shapely.MultiPoint(_polygon(one[name], f"outline of '{name}'"))
-            for one in outlines
-            if isinstance(one, dict) and name in one
-        ]
+        corners = [shapely.MultiPoint(one[name]) for one in outlines if one and name in one.names]
         if any(corners[0].hausdorff_distance(other) > SAME for other in corners[1:]):
             raise PalpateError(
                 f"'{name}' has another outline in what is scored than in what is fitted: expected "
@@ -139,31 +135,35 @@ def starting_furniture(
 ) -> Planar:
     """The planar model of the bodies in a recording, every parameter at its prior's centre.
 
-    Outlines and walls are those that the recording brings; where it brings none, every body is a
-    rectangle of `size` (m along x and y of its frame). `structure` as in `furniture`.
+    Outlines and walls are the facts "outlines" and "walls" of the recording; where it has no
+    outlines, every body is a rectangle of `size` (m along x and y of its frame). `structure` as in
+    `furniture`.
 
-    Raises `PalpateError` when there are neither, or they are malformed.
+    Raises `PalpateError` when there are neither, or an outline is longer than 50 m.
     """
     names = names_of(recording)
-    told = None if size is not None else _told(recording, "outlines")
+    facts = None if size is not None else recording.fact("outlines", Polygons)
     if size is not None:
         if not all(math.isfinite(s) and s > 0 for s in size):
             raise PalpateError(f"a size is two positive lengths in m, not {size}")
-        x, y = size[0] / 2, size[1] / 2
-        outlines = [[(-x, -y), (x, -y), (x, y), (-x, y)]] * len(names)
-    elif isinstance(told, dict) and set(names) <= set(told):
-        outlines = [_polygon(told[name], f"outline of '{name}'", LARGEST) for name in names]
+        outlines = [rectangle(*size)] * len(names)
+    elif facts is not None and set(names) <= set(facts.names):
+        outlines = [facts[name] for name in names]
     else:
         raise PalpateError(
-            'the recording does not say how large the bodies are: expected "outlines" in its '
-            "provenance, or --size LENGTH WIDTH"
+            'the recording does not say how large the bodies are: expected a fact "outlines" of '
+            "polygons with their names, or --size LENGTH WIDTH"
         )
-    walls = _told(recording, "walls") or []
-    if not isinstance(walls, list):
-        raise PalpateError(f'the recording\'s "walls" are {walls!r}: expected a list of polygons')
+    for name, outline in zip(names, outlines, strict=True):
+        if (length := np.ptp(outline, axis=0).max()) > LARGEST:
+            raise PalpateError(
+                f"the outline of '{name}' is {length:.4g} m long: expected at most {LARGEST:g} m, "
+                "so its corners may not be in m"
+            )
+    walls = recording.fact("walls", Polygons)
     return furniture(
         outlines,
-        [_polygon(wall, f"wall {number}") for number, wall in enumerate(walls)],
+        walls.polygons if walls else (),
         control_period=period,
         poses=_first_seen(recording),
         **structure,
@@ -229,6 +229,7 @@ def record_pieces(
 
 def alone(recording: Recording, body: int) -> Recording:
     """A recording as if one of its bodies had been alone."""
+    name = Labels((names_of(recording)[body],))
     trials = [
         dataclasses.replace(
             trial,
@@ -236,13 +237,11 @@ def alone(recording: Recording, body: int) -> Recording:
                 of: dataclasses.replace(trial[of], values=trial[of].values[:, body : body + 1])
                 for of in (POSE, WRENCH)
             },
+            facts={**trial.facts, "bodies": name},
         )
         for trial in recording.trials
     ]
-    told = {"bodies": json.dumps([names_of(recording)[body]])}
-    return dataclasses.replace(
-        recording, trials=tuple(trials), provenance=dict(recording.provenance) | told
-    )
+    return dataclasses.replace(recording, trials=tuple(trials))
 
 
 def _first_seen(recording: Recording) -> np.ndarray:
@@ -261,47 +260,3 @@ def _unwrapped(poses: np.ndarray) -> np.ndarray:
         seen = np.isfinite(poses[:, body, 2])
         poses[seen, body, 2] = np.unwrap(poses[seen, body, 2])
     return poses
-
-
-def _told(recording: Recording, key: str) -> Any:
-    text = recording.provenance.get(key)
-    if text is None:
-        return None
-    try:
-        return json.loads(str(text))
-    except (ValueError, RecursionError) as error:
-        parts = str(text).split("; ")  # as `join` puts together what differs
-        if len(parts) > 1 and all(map(_is_json, parts)):
-            raise PalpateError(
-                f'the recordings say different things of "{key}": expected the same of all'
-            ) from error
-        raise PalpateError(f'the recording\'s "{key}" is not JSON: {error}') from error
-
-
-def _is_json(text: str) -> bool:
-    try:
-        json.loads(text)
-    except (ValueError, RecursionError):
-        return False
-    return True
-
-
-def _polygon(points: Any, what: str, most: float = math.inf) -> np.ndarray:
-    try:
-        polygon = np.asarray(points, float)
-    except (TypeError, ValueError) as error:
-        raise PalpateError(f"the {what} is not a list of points (x, y)") from error
-    if polygon.ndim != 2 or polygon.shape[1:] != (2,) or not np.isfinite(polygon).all():
-        raise PalpateError(
-            f"the {what} has shape {polygon.shape}: expected finite points (corners, 2) in m"
-        )
-    if len(polygon) and np.ptp(polygon, axis=0).max() > most:
-        raise PalpateError(
-            f"the {what} is {np.ptp(polygon, axis=0).max():.4g} m long: expected at most {most:g} "
-            "m, so its corners may not be in m"
-        )
-    return polygon
-
-
-def _is_name(text: Any) -> bool:
-    return isinstance(text, str) and bool(text)

@@ -6,36 +6,25 @@ Reads MCAP files, rosbag2 folders and databases, and ROS 1 bags. No ROS has to b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.recordings.csv import MarkerTable
-from palpate.recordings.recording import DRIVEN_GAP, ON_STAMP, Role
+from palpate.recordings.alignment import DRIVEN_GAP, ON_STAMP
+from palpate.recordings.channel import Role
+from palpate.recordings.csv import some
 from palpate.recordings.rosbag.files import Bag, open_bag
-from palpate.recordings.rosbag.topics import Chosen, Track, choose, some, tracks_of
+from palpate.recordings.rosbag.topics import Chosen, Track, choose, tracks_of
+from palpate.recordings.tables import InputTable, MarkerTable
 
 CLOCKS_APART = 0.5  # s between clocks; less is what cameras and networks take
 SHORTEST = 1.0  # s of a piece between two gaps that is worth being a trial
 GRIPPER, COMMAND = "gripper", "command"
 
 
-@dataclass(frozen=True, eq=False)
-class InputTable:
-    """What drove the object, in the file's own unit and axes: `values` (frames, 1, 3)."""
-
-    name: str
-    role: Role
-    time: np.ndarray
-    values: np.ndarray
-
-
-def read_bag(
-    path: str | Path, topics: Sequence[str] = ()
-) -> list[tuple[str, MarkerTable, tuple[InputTable, ...]]]:
-    """Trials of a log: a name, markers, and what drove them, in the file's own unit and axes.
+def read_bag(path: str | Path, topics: Sequence[str] = ()) -> list[tuple[str, MarkerTable]]:
+    """Trials of a log by name: markers and what drove them, in the file's own unit and axes.
 
     Markers come from a topic whose messages list several places; which, is plain when there is
     only one. A gripper comes from a topic of poses in the same frame that stays within a segment of
@@ -57,9 +46,7 @@ def read_bag(
     return _trials(path, bag, choose(tracks, bag.contents, topics))
 
 
-def _trials(
-    path: Path, bag: Bag, chosen: Chosen
-) -> list[tuple[str, MarkerTable, tuple[InputTable, ...]]]:
+def _trials(path: Path, bag: Bag, chosen: Chosen) -> list[tuple[str, MarkerTable]]:
     times, notes = _times(chosen)
     pieces = _pieces([time for track, time in times.items() if track is not chosen.command], chosen)
     long = [piece for piece in pieces if piece[1] - piece[0] >= SHORTEST] or pieces
@@ -70,14 +57,6 @@ def _trials(
         )
     trials = []
     for number, (begin, end) in enumerate(long):
-        rows = _within(times[chosen.markers], begin, end)
-        table = MarkerTable(
-            f"{bag.format}, topic {chosen.markers.topic}",
-            times[chosen.markers][rows],
-            chosen.positions[rows],
-            chosen.names,
-            notes=tuple(notes) if number == 0 else (),
-        )
         inputs = []
         for name, role, track in (
             (GRIPPER, Role.DRIVEN, chosen.gripper),
@@ -90,8 +69,16 @@ def _trials(
                 rows = _within(times[track], since, end)
                 values = np.stack([sight.points for sight in track.sights])[rows]
                 inputs.append(InputTable(name, role, times[track][rows], values))
-        name = path.stem if len(long) == 1 else f"{path.stem}/{number}"
-        trials.append((name, table, tuple(inputs)))
+        rows = _within(times[chosen.markers], begin, end)
+        table = MarkerTable(
+            f"{bag.format}, topic {chosen.markers.topic}",
+            times[chosen.markers][rows],
+            chosen.positions[rows],
+            chosen.names,
+            notes=tuple(notes) if number == 0 else (),
+            inputs=tuple(inputs),
+        )
+        trials.append((path.stem if len(long) == 1 else f"{path.stem}/{number}", table))
     return trials
 
 

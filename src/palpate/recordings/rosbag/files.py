@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from palpate.errors import PalpateError
-from palpate.recordings.recording import LARGEST
+from palpate.recordings.alignment import LARGEST
 from palpate.recordings.rosbag.decoding import Decode, json_decoder, ros_decoder
 from palpate.runs.storage import DamagedFileError
 

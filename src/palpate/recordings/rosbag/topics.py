@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.recordings.csv import _in_natural_order
-from palpate.recordings.recording import LARGEST
+from palpate.recordings.alignment import LARGEST
+from palpate.recordings.csv import in_natural_order, some
 from palpate.recordings.rosbag.files import Bag, Contents
 from palpate.recordings.rosbag.messages import LATEST, MOST, Kind, Sight, sights
 from palpate.runs.storage import DamagedFileError
@@ -211,12 +211,6 @@ def _listed(contents: Contents) -> str:
     return f"there are: {some(there)}" if there else "there are no topics"
 
 
-def some(names: Sequence[str], most: int = 6) -> str:
-    """The first of `names`, and how many more there are, for a sentence."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
-
-
 def _holds_the_first(pose: Track, markers: Track, positions: np.ndarray) -> bool:
     """Whether a pose stays, by median, within the first segment's length of the first marker."""
     if len(pose.sights) < 2 or positions.shape[1] < 2:
@@ -256,7 +250,7 @@ def _positions(track: Track) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
     """(messages, markers, 3), the names of the markers if they have any, and notes."""
     total = len(track.sights)
     if all(sight.names is not None for sight in track.sights):
-        names = _in_natural_order(
+        names = in_natural_order(
             list(dict.fromkeys(name for sight in track.sights for name in sight.names or ()))
         )
         if not 0 < len(names) <= MOST:

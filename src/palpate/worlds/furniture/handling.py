@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
 
 from palpate.errors import PalpateError
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Channel, Labels, Polygons, Recording, Role, Trial
+from palpate.recordings.facts import Fact
 from palpate.worlds.excitation import smooth_step
 from palpate.worlds.furniture.furniture import (
     CONTROL_PERIOD,
@@ -260,7 +260,7 @@ def record(
             `first_episode + i` of `seed`, so that all are of the same pieces.
         names: of the trials.
     """
-    recorded = []
+    recorded, facts = [], facts_of(world)
     for number, (name, trial) in enumerate(zip(names, trials, strict=True)):
         observations = [world.reset(seed, episode=first_episode + number)]
         if isinstance(trial, np.ndarray):
@@ -268,12 +268,14 @@ def record(
         else:
             for step in range(trial.steps):
                 observations.append(world.step(trial.wrench(step, world.truth())))
-        recorded.append(trial_of(name, observations))
-    facts = {"seed": seed, "first_episode": first_episode}
-    return Recording(tuple(recorded), provenance_of(world) | facts)
+        recorded.append(trial_of(name, observations, facts))
+    provenance = {"world": "furniture", "seed": seed, "first_episode": first_episode}
+    return Recording(tuple(recorded), provenance)
 
 
-def trial_of(name: str, observations: Sequence[FurnitureObservation]) -> Trial:
+def trial_of(
+    name: str, observations: Sequence[FurnitureObservation], facts: Mapping[str, Fact]
+) -> Trial:
     """What was observed in consecutive control periods, two or more, from a reset or later on.
 
     The observation "pose" (frames, bodies, 3) in m, m, rad and the command "wrench"
@@ -284,16 +286,14 @@ def trial_of(name: str, observations: Sequence[FurnitureObservation]) -> Trial:
     wrenches = np.array([observation.wrench for observation in observations[1:]])
     pose = Channel("pose", Role.OBSERVATION, time, poses, "m, m, rad", axes=AXES)
     wrench = Channel("wrench", Role.COMMAND, time[:-1], wrenches, "N, N, N m", axes=AXES)
-    return Trial(name, {"pose": pose, "wrench": wrench})
+    return Trial(name, {"pose": pose, "wrench": wrench}, facts=facts)
 
 
-def provenance_of(world: FurnitureWorld) -> dict[str, str | float | int]:
-    """What a recording says of its scene: "bodies" (names), "outlines" ({name: points in the body
-    frame, m}) and "walls" (polygons, m) as JSON, in the order of the channels' bodies."""
-    outlines = {name: outline.tolist() for name, outline in world.outlines.items()}
+def facts_of(world: FurnitureWorld) -> dict[str, Fact]:
+    """What a recording says of its scene: "bodies", names in the order of the channels' bodies,
+    their "outlines" in body frames and "walls"."""
     return {
-        "world": "furniture",
-        "bodies": json.dumps(world.names),
-        "outlines": json.dumps(outlines),
-        "walls": json.dumps([wall.tolist() for wall in world.walls]),
+        "bodies": Labels(world.names),
+        "outlines": Polygons(tuple(world.outlines.values()), tuple(world.outlines), "body"),
+        "walls": Polygons(world.walls),
     }

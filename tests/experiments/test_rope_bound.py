@@ -147,5 +147,5 @@ def test_a_search_that_was_cut_off_goes_on_and_one_that_is_done_is_read(
     assert result.settings["weights"] == "shipped"
     write_json(tmp_path / "result.json", result.to_dict())
     read_result(tmp_path / "result.json")
-    energy = read_evidence(tmp_path / "search").energy
+    energy = read_evidence(tmp_path / "search").pieces["energy"]
     assert energy.values["controlled"].shape == (2, 151)

@@ -83,8 +83,8 @@ def test_stages_hand_on_what_they_made(calls, tmp_path):
     read_result(tmp_path / "result.json")
     evidence = read_evidence(tmp_path / "evaluate")
     assert [motion.group for motion in evidence.motions] == list(START_POSES)
-    assert evidence.energy is not None
-    assert set(evidence.energy.values) == {"controlled", "held still", "swing damper"}
+    assert "energy" in evidence.pieces
+    assert set(evidence.pieces["energy"].values) == {"controlled", "held still", "swing damper"}
 
 
 def test_finished_stages_are_not_done_again(calls, tmp_path, monkeypatch):

@@ -5,8 +5,9 @@ import base64
 import numpy as np
 import pytest
 
+from palpate.families.rope.energy import chart as energy_chart
 from palpate.report import Curves, Motion
-from palpate.report.charts import energy, horizon, learning, quantiles
+from palpate.report.charts import horizon, learning, quantiles
 from palpate.report.evidence import Parameter
 from palpate.report.parameter_chart import number, parameters
 from palpate.report.player import scene
@@ -21,7 +22,7 @@ def traces(chart, **wanted):
 
 def test_energy_is_the_median_and_its_band_with_the_one_percent_line():
     values = np.exp(-TIME) * np.linspace(0.5, 1.5, 101)[:, None]
-    chart = energy(Curves(TIME, {"controlled": values}), {"controlled": 1})
+    chart = energy_chart(Curves(TIME, {"controlled": values}), {"controlled": 1})
     band, line = chart["data"]
     np.testing.assert_allclose(line["y"], np.exp(-TIME), rtol=1e-5)
     assert max(band["y"]) == pytest.approx(1.45)
@@ -31,7 +32,7 @@ def test_energy_is_the_median_and_its_band_with_the_one_percent_line():
 
 
 def test_energies_that_rounding_left_below_zero_can_be_drawn():
-    chart = energy(Curves(TIME, {"x": -np.ones((1, 201))}), {"x": 1})
+    chart = energy_chart(Curves(TIME, {"x": -np.ones((1, 201))}), {"x": 1})
     assert min(chart["data"][0]["y"]) > 0
 
 
@@ -106,8 +107,8 @@ def test_whiskers_are_relative_to_the_median_and_cut_with_an_arrow():
     assert whiskers[6:8] == [0.25, 1.0]
     (sure,) = traces(chart, name="identified, 90 % interval")
     assert sure["x"] == [1.0, 1.0, 0.5, 1.0, 2.0]
-    (untold,) = traces(chart, name="not told by the data")
-    assert untold["text"] == ["prior = 4 N (2 to 8)"]
+    (uninformed,) = traces(chart, name="not told by the data")
+    assert uninformed["text"] == ["prior = 4 N (2 to 8)"]
     assert whiskers[15:17] == [0.5, 2.0]
     assert traces(chart, name="fixed")[0]["x"] == [1.0]
     assert traces(chart, name="no interval")[0]["x"] == [1.0]

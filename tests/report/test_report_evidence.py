@@ -20,7 +20,7 @@ def test_everything_a_run_holds_is_found(tmp_path):
     assert np.isnan(motion.chains["observed"][130, 9]).all()
     assert list(evidence.horizon.values) == ["identified", "undamped baseline"]
     assert list(evidence.horizon.bands) == ["identified"]
-    assert evidence.energy is None
+    assert evidence.pieces == {}
     assert [figure.met for figure in evidence.figures] == [True, False]
     assert len(evidence.metrics) == 280
     assert evidence.name == "identify"
@@ -49,7 +49,7 @@ def test_groups_of_motions_stay_apart(tmp_path):
         "straight at 60 degrees",
         "half circle",
     ]
-    assert evidence.energy.values["controlled"].shape == (40, 501)
+    assert evidence.pieces["energy"].values["controlled"].shape == (40, 501)
 
 
 def test_a_run_without_evidence_is_read_for_the_rest(tmp_path):
@@ -122,7 +122,7 @@ def test_pickled_evidence_is_refused(tmp_path):
 
 def test_gigantic_evidence_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
     identification(tmp_path)
-    monkeypatch.setattr("palpate.report.evidence._LARGEST", 2**17)
+    monkeypatch.setattr("palpate.report.evidence.MAX_BYTES", 2**17)
     monkeypatch.setattr(np, "load", None)
     with pytest.raises(PalpateError, match=r"unpacks to 0 MiB, at most 0\.125 are"):
         read_evidence(tmp_path)

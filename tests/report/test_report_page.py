@@ -185,10 +185,10 @@ EVIL = "</script><script>alert(1)</script><img src='http://x/y' onerror=alert(1)
 
 
 def test_what_the_data_tell_is_counted_and_what_follows_from_it_is_not(tmp_path):
-    untold = "not told by the data: the interval is the prior's"
+    uninformed = "not told by the data: the interval is the prior's"
     rows = [
         parameter("mass", [8.0, 9.0], "kg", "") | {"lower": [7.0, 8.5], "upper": [8.5, 9.5]},
-        parameter("friction", [0.1], "1", "", lower=[0.0], upper=[0.4], verdict=untold),
+        parameter("friction", [0.1], "1", "", lower=[0.0], upper=[0.4], verdict=uninformed),
         parameter("radius", [0.2], "m", "", fixed=True),
         parameter("roll_direction", [3.0], "deg", "", lower=[-1.0], upper=[5.0], derived=True),
     ]

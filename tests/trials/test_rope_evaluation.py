@@ -221,9 +221,9 @@ def test_evidence_is_what_a_report_reads(short, tmp_path):
     evidence = read_evidence(tmp_path)
     assert [motion.group for motion in evidence.motions] == ["straight", "helix"]
     assert [set(motion.chains) for motion in evidence.motions] == [{"fast"}, {"fast"}]
-    assert evidence.energy is not None
-    assert evidence.energy.values["slow"].shape[0] == 4
-    np.testing.assert_allclose(evidence.energy.values["slow"][:, 0], 1.0)
+    assert "energy" in evidence.pieces
+    assert evidence.pieces["energy"].values["slow"].shape[0] == 4
+    np.testing.assert_allclose(evidence.pieces["energy"].values["slow"][:, 0], 1.0)
 
 
 def test_a_rope_that_was_never_seen_is_not_drawn(short, tmp_path):
@@ -237,4 +237,4 @@ def test_a_rope_that_was_never_seen_is_not_drawn(short, tmp_path):
         write_trial_evidence(run, trials, evaluated, ["slow", "fast"])
     evidence = read_evidence(tmp_path)
     assert [motion.group for motion in evidence.motions] == ["straight"]
-    assert evidence.energy is not None
+    assert "energy" in evidence.pieces

@@ -29,7 +29,7 @@ def tip(motion: Motion, looks: Mapping[str, int], height: int) -> Chart:
     data, layout = [], empty_layout(height)
     for row, axis in enumerate("xyz"):
         for label, chain in motion.chains.items():
-            line = _line(label, looks, motion.time, chain[:, -1, row], "%{y:.3f} m")
+            line = curve_line(label, looks, motion.time, chain[:, -1, row], "%{y:.3f} m")
             data.append(line | _panel(row) | {"showlegend": row == 0})
         top = 1.0 - row * 0.345
         layout[f"yaxis{row + 1 if row else ''}"] = titled_axis(f"{axis} (m)") | {
@@ -44,41 +44,11 @@ def horizon(curves: Curves, looks: Mapping[str, int], unit: str) -> Chart:
     data: list[dict[str, Any]] = []
     for label, values in curves.values.items():
         if label in curves.bands:
-            data += _band(label, looks, curves.time, *curves.bands[label])
-        data.append(_line(label, looks, curves.time, values, f"%{{y:.4g}} {plain_text(unit)}"))
+            data += quantile_band(label, looks, curves.time, *curves.bands[label])
+        data.append(curve_line(label, looks, curves.time, values, f"%{{y:.4g}} {plain_text(unit)}"))
     layout = empty_layout(340)
     layout["xaxis"] = titled_axis("time since the prediction began (s)")
     layout["yaxis"] = titled_axis(f"RMSE ({plain_text(unit) or 1})") | {"rangemode": "tozero"}
-    return {"data": data, "layout": layout}
-
-
-def energy(curves: Curves, looks: Mapping[str, int]) -> Chart:
-    """Median energy over the episodes and their 5-95 % band on a log scale, the 1 % line marked."""
-    data: list[dict[str, Any]] = []
-    largest = 1.0
-    for label, values in curves.values.items():
-        # what has come to rest may lie a rounding below zero, where a logarithm has no place
-        low, median, high = quantiles(np.maximum(values, 1e-9), (0.05, 0.5, 0.95))
-        largest = max(largest, float(np.nanmax(high, initial=1.0)))
-        if len(values) > 1:
-            data += _band(label, looks, curves.time, low, high)
-        data.append(_line(label, looks, curves.time, median, "%{y:.2%}"))
-    layout = empty_layout(380)
-    layout["xaxis"] = titled_axis("time (s)")
-    decades = range(-4, math.ceil(math.log10(largest)) + 1)
-    layout["yaxis"] = titled_axis("energy relative to the start (%)") | {
-        "type": "log",
-        "range": [-4.2, math.log10(largest) + 0.15],
-        "tickvals": [10.0**decade for decade in decades],
-        "ticktext": [f"{10.0 ** (decade + 2):g} %" for decade in decades],
-    }
-    line = {"color": "@ink", "width": 1.2, "dash": "4px,4px"}
-    layout["shapes"] = [
-        {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": 0.01, "y1": 0.01, "line": line}
-    ]
-    layout["annotations"] = [
-        _note("1 %: at rest", xref="paper", x=1, xanchor="right", y=-2, yanchor="bottom")
-    ]
     return {"data": data, "layout": layout}
 
 
@@ -108,11 +78,11 @@ def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
         looks = {name: look}
         smooth = _smooth(values, _column(metrics, "horizon"), every)
         if len(values) >= _MANY:
-            raw = _line(name, looks, steps[::every], values[::every], "%{y:.4g}")
+            raw = curve_line(name, looks, steps[::every], values[::every], "%{y:.4g}")
             raw |= {"line": {"color": f"@series-{look}:0.35", "width": 1}, "hoverinfo": "skip"}
             del raw["hovertemplate"]
             data.append(raw | {"showlegend": False})
-        line = _line(name, looks, steps[::every], smooth, "%{y:.4g}")
+        line = curve_line(name, looks, steps[::every], smooth, "%{y:.4g}")
         data.append(line | {"line": line["line"] | {"dash": "solid"}} if index == 1 else line)
     layout = empty_layout(300 + 110 * len(panels))
     bottom = 1.0 - 190 / (220 + 110 * len(panels)) if panels else 0.0
@@ -125,7 +95,7 @@ def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
     }
     share = bottom / len(panels) if panels else 0.0
     for row, name in enumerate(panels, start=1):
-        line = _line(name, {name: 3 + row}, steps, _column(metrics, name), "%{y:.4g}")
+        line = curve_line(name, {name: 3 + row}, steps, _column(metrics, name), "%{y:.4g}")
         line["line"] |= {"shape": "hv", "dash": "solid"}
         data.append(line | _panel(row) | {"showlegend": False})
         top = bottom - (row - 1) * share
@@ -171,7 +141,7 @@ def _smooth(values: np.ndarray, horizon: np.ndarray, every: int) -> np.ndarray:
 # --- parts of every chart ---------------------------------------------------------------------
 
 
-def _line(
+def curve_line(
     label: str, looks: Mapping[str, int], x: np.ndarray, y: np.ndarray, value: str
 ) -> dict[str, Any]:
     style = STYLES[looks[label]]
@@ -192,7 +162,7 @@ def _line(
     }
 
 
-def _band(
+def quantile_band(
     label: str, looks: Mapping[str, int], x: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> list[dict[str, Any]]:
     """A filled polygon for each stretch without a gap, because a fill would bridge gaps."""
@@ -250,7 +220,7 @@ def _panel(row: int) -> dict[str, str]:
     return {"xaxis": "x", "yaxis": f"y{row + 1}" if row else "y"}
 
 
-def _note(text: str, **place: Any) -> dict[str, Any]:
+def note(text: str, **place: Any) -> dict[str, Any]:
     return {"text": text, "showarrow": False, "font": {"size": 12, "color": "@ink"}} | place
 
 

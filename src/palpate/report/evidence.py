@@ -8,8 +8,9 @@ folder and holds plain arrays, named by what they are:
     horizon.time         (times,)             s since the prediction began
     horizon.<label>      (times,)             root-mean-square error of the prediction
     horizon.<label>.low, horizon.<label>.high  (times,)  quantiles around it, both or neither
-    energy.time          (times,)             s
-    energy.<label>       (episodes, times)    energy relative to the start of its episode
+
+A family adds kinds of its own, `<kind>.time` and `<kind>.<label>`: each is a `Piece` that stands in
+the table of families (`Family.evidence`) with the axes of its arrays.
 
 Several motions stand side by side as `motion/<group>.time`, `motion/<group>.<label>`. NaN is a gap.
 Errors are in the unit that "observation_unit" names in the settings of `result.json`, else in m.
@@ -22,7 +23,7 @@ others; the learning curve from `metrics.jsonl`.
 import io
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -31,14 +32,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from palpate.errors import PalpateError
+from palpate.family import places, resolve
 from palpate.runs import Figure
 from palpate.runs.run import CONFIGURATION, ENVIRONMENT, METRICS, RESULT, read_metrics
 from palpate.runs.storage import DamagedFileError, read_json, write_bytes
 
 EVIDENCE = "evidence.npz"
-_LARGEST = 2**29  # bytes when unpacked: far above what a page can show
-_KEY = re.compile(r"(motion)(?:/([^./]+))?\.(.+)|(horizon|energy)\.(.+)")
-_KEYS = "motion.<label>, motion/<group>.<label>, horizon.<label>, energy.<label>"
+MAX_BYTES = 2**29  # when unpacked: far above what a page can show
+_KEY = re.compile(r"(motion)(?:/([^./]+))?\.(.+)|([^./]+)\.(.+)")
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,31 @@ class Motion:
 class Curves:
     """Labelled quantities over `time` (times,) in s.
 
-    `values` are (times,), or (episodes, times) for energies; `bands` holds (low, high) of shape
+    `values` are (times,), or have the axes of their `Piece`; `bands` holds (low, high) of shape
     (times,) for those labels that have them.
     """
 
     time: np.ndarray
     values: dict[str, np.ndarray]
     bands: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A piece of evidence that a family adds to the page: a kind of curves, and their section.
+
+    `axes` are those of each array, "times" one of them. `show` gives the section's caption and its
+    Plotly figure from the curves and each label's index into `palpate.report.style.STYLES`.
+    """
+
+    heading: str
+    axes: tuple[str, ...]
+    show: Callable[[Curves, Mapping[str, int]], tuple[str, dict[str, Any]]]
+
+
+def pieces() -> dict[str, Piece]:
+    """The pieces of evidence of all families, by name."""
+    return {name: resolve(place) for name, place in places("evidence").items()}
 
 
 @dataclass(frozen=True)
@@ -83,7 +102,7 @@ class Parameter:
     derived: bool = False
 
     @property
-    def untold(self) -> bool:
+    def uninformed(self) -> bool:
         """Whether the data left all of it where the prior had it."""
         return str(self.verdict).startswith("not told by the data:")
 
@@ -92,9 +111,9 @@ class Parameter:
 class Evidence:
     """All that a run's folder holds for a report; what is not there is empty or None.
 
-    `unit` is that of `horizon`. `metrics` are the run's logged lines. `rendering` is a moving
-    picture of the scene, `rendering.webp`, `.gif` or `.png`, where the machine could render one.
-    `pictures` are all others that the run has drawn, PNGs.
+    `unit` is that of `horizon`; `pieces` are the curves that families add, by name. `metrics` are
+    the run's logged lines. `rendering` is a moving picture of the scene, `rendering.webp`, `.gif`
+    or `.png`, where the machine could render one; `pictures` are all others that it drew, PNGs.
     """
 
     path: Path
@@ -102,7 +121,7 @@ class Evidence:
     motions: tuple[Motion, ...] = ()
     horizon: Curves | None = None
     unit: str = "m"
-    energy: Curves | None = None
+    pieces: dict[str, Curves] = field(default_factory=dict)
     parameters: tuple[Parameter, ...] = ()
     metrics: tuple[dict[str, Any], ...] = ()
     figures: tuple[Figure, ...] = ()
@@ -148,7 +167,7 @@ def read_evidence(run: str | Path) -> Evidence:
     known = (CONFIGURATION, RESULT, METRICS, EVIDENCE)
     if not any((run / name).exists() for name in known):
         raise PalpateError(f"{run} holds no run: expected {', '.join(known)} or some of them")
-    motions, horizon, energy = _arrays(run / EVIDENCE)
+    motions, horizon, added = _arrays(run / EVIDENCE)
     result = _object(run / RESULT)
     settings = result.get("settings")
     configuration = _object(run / CONFIGURATION)
@@ -159,7 +178,7 @@ def read_evidence(run: str | Path) -> Evidence:
         motions=motions,
         horizon=horizon,
         unit=str(settings.get("observation_unit", "m") if isinstance(settings, dict) else "m"),
-        energy=energy,
+        pieces=added,
         parameters=tuple(_rows(run / RESULT, result, "parameters", _parameter)),
         metrics=tuple(read_metrics(run)),
         figures=tuple(_rows(run / RESULT, result, "figures", _figure)),
@@ -176,17 +195,17 @@ RENDERINGS = {".webp": "image/webp", ".gif": "image/gif", ".png": "image/png"}
 
 # --- arrays -----------------------------------------------------------------------------------
 
-_Sections = tuple[tuple[Motion, ...], Curves | None, Curves | None]
+_Sections = tuple[tuple[Motion, ...], Curves | None, dict[str, Curves]]
 
 
 def _arrays(path: Path) -> _Sections:
     if not path.exists():
-        return (), None, None
+        return (), None, {}
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        if size > _LARGEST:
-            limit = f"at most {_LARGEST / 2**20:g} are read"
+        if size > MAX_BYTES:
+            limit = f"at most {MAX_BYTES / 2**20:g} are read"
             raise PalpateError(f"it unpacks to {size / 2**20:.0f} MiB, {limit}")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {key: np.asarray(archive[key]) for key in archive.files}
@@ -203,30 +222,33 @@ def _arrays(path: Path) -> _Sections:
 
 def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
     """The arrays by section, once each was found to fit its name."""
+    known = pieces()
     sections: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     for key, values in arrays.items():
         match = _KEY.fullmatch(key)
-        if match is None:
-            raise PalpateError(f"unknown evidence '{key}': expected {_KEYS}, each beside its .time")
+        if match is None or (match[4] or "horizon") not in {"horizon", *known}:
+            kinds = "motion", "motion/<group>", "horizon", *known
+            kinds = ", ".join(f"{kind}.<label>" for kind in kinds)
+            raise PalpateError(f"unknown evidence '{key}': expected {kinds}, each beside its .time")
         kind, group, label = match[1] or match[4], match[2] or "", match[3] or match[5]
         if values.dtype.kind not in "fiu":
             raise PalpateError(f"'{key}' has the dtype {values.dtype}: expected real numbers")
         if values.size == 0 or np.isinf(values).any():
             raise PalpateError(f"'{key}' is empty or infinite: expected numbers, NaN for a gap")
         sections.setdefault((kind, group), {})[label] = values
-    motions, curves = [], {}
+    motions, horizon, added = [], None, {}
     for (kind, group), values in sections.items():
         where = f"{kind}/{group}" if group else kind
         time = _time(where, values)
         if kind == "motion":
             shape = ("frames", "points", 3)
             motions.append(Motion(group, time, _fitting(where, values, time, shape, 0)))
-        elif kind == "energy":
-            shape = ("episodes", "times")
-            curves[kind] = Curves(time, _fitting(where, values, time, shape, 1))
+        elif kind == "horizon":
+            horizon = _banded(time, _fitting(where, values, time, ("times",), 0))
         else:
-            curves[kind] = _banded(time, _fitting(where, values, time, ("times",), 0))
-    return tuple(motions), curves.get("horizon"), curves.get("energy")
+            axes = known[kind].axes
+            added[kind] = Curves(time, _fitting(where, values, time, axes, axes.index("times")))
+    return tuple(motions), horizon, added
 
 
 def _time(where: str, values: dict[str, np.ndarray]) -> np.ndarray:

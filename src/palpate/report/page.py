@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from palpate.report.evidence import (
     Evidence,
     Motion,
     Parameter,
+    Piece,
+    pieces,
     read_evidence,
 )
 from palpate.report.parameter_chart import number, parameters
@@ -45,7 +48,7 @@ def build_report(
 
     A section appears where some run left evidence for it: results, pictures (of the first run,
     which the page is about), motion, tip path, error against horizon, parameters, learning,
-    energy, and what was run. `notes` are sentences shown on top.
+    what families add, and what was run. `notes` are sentences shown on top.
     The same files give the same page.
 
     Raises `PalpateError` when a folder holds no run, when a file in it is damaged, or when `out`
@@ -72,7 +75,7 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
         ("Error against horizon", lambda e, looks: _horizon(e.horizon, looks, e.unit)),
         ("Parameters", lambda e, looks: _parameters(e.parameters)),
         ("Learning", lambda e, looks: _learning(e.metrics)),
-        ("Energy", lambda e, looks: _energy(e.energy, looks)),
+        *((piece.heading, partial(_piece, name, piece)) for name, piece in pieces().items()),
     )
     looks = [numbered(_labels(evidence)) for evidence in found]
     for heading, part in parts:
@@ -88,7 +91,7 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
 def _labels(evidence: Evidence) -> Iterator[str]:
     for motion in evidence.motions:
         yield from motion.chains
-    for curves in (evidence.horizon, evidence.energy):
+    for curves in (evidence.horizon, *evidence.pieces.values()):
         yield from curves.values if curves else ()
 
 
@@ -169,13 +172,13 @@ def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
 def _tip(motion: Motion, looks: dict[str, int], height: int) -> str:
     caption = "where the object's last point is over time"
     observed = motion.chains.get(_OBSERVED)
-    apart = [
+    distances = [
         f"{number(_root_mean_square(chain[:, -1] - observed[:, -1]))} m ({label})"
         for label, chain in motion.chains.items()
         if observed is not None and label != _OBSERVED
     ]
-    if apart:
-        caption += f"; root-mean-square distance from what was observed: {', '.join(apart)}"
+    if distances:
+        caption += f"; root-mean-square distance from what was observed: {', '.join(distances)}"
     caption = f"{motion.group}: {caption}" if motion.group else caption[0].upper() + caption[1:]
     return _caption(f"{caption}.") + _chart(charts.tip(motion, looks, height))
 
@@ -201,7 +204,7 @@ def _parameters(rows: Sequence[Parameter]) -> str:
     if not rows:
         return ""
     own = [row for row in rows if not row.derived]
-    free = sum(not row.fixed and not row.untold for row in own)
+    free = sum(not row.fixed and not row.uninformed for row in own)
     caption = f"{free} of {len(own)} parameters were identified; a short whisker is one that the "
     caption += "data determine, a long or missing one is not to be trusted."
     chart = parameters(own)
@@ -235,35 +238,23 @@ def _learning(metrics: Sequence[dict[str, Any]]) -> str:
     return _caption(caption + ".") + _chart(chart)
 
 
-def _energy(curves: Curves | None, looks: dict[str, int]) -> str:
-    if curves is None:
+def _piece(name: str, piece: Piece, evidence: Evidence, looks: dict[str, int]) -> str:
+    if name not in evidence.pieces:
         return ""
-    ends = []
-    for label, values in curves.values.items():
-        (median,) = charts.quantiles(values, (0.5,))
-        above = np.flatnonzero(~(median < 0.01))
-        stays = 0 if not above.size else above[-1] + 1
-        if stays < len(curves.time):
-            ends.append(f"{label} stays below 1 % from {curves.time[stays]:.3g} s on")
-        else:
-            ends.append(f"{label} does not come to stay below 1 %")
-    episodes = max(len(values) for values in curves.values.values())
-    caption = "Energy left in the object, its start being 100 %"
-    if episodes > 1:
-        caption += f": the median of {episodes} episodes and the band that holds 90 % of them"
-    return _caption(f"{caption}; {', '.join(ends)}.") + _chart(charts.energy(curves, looks))
+    caption, chart = piece.show(evidence.pieces[name], looks)
+    return _caption(caption) + _chart(chart)
 
 
 def _provenance(evidence: Evidence) -> str:
     known = ("command", "date", "commit", "machine", "versions")
-    told = {name: evidence.environment[name] for name in known if name in evidence.environment}
+    shown = {name: evidence.environment[name] for name in known if name in evidence.environment}
     for name in ("seeds", "split", "wall_time_s", "settings", *known):
-        if name in evidence.result and name not in told:
-            told[name] = evidence.result[name]
-    told["configuration"] = evidence.configuration
+        if name in evidence.result and name not in shown:
+            shown[name] = evidence.result[name]
+    shown["configuration"] = evidence.configuration
     rows = "".join(
         f"<dt>{_readable(name)}</dt><dd><pre>{_text(_pretty(value))}</pre></dd>"
-        for name, value in told.items()
+        for name, value in shown.items()
         if value not in (None, {}, [])
     )
     return f"<details><summary>{_text(evidence.name)}</summary><dl>{rows}</dl></details>"

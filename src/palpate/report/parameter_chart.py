@@ -9,11 +9,11 @@ import numpy as np
 from palpate.report.charts import Chart, empty_layout, plain_text, titled_axis
 from palpate.report.evidence import Parameter
 
-_SURE, _UNTOLD = "identified, 90 % interval", "not told by the data"
+_SURE, _UNINFORMED = "identified, 90 % interval", "not told by the data"
 _FIXED, _UNSURE = "fixed", "no interval"
 _SYMBOLS = {
     _SURE: "circle",
-    _UNTOLD: "diamond-open",
+    _UNINFORMED: "diamond-open",
     _FIXED: "circle-open",
     _UNSURE: "x-thin-open",
 }
@@ -56,7 +56,7 @@ def parameters(rows: Sequence[Parameter]) -> Chart | None:
         top = dots[-1].y + _GAP
     least = min(dot.value for dot in dots) / _REACH
     most = max(dot.value for dot in dots) * _REACH
-    intervals = [dot for dot in dots if dot.kind in (_SURE, _UNTOLD)]
+    intervals = [dot for dot in dots if dot.kind in (_SURE, _UNINFORMED)]
     shown = [(max(dot.lower, least), min(dot.upper, most)) for dot in intervals]
     data = [_whiskers([(dot.y, *ends) for dot, ends in zip(intervals, shown, strict=True)])]
     for kind, symbol in _SYMBOLS.items():
@@ -97,11 +97,11 @@ def _dots(row: Parameter, top: float, pitch: float) -> Iterator[_Dot]:
         zip(row.value, row.lower, row.upper, strict=True)
     ):
         known = math.isfinite(upper - lower)
-        kind = _UNTOLD if row.untold else _SURE
+        kind = _UNINFORMED if row.uninformed else _SURE
         kind = _FIXED if row.fixed else kind if known else _UNSURE
         element = f"[{index}]" if row.value.size > 1 else ""
         text = f"{row.name}{element} = {number(value)} {row.unit}".rstrip()
-        text += f" ({number(lower)} to {number(upper)})" if kind in (_SURE, _UNTOLD) else ""
+        text += f" ({number(lower)} to {number(upper)})" if kind in (_SURE, _UNINFORMED) else ""
         yield _Dot(
             kind=kind,
             y=top + pitch * index,

@@ -13,6 +13,7 @@ FAMILY = Family(
         "rope-stabilization": "palpate.tasks.rope:RopeStabilization",
         "rope-tracking": "palpate.tasks.rope:RopeTracking",
     },
+    evidence={"energy": "palpate.families.rope.energy:ENERGY"},
     options={
         "demo": {"rope": "palpate.families.rope.demo:DemoRope"},
         "record": {"rope": f"{_OPTIONS}:RecordRope"},

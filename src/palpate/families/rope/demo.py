@@ -83,7 +83,8 @@ class DemoRope(Demo):
 
     def summarise(self, identified: Path, evaluated: Path, out: Path) -> Summary:
         """The recorded motion beside its prediction, and the energy with and without control."""
-        from palpate.report import motion_figure, read_evidence
+        from palpate.families.rope.motion_figure import motion_figure
+        from palpate.report import read_evidence
         from palpate.runs import Figure
         from palpate.runs.result import read_result
         from palpate.runs.run import RESULT
@@ -99,7 +100,7 @@ class DemoRope(Demo):
         figures = [Figure("tip_rmse_per_length", share, "m/m"), *(known[name] for name in names)]
         success, periods, seconds, still = (known[name].value for name in names)
         motion = read_evidence(identified).motions[0]
-        motion_figure(out / PICTURE, motion, INSTANTS, read_evidence(evaluated).energy)
+        motion_figure(out / PICTURE, motion, INSTANTS, read_evidence(evaluated).pieces["energy"])
         error = "unknown" if share is None else f"{share:.4f} m per metre of rope"
         rest = ": never; a longer training would help"
         if seconds is not None:

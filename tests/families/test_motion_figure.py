@@ -5,7 +5,8 @@ import pytest
 from PIL import Image
 
 from palpate.errors import PalpateError
-from palpate.report import Curves, Motion, motion_figure
+from palpate.families.rope.motion_figure import motion_figure
+from palpate.report import Curves, Motion
 from synthetic_evidence import chain
 
 TIME, OBSERVED = chain(points=6, seconds=1.0)

@@ -186,10 +186,8 @@ def policy_times(calls: int) -> np.ndarray:
     policy = CommandPolicy.create(
         jax.random.key(1),
         task.features(start.state, start.goal),
-        rope.action_shape,
+        task.action_channels(rope),
         period=rope.control_period,
-        limit=task.action_limit,
-        rate_limit=task.action_rate_limit,
     )
 
     @jax.jit

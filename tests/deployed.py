@@ -11,9 +11,17 @@ from palpate.deployment.intake import Intake
 from palpate.deployment.messages import StateMessage, encode_state
 from palpate.deployment.plausibility import ChainCheck
 from palpate.deployment.supervisor import Limits, Order, Supervisor
-from palpate.networks import CommandPolicy
+from palpate.models.rope import Rope
+from palpate.networks import Channel, CommandPolicy
+from palpate.tasks.rope import RopeStabilization
+from small_rope import VELOCITY
 
 PERIOD = 0.01
+IMPEDANCE = (
+    Channel("displacement", (3,), "m", 0.05, 0.4),
+    Channel("stiffness", (3, 1), "N/m", 800.0, 4000.0),
+    Channel("damping ratio", (1,), "", 2.0),
+)
 NODES, SPACING = 6, 0.1
 LIMITS = Limits(speed=1.5, acceleration=10.0, period=PERIOD)
 
@@ -22,11 +30,6 @@ def manifest(nodes: int = NODES) -> dict:
     """As `palpate train` writes it, shortened."""
     return {
         "task": "rope-stabilization",
-        "features": {
-            "node position relative to the gripper": f"({nodes - 1}, 3) m",
-            "node velocity": f"({nodes - 1}, 3) m/s",
-        },
-        "action": "gripper velocity, m/s",
         "command": "palpate train rope-stabilization",
         "seed": 0,
         "model": [{"name": "rest_length", "value": [SPACING] * (nodes - 1), "unit": "m"}],
@@ -37,11 +40,13 @@ def manifest(nodes: int = NODES) -> dict:
 def rope_policy(nodes: int = NODES, **changes) -> CommandPolicy:
     """A policy that acts at random, and not a little."""
     seen = jax.random.normal(jax.random.key(1), (32, 6 * (nodes - 1)))
+    limits = {name: changes.pop(name) for name in ("limit", "rate_limit") if name in changes}
     policy = CommandPolicy.create(
         jax.random.key(0),
         0.3 * seen + 0.1,
-        (1, 3),
-        **{"period": PERIOD, "limit": 1.5, "rate_limit": 10.0, "width": 16} | changes,
+        dataclasses.replace(VELOCITY, **limits),
+        observations=RopeStabilization().feature_channels(Rope.uniform(nodes=nodes)),
+        **{"period": PERIOD, "width": 16} | changes,
     )
     return dataclasses.replace(policy, network=scaled(policy.network, 4.0))
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.models.model import Model
+from palpate.networks import Channel
 from palpate.parameters import LogNormal, Parameter, parameter
 from palpate.tasks.task import Start, Task
 
@@ -112,6 +113,8 @@ class CartToOrigin(Task):
     """Bring the cart to the origin, and to rest there, with a bounded force."""
 
     name: ClassVar[str] = "cart-to-origin"
+    action_name: ClassVar[str] = "force"
+    action_unit: ClassVar[str] = "N"
     outcome_units: ClassVar[dict[str, str]] = {"distance": "m"}
     duration: float = eqx.field(static=True, default=3.0)
     action_limit: float = eqx.field(static=True, default=4.0)  # N
@@ -129,8 +132,8 @@ class CartToOrigin(Task):
     def features(self, state: CartState, goal: None) -> Array:
         return jnp.concatenate([state.position, state.velocity], axis=-1)
 
-    def feature_names(self, model: Model) -> dict[str, str]:
-        return {"position": "(1,) m", "velocity": "(1,) m/s"}
+    def feature_channels(self, model: Model) -> tuple[Channel, ...]:
+        return Channel("position", (1,), "m"), Channel("velocity", (1,), "m/s")
 
     def loss(self, models: Model, start: Start, states: CartState, actions: Array) -> Array:
         return jnp.mean(states.position**2 + 0.1 * states.velocity**2, axis=(1, 2))
@@ -146,6 +149,8 @@ class PendulumDamping(Task):
     """Take the swing out of the pendulum by accelerating its pivot, which takes time to change."""
 
     name: ClassVar[str] = "pendulum-damping"
+    action_name: ClassVar[str] = "acceleration of the pivot"
+    action_unit: ClassVar[str] = "m/s^2"
     duration: float = eqx.field(static=True, default=1.5)
     action_limit: float = eqx.field(static=True, default=6.0)  # m/s^2
     action_rate_limit: float | None = eqx.field(static=True, default=60.0)  # m/s^3
@@ -157,8 +162,8 @@ class PendulumDamping(Task):
     def features(self, state: PendulumState, goal: None) -> Array:
         return jnp.concatenate([jnp.sin(state.angle), jnp.cos(state.angle), state.rate], axis=-1)
 
-    def feature_names(self, model: Model) -> dict[str, str]:
-        return {"sine and cosine of the angle": "(2,)", "rate": "(1,) rad/s"}
+    def feature_channels(self, model: Model) -> tuple[Channel, ...]:
+        return Channel("sine and cosine of the angle", (2,)), Channel("rate", (1,), "rad/s")
 
     def loss(self, models: Model, start: Start, states: PendulumState, actions: Array) -> Array:
         return jnp.mean(_energy(models, states), axis=1)

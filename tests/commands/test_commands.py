@@ -59,7 +59,6 @@ class IdentifyToy(Identify):
 class TrainToy(Train):
     """As a task's file would say it."""
 
-    action: ClassVar[str] = "force, N"
     task: str = "cart-to-origin"
 
     def prepare(self, model):

@@ -8,7 +8,7 @@ from palpate.cli import main
 from palpate.families.rope.options import EvaluateRopeStabilization
 from palpate.models.files import save_model
 from palpate.models.rope import Rope
-from palpate.networks import CommandPolicy, save_policy
+from palpate.networks import Channel, CommandPolicy, save_controller
 
 
 @pytest.fixture
@@ -23,8 +23,10 @@ def refused(tmp_path, monkeypatch, capsys):
 
     def refused(period=0.01, action_shape=(1, 3), options="", **rope):
         seen, key = jnp.ones((2, 30)), jax.random.key(0)
-        policy = CommandPolicy.create(key, seen, action_shape, period=period, limit=1.5, width=4)
-        save_policy("policy.safetensors", policy, {"task": "rope-stabilization"})
+        policy = CommandPolicy.create(
+            key, seen, Channel("velocity", action_shape, "m/s", 1.5), period=period, width=4
+        )
+        save_controller("policy.safetensors", policy, {"task": "rope-stabilization"})
         save_model("model.json", Rope.uniform(**rope), {})
         words = "evaluate rope-stabilization --policy policy.safetensors --model model.json "
         assert main((words + options).split()) == 2

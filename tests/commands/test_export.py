@@ -10,7 +10,7 @@ from deployed import manifest, rope_policy
 from palpate.cli import main
 from palpate.commands import export
 from palpate.deployment.contract import contract_of, read_contract
-from palpate.networks import save_policy
+from palpate.networks import save_controller
 from palpate.runs.result import read_result
 
 runtime = pytest.importorskip("onnxruntime")
@@ -21,7 +21,7 @@ pytest.importorskip("onnx")
 def policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     policy = rope_policy()
-    save_policy("policy.safetensors", policy, manifest())
+    save_controller("policy.safetensors", policy, manifest())
     return policy
 
 
@@ -65,6 +65,6 @@ def test_sentences(capsys, tmp_path, monkeypatch):
 def test_a_file_that_does_not_agree_is_not_handed_over(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(export, "difference", lambda *given: 2e-5)
     sentence = refused("policy.safetensors --onnx a.onnx", capsys)
-    assert "gives commands that differ by 2e-05 m/s from the policy's" in sentence
+    assert "gives commands that differ from the policy's by 2e-05 of their limits" in sentence
     assert not (tmp_path / "a.onnx").exists()
     assert not (tmp_path / "a.json").exists()

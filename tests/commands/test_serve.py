@@ -8,7 +8,7 @@ import pytest
 from deployed import manifest, rope_policy
 from palpate.cli import main
 from palpate.commands.serve import free_endpoint
-from palpate.networks import save_policy
+from palpate.networks import save_controller
 from palpate.runs.result import read_result
 
 
@@ -20,7 +20,7 @@ def elsewhere(tmp_path, monkeypatch):
 @pytest.fixture
 def refused(capsys):
     def refused(words, told=None, **changes):
-        save_policy("policy.safetensors", rope_policy(**changes), manifest() | (told or {}))
+        save_controller("policy.safetensors", rope_policy(**changes), manifest() | (told or {}))
         assert main(["serve", "policy.safetensors", *words.split()]) == 2
         return capsys.readouterr().err.removeprefix("palpate: ").rstrip()
 
@@ -53,7 +53,7 @@ def test_sentences(refused, tmp_path, monkeypatch):
 
 def test_with_nobody_there_it_waits_and_says_how_it_went(tmp_path, capsys):
     pytest.importorskip("zenoh")
-    save_policy("policy.safetensors", rope_policy(), manifest())
+    save_controller("policy.safetensors", rope_policy(), manifest())
     words = ["serve", "policy.safetensors", "--seconds", "0.3", "--listen", free_endpoint()]
     assert main([*words, "--out", "served"]) == 0
     said = capsys.readouterr().out

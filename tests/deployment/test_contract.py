@@ -58,21 +58,6 @@ def test_the_policy_that_ships_has_one(tmp_path):
     assert read_contract(tmp_path / "policy.json") == contract
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"features": {"height": "metres"}}, "feature 'height' is described as 'metres'"),
-        ({"features": {"height": "(2, 3) m"}}, "describes 6 features and its network sees 30"),
-        ({"features": None}, "describes 0 features"),
-        ({"action": "m/s"}, "gives the action 'm/s': expected its name and unit"),
-    ],
-)
-def test_a_manifest_that_does_not_say_is_refused(changes, sentence):
-    with pytest.raises(PalpateError, match="the policy's") as refused:
-        contract_of(rope_policy(), manifest() | changes)
-    assert sentence in str(refused.value)
-
-
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "policy.json"
     contract = contract_of(rope_policy(), manifest())

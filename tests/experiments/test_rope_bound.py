@@ -18,7 +18,7 @@ from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
 from palpate.trials.rope.trials import Trial
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
-from small_rope import SMALL
+from small_rope import SMALL, VELOCITY
 
 BASE = RopeConfiguration(**SMALL)
 WARM = [restart.warm for restart in RESTARTS].index(True)
@@ -27,7 +27,7 @@ WARM = [restart.warm for restart in RESTARTS].index(True)
 def untrained() -> CommandPolicy:
     seen = jax.random.normal(jax.random.key(0), (9, 30))  # of six nodes
     key = jax.random.key(1)
-    return CommandPolicy.create(key, seen, (1, 3), period=0.01, limit=1.5, rate_limit=10.0, width=4)
+    return CommandPolicy.create(key, seen, VELOCITY, period=0.01, width=4)
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope import evaluation as rope_evaluation
 from palpate.trials.rope.baselines import HeldStill
 from palpate.worlds.rope.rope import RopeConfiguration
-from small_rope import SMALL
+from small_rope import SMALL, VELOCITY
 
 TINY = Work(rope_dagger.QUICK, Training(iterations=1, starts=20), 1, 2, 2, {"everything": 1})
 MODEL = Rope.from_rest_lengths(np.full(5, 0.2), 0.1, drive="velocity", substeps=4)
@@ -29,7 +29,7 @@ MODEL = Rope.from_rest_lengths(np.full(5, 0.2), 0.1, drive="velocity", substeps=
 def untrained() -> CommandPolicy:
     seen = jax.random.normal(jax.random.key(1), (8, 30))
     key = jax.random.key(0)
-    return CommandPolicy.create(key, seen, (1, 3), period=0.01, limit=1.5, rate_limit=10.0, width=4)
+    return CommandPolicy.create(key, seen, VELOCITY, period=0.01, width=4)
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from palpate.trials.rope.followers import as_of_model
 from palpate.trials.rope.planners import PlannedStabiliser, energy_and_speed, stabilising_planner
 from palpate.trials.rope.trials import Trial, run_trials
 from palpate.worlds.rope.rope import RopeConfiguration
-from small_rope import SMALL
+from small_rope import SMALL, VELOCITY
 
 TINY = Size(2, (1, 1, 1), Training(iterations=8, width=4), 1, dict.fromkeys(
     ("recording", "identification", "training", "evaluation"), 1
@@ -38,7 +38,7 @@ def small_model(length: float = 1.0) -> Rope:
 
 def untrained(seed: int) -> CommandPolicy:
     seen, key = jnp.ones((2, 30)), jax.random.key(seed)  # of six nodes
-    return CommandPolicy.create(key, seen, (1, 3), period=0.01, limit=1.5, rate_limit=10.0, width=4)
+    return CommandPolicy.create(key, seen, VELOCITY, period=0.01, width=4)
 
 
 def test_a_rope_of_another_length_is_taken_for_the_models() -> None:

@@ -15,6 +15,7 @@ from palpate.experiments.rivals.soft_actor_critic import Sac, as_actor, trained_
 from palpate.learning import Training  # noqa: E402
 from palpate.models.rope import Rope  # noqa: E402
 from palpate.runs.storage import read_manifest  # noqa: E402
+from small_rope import VELOCITY  # noqa: E402
 
 
 def small_model() -> Rope:
@@ -31,8 +32,7 @@ def test_the_actor_is_the_librarys() -> None:
     theirs = Theirs(seen, Box(-1, 1, (3,)), [8, 8], FlattenExtractor(seen), 21)
     examples = jax.random.normal(jax.random.key(0), (50, 18))
     untrained = Actor.untrained(
-        jax.random.key(1), examples, action_shape=(1, 3), period=0.01, limit=1.5, rate_limit=10.0,
-        width=8, depth=2,
+        jax.random.key(1), examples, actions=VELOCITY, period=0.01, width=8, depth=2,
     )  # fmt: skip
     ours = as_actor(untrained, theirs.state_dict())
     told = np.array(ours.told(jnp.full((50, 1, 3), 0.3), examples))

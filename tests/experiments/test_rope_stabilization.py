@@ -13,13 +13,13 @@ from palpate.experiments.rope import stabilization as rope_stabilization
 from palpate.experiments.rope.stabilization import Size, shipped_policy
 from palpate.learning import Training
 from palpate.models.rope import Rope
-from palpate.networks import CommandPolicy, save_policy
+from palpate.networks import CommandPolicy, save_controller
 from palpate.report.evidence import read_evidence
 from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
 from palpate.trials.rope import evaluation as rope_evaluation
 from palpate.worlds.rope.rope import START_POSES, RopeConfiguration
-from small_rope import SMALL
+from small_rope import SMALL, VELOCITY
 
 TINY = Size(2, (1, 1, 1), Training(iterations=8, width=4), 1, dict.fromkeys(
     ("recording", "identification", "training", "evaluation"), 1
@@ -59,7 +59,7 @@ def figure():
 def untrained(features: int, seed: int) -> CommandPolicy:
     seen = jnp.ones((2, features))
     key = jax.random.key(seed)
-    return CommandPolicy.create(key, seen, (1, 3), period=0.01, limit=1.5, rate_limit=10.0, width=4)
+    return CommandPolicy.create(key, seen, VELOCITY, period=0.01, width=4)
 
 
 def test_stages_hand_on_what_they_made(calls, tmp_path):
@@ -105,7 +105,9 @@ def test_another_seed_does_not_go_on_with_this_one(calls, tmp_path):
 
 
 def test_shipped_weights_are_only_evaluated(calls, tmp_path, monkeypatch):
-    save_policy(tmp_path / "policy.safetensors", untrained(30, 0), {"task": "rope-stabilization"})
+    save_controller(
+        tmp_path / "policy.safetensors", untrained(30, 0), {"task": "rope-stabilization"}
+    )
     monkeypatch.setattr(rope_stabilization.resources, "files", lambda _: tmp_path)
     monkeypatch.setattr(rope_stabilization, "SHIPPED", "policy.safetensors")
     result = rope_stabilization.reproduce(tmp_path / "out", quick=True, weights="shipped")

@@ -33,7 +33,7 @@ from palpate.trials.rope.followers import (
 from palpate.trials.rope.tracking import Followed, follow, path_trials, summarise, table
 from palpate.trials.rope.trials import Seen
 from palpate.worlds.rope.rope import RopeConfiguration
-from small_rope import SMALL
+from small_rope import SMALL, VELOCITY
 
 BASE = RopeConfiguration(**SMALL)
 FEATURES = 30 + 3 * len(PREVIEW)  # of six nodes
@@ -53,7 +53,7 @@ def brief(trials, steps: int):
 def untrained(seed: int = 0) -> CommandPolicy:
     seen = jnp.ones((2, FEATURES))
     key = jax.random.key(seed)
-    return CommandPolicy.create(key, seen, (1, 3), period=0.01, limit=1.5, rate_limit=10.0, width=4)
+    return CommandPolicy.create(key, seen, VELOCITY, period=0.01, width=4)
 
 
 def small_model() -> Rope:

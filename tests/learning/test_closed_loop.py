@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array
 
 from palpate.learning import simulate
-from palpate.networks.policy import Policy
+from palpate.networks import Controller
 from palpate.tasks.task import Start
 from toys import Cart, CartState, CartToOrigin
 
@@ -24,7 +24,7 @@ class Follow(CartToOrigin):
         return goal
 
 
-class Echo(Policy):
+class Echo(Controller):
     """What is seen, as it is: to see what that was."""
 
     unused: Array = eqx.field(default_factory=lambda: jnp.zeros(()))

@@ -11,7 +11,7 @@ import pytest
 from palpate.errors import PalpateError
 from palpate.learning import Training, dagger, loss_monitor, train
 from palpate.learning.loss_monitor import Comparison, Observed, Promise, calibrate, in_model
-from palpate.networks import CommandPolicy
+from palpate.networks import Channel, CommandPolicy
 from palpate.runs import Run
 from palpate.tasks.task import Start
 from toys import Pendulum, PendulumDamping, PendulumState
@@ -171,7 +171,9 @@ def test_what_cannot_be_compared_is_refused():
 
 def untrained() -> CommandPolicy:
     key, seen = jax.random.key(0), jax.random.normal(jax.random.key(1), (8, 3))
-    return CommandPolicy.create(key, seen, (1,), period=0.05, limit=6.0, rate_limit=60.0, width=4)
+    return CommandPolicy.create(
+        key, seen, Channel("pivot", (1,), "", 6.0, 60.0), period=0.05, width=4
+    )
 
 
 def test_training_begins_in_the_pool_that_is_given(policy, tmp_path):

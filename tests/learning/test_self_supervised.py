@@ -15,7 +15,7 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.learning import Training, simulate, train
-from palpate.networks.policy import CommandPolicy, Policy
+from palpate.networks import CommandPolicy, Controller
 from palpate.parameters import randomise
 from palpate.runs import Run
 from palpate.runs.storage import plain
@@ -37,7 +37,7 @@ class Counting(CartToOrigin):
         return super().loss(models, start, states, actions)
 
 
-class Held(Policy):
+class Held(Controller):
     """Always commands the same."""
 
     command: jax.Array

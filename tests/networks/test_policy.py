@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.networks.policy import CommandPolicy, load_policy, save_policy
-from palpate.runs.storage import save_arrays
+from palpate.networks import Channel, CommandPolicy
 
 LIMIT, RATE, PERIOD = 1.5, 10.0, 0.01
 
@@ -18,10 +17,8 @@ def policy(rate_limit: float | None = RATE, gain: float = 1.0) -> CommandPolicy:
     made = CommandPolicy.create(
         key,
         3.0 + 2.0 * jax.random.normal(examples, (500, 5)),
-        (2, 3),
+        Channel("velocity", (2, 3), "m/s", LIMIT, rate_limit),
         period=PERIOD,
-        limit=LIMIT,
-        rate_limit=rate_limit,
         width=16,
     )
     last = lambda p: p.network.layers[-1].weight  # noqa: E731
@@ -113,20 +110,51 @@ def test_gradients_are_finite_at_rest_and_beyond_the_limit(command: float) -> No
     np.testing.assert_array_equal(for_arrays.mean, 0.0)  # normalisation is not trained
 
 
-def test_saved_policy_comes_back_the_same(tmp_path) -> None:
-    pilot, path = policy(), tmp_path / "policy.safetensors"
-    save_policy(path, pilot, {"task": "a task"})
-    loaded, manifest = load_policy(path)
-    assert manifest["task"] == "a task"
-    assert manifest["policy"]["rate_limit"] == RATE
-    observation, command = jnp.arange(5.0), jnp.zeros((2, 3))
-    np.testing.assert_array_equal(
-        loaded(command, observation, None, None)[1], pilot(command, observation, None, None)[1]
-    )
+IMPEDANCE = (
+    Channel("displacement", (3,), "m", 0.05, 0.4),
+    Channel("stiffness", (3, 1), "N/m", 800.0, 4000.0),
+    Channel("damping ratio", (1,), "", 2.0),
+)
 
 
-def test_another_file_is_refused(tmp_path) -> None:
-    path = tmp_path / "model.safetensors"
-    save_arrays(path, {"a": np.zeros(3)}, {"kind": "model"})
-    with pytest.raises(PalpateError, match="holds no policy"):
-        load_policy(path)
+def impedance(gain: float) -> CommandPolicy:
+    key, seen = jax.random.key(0), jax.random.normal(jax.random.key(1), (500, 5))
+    made = CommandPolicy.create(key, seen, IMPEDANCE, period=PERIOD, width=16)
+    last = lambda p: p.network.layers[-1].weight  # noqa: E731
+    return eqx.tree_at(last, made, replace_fn=lambda weight: gain * weight)
+
+
+def test_each_channel_keeps_limits_of_its_own() -> None:
+    pilot, observation = impedance(1e4), jnp.linspace(-1.0, 7.0, 5)
+    command, commands = pilot.initial_carry(jnp.zeros(7)), [np.zeros(7)]
+    assert pilot.action_shape == (7,)
+    for _ in range(40):
+        command, action = pilot(command, observation, None, None)
+        commands.append(np.array(action))
+    commands = np.array(commands)
+    rates = np.diff(commands, axis=0) / PERIOD
+    displacement, rate = (np.linalg.norm(part[:, :3], axis=-1) for part in (commands, rates))
+    assert displacement.max() == pytest.approx(0.05, rel=1e-5)
+    assert rate.max() == pytest.approx(0.4, rel=1e-3)
+    np.testing.assert_allclose(np.abs(commands[-1, 3:6]), 800.0, rtol=1e-5)  # each of the three
+    np.testing.assert_allclose(np.abs(rates[:, 3:6]).max(axis=0), 4000.0, rtol=1e-3)
+    np.testing.assert_allclose(np.abs(commands[1:, 6]), 2.0, rtol=1e-3)
+
+
+def test_a_batch_of_several_channels_equals_one_by_one() -> None:
+    pilot = impedance(10.0)
+    observation = jax.random.normal(jax.random.key(1), (4, 5))
+    command = 0.03 * jax.random.normal(jax.random.key(2), (4, 7))
+    together, _ = pilot(command, observation, None, None)
+    single = jnp.stack([pilot(c, o, None, None)[1] for c, o in zip(command, observation)])  # noqa: B905
+    np.testing.assert_allclose(together, single, rtol=1e-5, atol=1e-6)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    seen, key = jnp.ones((2, 5)), jax.random.key(0)
+    with pytest.raises(PalpateError, match="'force' has no limit"):
+        CommandPolicy.create(key, seen, Channel("force", (1,), "N"), period=PERIOD)
+    with pytest.raises(PalpateError, match="described as 6 features and its network sees 5"):
+        CommandPolicy.create(
+            key, seen, IMPEDANCE, period=PERIOD, observations=[Channel("a", (2, 3))]
+        )

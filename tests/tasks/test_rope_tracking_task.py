@@ -63,8 +63,8 @@ def test_the_goal_moves_on_and_features_take_it_from_the_start_or_later(starts) 
     steps = np.round(np.array(PREVIEW) / PERIOD).astype(int)
     gripper = state.position[:, :1]
     np.testing.assert_array_equal(ahead, goal.position[:, 37 + steps] - gripper)
-    shapes = [text.split(")")[0] + ")" for text in TASK.feature_names(starts_model()).values()]
-    assert shapes == ["(5, 3)", "(5, 3)", f"({len(PREVIEW)}, 3)"]
+    shapes = [channel.shape for channel in TASK.feature_channels(starts_model())]
+    assert shapes == [(5, 3), (5, 3), (len(PREVIEW), 3)]
     single = jax.tree.map(lambda leaf: leaf[0], (state, goal))
     np.testing.assert_array_equal(TASK.features(*single), TASK.features(state, goal)[0])
 

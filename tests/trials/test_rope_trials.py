@@ -9,7 +9,7 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.models.rope import RopeState
-from palpate.networks import CommandPolicy
+from palpate.networks import Channel, CommandPolicy
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope import trials as rope_trials
 from palpate.trials.rope.baselines import TUNED, Gains, HeldStill, SwingDamper
@@ -197,7 +197,11 @@ def policy_for(nodes: int) -> CommandPolicy:
     """An untrained policy whose output is not small."""
     observations = jax.random.normal(jax.random.key(1), (50, 6 * (nodes - 1)))
     policy = CommandPolicy.create(
-        jax.random.key(0), observations, (1, 3), period=PERIOD, limit=1.5, rate_limit=10.0, width=8
+        jax.random.key(0),
+        observations,
+        Channel("velocity", (1, 3), "m/s", 1.5, 10.0),
+        period=PERIOD,
+        width=8,
     )
     return policy
 

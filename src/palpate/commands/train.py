@@ -17,7 +17,7 @@ from palpate.family import find
 from palpate.learning import Training, simulate, train
 from palpate.models.files import load_model
 from palpate.models.model import Model
-from palpate.networks import CommandPolicy, Policy, save_policy
+from palpate.networks import CommandPolicy, Controller, save_controller
 from palpate.parameters import describe
 from palpate.runs import Figure, Result, Run
 from palpate.runs.result import machine, read_result
@@ -51,7 +51,6 @@ def run(options: Train) -> Path:
                 training,
                 options.seed,
                 run,
-                action=options.action,
                 command=folders.command(options, f"train {options.task}"),
             )
             figures = figures_in_model(task, model, policy, options.seed)
@@ -79,18 +78,15 @@ def trained(
     seed: int,
     run: Run,
     *,
-    action: str,
     command: str,
 ) -> CommandPolicy:
     """The policy that is trained in `run`, which keeps it with all that its reader has to know.
 
-    `action`: what the policy's output is; `command`: what makes it again.
+    `command`: what makes it again.
     """
     policy = train(task, model, training, seed, run)
     manifest = {
         "task": task.name,
-        "features": task.feature_names(model),
-        "action": action,
         "command": command,
         "seed": seed,
         "training": dataclasses.asdict(training),
@@ -98,7 +94,7 @@ def trained(
         "machine": machine(),
         "wall_time_s": run.elapsed,
     }
-    save_policy(run.path / folders.POLICY, policy, manifest)
+    save_controller(run.path / folders.POLICY, policy, manifest)
     return policy
 
 
@@ -114,7 +110,7 @@ def settings(options: Train) -> Training:
     return Training(**{name: value for name, value in asked.items() if value is not None})
 
 
-def figures_in_model(task: Task, model: Model, policy: Policy, seed: int) -> list[Figure]:
+def figures_in_model(task: Task, model: Model, policy: Controller, seed: int) -> list[Figure]:
     """Means over episodes in the model, from start states of another seed than the training's.
 
     They last twice as long as those trained on, for what has to stay as it is in the end.

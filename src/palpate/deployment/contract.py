@@ -7,7 +7,6 @@ real-time loop of palpate goes by the same contract.
 
 import dataclasses
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,39 +73,22 @@ def contract_of(policy: CommandPolicy, manifest: Mapping[str, Any]) -> Contract:
 
     Raises `PalpateError` where the manifest does not say what the features or the action are.
     """
+    (action,) = policy.actions
     blocks, first = [], 0
-    for name, described in dict(manifest.get("features") or {}).items():
-        match = re.fullmatch(r"\(([\d, ]+)\) ?(.*)", str(described))
-        if match is None:
-            raise PalpateError(
-                f"the policy's feature '{name}' is described as '{described}': expected a shape "
-                "and a unit, such as '(10, 3) m'"
-            )
-        shape = tuple(int(size) for size in match[1].replace(",", " ").split())
-        blocks.append(Block(name, shape, match[2], first))
-        first += blocks[-1].count
-    if first != policy.mean.shape[0]:
-        raise PalpateError(
-            f"the policy's manifest describes {first} features and its network sees "
-            f"{policy.mean.shape[0]}: expected a policy that `palpate train` wrote"
-        )
-    command, _, unit = str(manifest.get("action", "")).rpartition(", ")
-    if not command:
-        raise PalpateError(
-            f"the policy's manifest gives the action '{manifest.get('action')}': expected its name "
-            "and unit, such as 'gripper velocity, m/s'"
-        )
+    for channel in policy.observations:
+        blocks.append(Block(channel.name, channel.shape, channel.unit, first))
+        first += channel.count
     return Contract(
         task=str(manifest.get("task")),
         features=tuple(blocks),
         mean=tuple(policy.mean.tolist()),
         scale=tuple(policy.scale.tolist()),
-        command=command,
-        unit=unit,
+        command=action.name,
+        unit=action.unit,
         command_shape=policy.action_shape,
         period=policy.period,
-        speed_limit=policy.limit,
-        acceleration_limit=policy.rate_limit,
+        speed_limit=action.bound,
+        acceleration_limit=action.rate_limit,
         velocity_weights=tuple(VelocityEstimator(policy.period).weights.tolist()),
         trained={name: manifest[name] for name in _TRAINED if name in manifest},
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from palpate.deployment.contract import Contract
 from palpate.errors import PalpateError
-from palpate.networks import CommandPolicy
+from palpate.networks import CommandPolicy, count_of
 
 
 class NetworkDecision:
@@ -23,16 +23,22 @@ class NetworkDecision:
         self._scale = np.asarray(policy.scale)
         self._input = np.empty(layers[0][0].shape[1], np.float32)
         self._shape = policy.action_shape
-        self._limit = np.float32(policy.limit)
-        rate = policy.rate_limit
-        self._change = None if rate is None else np.float32(policy.period * rate)
+        self._action = np.empty(count_of(policy.actions), np.float32)
+        self._channels, first = [], 0
+        for channel in policy.actions:
+            rate, part = channel.rate_limit, slice(first, first + channel.count)
+            change = None if rate is None else np.float32(policy.period * rate)
+            self._channels.append((part, channel.shape, np.float32(channel.bound), change))
+            first += channel.count
 
     def __call__(self, features: np.ndarray, command: np.ndarray) -> np.ndarray:
         """The next command (action_shape) from features (features,) and the command in force."""
         seen = self._input[: len(features)]
         np.subtract(features, self._mean, out=seen)
         np.divide(seen, self._scale, out=seen)
-        np.divide(command.reshape(-1), self._limit, out=self._input[len(features) :])
+        before, shares = command.reshape(-1), self._input[len(features) :]
+        for part, _, limit, _ in self._channels:
+            np.divide(before[part], limit, out=shares[part])
         values = self._input
         for number, (weight, bias, output) in enumerate(self._layers):
             if number:
@@ -40,13 +46,18 @@ class NetworkDecision:
             # Not a BLAS product: that would wait for a thread of its own on a busy core.
             np.einsum("ij,j->i", weight, values, out=output)
             values = np.add(output, bias, out=output)
-        vector = values.reshape(self._shape)
-        direction = vector / np.sqrt(1 + np.sum(vector**2, axis=-1, keepdims=True))
-        if self._change is None:
-            return self._limit * direction
-        moved = command + self._change * direction
-        square = np.sum(moved**2, axis=-1, keepdims=True)
-        return moved * (self._limit / np.sqrt(np.maximum(square, self._limit**2)))
+        action = np.empty_like(self._action)
+        for part, shape, limit, change in self._channels:
+            vector = values[part].reshape(shape)
+            moved = vector / np.sqrt(1 + np.sum(vector**2, axis=-1, keepdims=True))
+            if change is None:
+                moved *= limit
+            else:
+                moved = before[part].reshape(shape) + change * moved
+                square = np.sum(moved**2, axis=-1, keepdims=True)
+                moved *= limit / np.sqrt(np.maximum(square, limit**2))
+            action[part] = moved.reshape(-1)
+        return action.reshape(self._shape)
 
 
 class RopeDecision:

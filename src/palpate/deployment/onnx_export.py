@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 
 from palpate.deployment.extras import extra_module
-from palpate.networks import CommandPolicy
+from palpate.networks import Channel, CommandPolicy
 from palpate.runs.storage import write_bytes
 
 EXTRA = "deploy"
@@ -30,34 +30,41 @@ def onnx_model(policy: CommandPolicy) -> Any:
     """
     onnx = extra_module("onnx", EXTRA)
     graph = _Graph(onnx)
-    shape = list(policy.action_shape)
     centred = graph.add("Sub", "features", graph.constant(policy.mean))
     seen = graph.add("Div", centred, graph.constant(policy.scale))
+    shape = list(policy.action_shape)
     flat = graph.add("Flatten", "carry", axis=1)
-    previous = graph.add("Div", flat, graph.constant(policy.limit))
+    previous = graph.add("Div", flat, graph.constant(_limits(policy)))
     output = graph.add("Concat", seen, previous, axis=1)
     for number, layer in enumerate(policy.network.layers):
         if number:
             output = graph.add("Tanh", output)
         weight, bias = graph.constant(layer.weight), graph.constant(layer.bias)
         output = graph.add("Gemm", output, weight, bias, transB=1)
-    output = graph.add("Reshape", output, graph.constant([-1, *shape], np.int64))
-
-    one, limit = graph.constant(1.0), graph.constant(policy.limit)
-    length = graph.add("Sqrt", graph.add("Add", graph.square(output), one))
-    direction = graph.add("Div", output, length)
-    if policy.rate_limit is None:
-        command = graph.add("Mul", direction, limit)
-    else:
-        change = graph.add("Mul", direction, graph.constant(policy.period * policy.rate_limit))
-        command = graph.add("Add", "carry", change)
-        square = graph.add("Max", graph.square(command), graph.constant(policy.limit**2))
-        share = graph.add("Div", limit, graph.add("Sqrt", square))
-        command = graph.add("Mul", command, share)
+    moved, first = [], 0
+    for channel in policy.actions:
+        own = [graph.part(whole, first, channel) for whole in (output, flat)]
+        moved.append(graph.flat(_moved(graph, channel, policy.period, *own), channel.count))
+        first += channel.count
+    command = graph.add("Concat", *moved, axis=1)
+    command = graph.add("Reshape", command, graph.constant([-1, *shape], np.int64))
     graph.add("Identity", command, output="command")
     graph.add("Identity", command, output="carry_out")
     inputs = {"features": policy.mean.shape, "carry": shape}
     return graph.model(inputs, {"command": shape, "carry_out": shape})
+
+
+def _moved(graph: "_Graph", channel: Channel, period: float, output: str, before: str) -> str:
+    """The next command of one channel, from the network's output and the command before."""
+    limit, one = graph.constant(channel.bound), graph.constant(1.0)
+    length = graph.add("Sqrt", graph.add("Add", graph.square(output), one))
+    direction = graph.add("Div", output, length)
+    if channel.rate_limit is None:
+        return graph.add("Mul", direction, limit)
+    change = graph.add("Mul", direction, graph.constant(period * channel.rate_limit))
+    moved = graph.add("Add", before, change)
+    square = graph.add("Max", graph.square(moved), graph.constant(channel.bound**2))
+    return graph.add("Mul", moved, graph.add("Div", limit, graph.add("Sqrt", square)))
 
 
 def write_onnx(path: str | Path, policy: CommandPolicy) -> None:
@@ -72,7 +79,7 @@ def difference(path: str | Path, policy: CommandPolicy, steps: int, seed: int) -
     """The largest difference of any command between the file, run by ONNX Runtime, and the policy.
 
     Over random features (mean and spread of what it was trained to see, and ten times that), each
-    fed with its own carry for `steps` calls. In the action's unit.
+    fed with its own carry for `steps` calls. As a share of the limit of its channel.
 
     Raises `PalpateError` without the extra `deploy`.
     """
@@ -82,6 +89,7 @@ def difference(path: str | Path, policy: CommandPolicy, steps: int, seed: int) -
     mean, scale = np.asarray(policy.mean), np.asarray(policy.scale)
     spread = scale * np.where(np.arange(batch) < batch // 2, 1.0, 10.0)[:, None]
     ours = theirs = np.zeros((batch, *policy.action_shape), np.float32)
+    limits = _limits(policy)
     worst, decide = 0.0, eqx.filter_jit(lambda policy, carry, seen: policy(carry, seen)[0])
     for _ in range(steps):
         features = (mean + spread * random.normal(size=spread.shape)).astype(np.float32)
@@ -89,8 +97,14 @@ def difference(path: str | Path, policy: CommandPolicy, steps: int, seed: int) -
         command, theirs = session.run(
             ["command", "carry_out"], {"features": features, "carry": theirs}
         )
-        worst = max(worst, float(np.abs(command - ours).max()))
+        worst = max(worst, float((np.abs(command - ours).reshape(batch, -1) / limits).max()))
     return worst
+
+
+def _limits(policy: CommandPolicy) -> np.ndarray:
+    """Of every number of a command that of its channel, (commands,)."""
+    limits = [channel.bound for channel in policy.actions]
+    return np.repeat(limits, [channel.count for channel in policy.actions])
 
 
 class _Graph:
@@ -117,6 +131,16 @@ class _Graph:
     def square(self, vector: str) -> str:
         """The squared length along the last axis, which stays with size 1."""
         return self.add("ReduceSum", self.add("Mul", vector, vector), self._sum_axis, keepdims=1)
+
+    def part(self, flat: str, first: int, channel: Channel) -> str:
+        """The numbers of a channel from `first` on, in its shape."""
+        places = [self.constant([place], np.int64) for place in (first, first + channel.count, 1)]
+        own = self.add("Slice", flat, *places)
+        return self.add("Reshape", own, self.constant([-1, *channel.shape], np.int64))
+
+    def flat(self, value: str, count: int) -> str:
+        """The value as rows of `count` numbers."""
+        return self.add("Reshape", value, self.constant([-1, count], np.int64))
 
     def model(self, inputs: dict[str, Any], outputs: dict[str, Any]) -> Any:
         helper = self._onnx.helper

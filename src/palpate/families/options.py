@@ -227,7 +227,6 @@ class Train(Options, ABC):
     """Training through an identified model; each task says in `prepare` how it needs the model."""
 
     task: ClassVar[str]
-    action: ClassVar[str]  # what the policy's output is, for whoever reads its file
 
     model: Annotated[Path, arg(metavar="MODEL")]
     """What `palpate identify` wrote: its folder, or the model file in it."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from palpate.models.model import Model
-from palpate.networks.policy import Policy
+from palpate.networks import Controller
 from palpate.perception.velocity import VelocityEstimator
 from palpate.tasks.task import Start, Task
 
@@ -15,7 +15,7 @@ from palpate.tasks.task import Start, Task
 def simulate(
     task: Task,
     models: Model,
-    policy: Policy,
+    policy: Controller,
     start: Start,
     steps: int,
     keys: Key[Array, " batch"] | None = None,

@@ -105,10 +105,9 @@ def train(
         policy = CommandPolicy.create(
             for_policy,
             task.features(starts.state, starts.goal),
-            model.action_shape,
+            task.action_channels(model),
             period=model.control_period,
-            limit=task.action_limit,
-            rate_limit=task.action_rate_limit,
+            observations=task.feature_channels(model),
             width=training.width,
             depth=training.depth,
         )

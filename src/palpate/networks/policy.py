@@ -1,92 +1,69 @@
-"""What decides: the contract of every policy, and a network that changes a command within limits.
+"""A network that changes a command within the limits of its channels."""
 
-A policy is a pure function of what it carries and what it sees, so the same object runs inside a
-differentiated rollout, over a batch, and in a robot's control loop.
-"""
-
-from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.runs.storage import load_arrays, read_manifest, save_arrays
-
-_KIND = "command policy"
-
-
-class Policy(eqx.Module):
-    """The contract: `(carry, observation, goal, key) -> (carry, action)`, with or without a batch.
-
-    `observation` is (*batch, features) as the task that the policy was trained for gives it,
-    `goal` what the task asks for (None where nothing varies) and `key` randomness, for policies
-    that use any (None otherwise). A batch is one leading axis of everything.
-    """
-
-    @abstractmethod
-    def initial_carry(self, command: Array) -> Any:
-        """What to carry into the first call.
-
-        `command`, (*batch, *action_shape), is the action in force when the policy takes over:
-        zero for a robot at rest.
-        """
-
-    @abstractmethod
-    def __call__(
-        self, carry: Any, observation: Array, goal: Any, key: Key[Array, "*batch"] | None
-    ) -> tuple[Any, Array]:
-        """The next carry, and the action to hold for one control period."""
+from palpate.networks.channels import Channel, count_of
+from palpate.networks.controller import DeclaredController, load_controller
 
 
-class CommandPolicy(Policy):
+class CommandPolicy(DeclaredController):
     """A tanh network whose output moves a command: no faster than a rate, no farther than a limit.
 
-    With the network's output x, one vector along the last axis of the action,
+    With the network's output x, one vector along the last axis of each channel of the action,
 
         rate = rate_limit x / sqrt(1 + |x|^2)
         command = previous + period rate,  shortened to the length `limit`
 
     or, where the rate has no limit (`rate_limit` None), command = limit x / sqrt(1 + |x|^2). The
-    previous command is carried, and seen by the network beside the normalised observation. Limits
-    hold for the Euclidean norm, in the action's unit and that per second. A goal is seen only as
-    far as the task's observation expresses it.
+    previous command is carried, and seen by the network, as a share of its limits, beside the
+    normalised observation. A goal is seen only as far as the task's observation expresses it.
     """
 
     network: eqx.nn.MLP
     mean: Float[Array, " features"]
     scale: Float[Array, " features"]
-    action_shape: tuple[int, ...] = eqx.field(static=True)
+    observations: tuple[Channel, ...] = eqx.field(static=True)
+    actions: tuple[Channel, ...] = eqx.field(static=True)
     period: float = eqx.field(static=True)
-    limit: float = eqx.field(static=True)
-    rate_limit: float | None = eqx.field(static=True)
 
     @classmethod
     def create(
         cls,
         key: PRNGKeyArray,
-        observations: Float[Array, "samples features"],
-        action_shape: tuple[int, ...],
+        examples: Float[Array, "samples features"],
+        actions: Channel | Sequence[Channel],
         *,
         period: float,
-        limit: float,
-        rate_limit: float | None = None,
+        observations: Sequence[Channel] = (),
         width: int = 256,
         depth: int = 2,
     ) -> "CommandPolicy":
         """An untrained policy that hardly acts, normalised by examples of what it will see.
 
-        `period` is in s, `limit` in the action's unit and `rate_limit` in that per second; `depth`
-        layers of `width` units. A feature that does not vary in the examples is only centred.
+        `observations` are the features' channels (default: one, called "features"), `period` is in
+        s; `depth` layers of `width` units. A feature that does not vary is only centred.
+
+        Raises `PalpateError` for an action without a limit, and channels that are not the features.
         """
-        deviation = jnp.std(observations, axis=0)
-        features = observations.shape[-1]
-        commands = int(np.prod(action_shape))
+        actions = (actions,) if isinstance(actions, Channel) else tuple(actions)
+        features, commands = examples.shape[-1], count_of(actions)
+        observations = tuple(observations) or (Channel("features", (features,)),)
+        if count_of(observations) != features:
+            raise PalpateError(
+                f"the policy's observations are described as {count_of(observations)} features "
+                f"and its network sees {features}: expected as many"
+            )
+        if not all(channel.bound > 0 for channel in actions):
+            raise PalpateError("the limit of an action is greater than 0")
+        deviation = jnp.std(examples, axis=0)
         network = eqx.nn.MLP(
             features + commands, commands, width, depth, activation=jnp.tanh, key=key
         )
@@ -98,16 +75,30 @@ class CommandPolicy(Policy):
         )
         return cls(
             network=network,
-            mean=jnp.mean(observations, axis=0),
+            mean=jnp.mean(examples, axis=0),
             scale=jnp.where(deviation > 1e-6, deviation, 1.0),
-            action_shape=tuple(action_shape),
+            observations=observations,
+            actions=actions,
             period=period,
-            limit=limit,
-            rate_limit=rate_limit,
         )
 
+    @property
+    def action_shape(self) -> tuple[int, ...]:
+        """Of what a call gives: the channel's, or flat where the action has several."""
+        return self.actions[0].shape if len(self.actions) == 1 else (count_of(self.actions),)
+
+    def settings(self, folder: Path) -> dict[str, Any]:
+        """See `DeclaredController.settings`: the network's width and depth."""
+        return {"width": self.network.width_size, "depth": self.network.depth}
+
+    @classmethod
+    def from_settings(cls, folder: Path, **settings: Any) -> "CommandPolicy":
+        """See `DeclaredController.from_settings`."""
+        features = count_of(settings["observations"])
+        return cls.create(jax.random.key(0), jnp.zeros((2, features)), **settings)
+
     def initial_carry(self, command: Array) -> Array:
-        """The command itself; see `Policy.initial_carry`."""
+        """The command itself; see `Controller.initial_carry`."""
         return command
 
     def __call__(
@@ -136,7 +127,7 @@ class CommandPolicy(Policy):
 
         Raises `PalpateError` where the rate of the command has no limit.
         """
-        if self.rate_limit is None:
+        if any(channel.rate_limit is None for channel in self.actions):
             raise PalpateError(
                 "similarity needs a policy whose network moves the command by an acceleration; "
                 "the command of this one has no rate limit"
@@ -145,19 +136,44 @@ class CommandPolicy(Policy):
         command = self._moved(carry, self._direction(carry / root, observation))
         return command, command
 
+    def shares(
+        self, command: Array, observation: Float[Array, "*batch features"]
+    ) -> Float[Array, "*batch commands"]:
+        """The command as shares of its limits, flat, for as many as there are observations."""
+        shares = self._each(lambda channel, own: own / channel.bound, command)
+        return shares.reshape(*observation.shape[:-1], -1)
+
     def _direction(self, carry: Array, observation: Array) -> Array:
-        """Where the network moves the command: a vector shorter than 1."""
+        """Where the network moves the command: in each channel vectors shorter than 1."""
         mean, scale = jax.lax.stop_gradient((self.mean, self.scale))
         seen = (observation - mean) / scale
-        previous = carry.reshape(*observation.shape[:-1], -1) / self.limit
         network = jax.vmap(self.network) if observation.ndim == 2 else self.network
-        output = network(jnp.concatenate([seen, previous], axis=-1)).reshape(carry.shape)
-        return output / jnp.sqrt(1.0 + jnp.sum(output**2, axis=-1, keepdims=True))
+        output = network(jnp.concatenate([seen, self.shares(carry, observation)], axis=-1))
+        return self._each(
+            lambda _, own: own / jnp.sqrt(1.0 + jnp.sum(own**2, axis=-1, keepdims=True)),
+            output.reshape(carry.shape),
+        )
 
     def _moved(self, carry: Array, direction: Array) -> Array:
-        if self.rate_limit is None:
-            return self.limit * direction
-        return _shorten(carry + self.period * self.rate_limit * direction, self.limit)
+        def move(channel: Channel, carry: Array, direction: Array) -> Array:
+            if channel.rate_limit is None:
+                return channel.bound * direction
+            change = self.period * channel.rate_limit * direction
+            return _shorten(carry + change, channel.bound)
+
+        return self._each(move, carry, direction)
+
+    def _each(self, change: Callable[..., Array], *commands: Array) -> Array:
+        """`change(channel, its part of each command)` of every channel, put together again."""
+        if len(self.actions) == 1:
+            return change(self.actions[0], *commands)
+        changed, first, batch = [], 0, commands[0].shape[:-1]
+        for channel in self.actions:
+            parts = [command[..., first : first + channel.count] for command in commands]
+            parts = [part.reshape(*batch, *channel.shape) for part in parts]
+            changed.append(change(channel, *parts).reshape(*batch, -1))
+            first += channel.count
+        return jnp.concatenate(changed, axis=-1)
 
 
 def _shorten(vector: Array, limit: float) -> Array:
@@ -167,47 +183,15 @@ def _shorten(vector: Array, limit: float) -> Array:
     return vector * (limit / jnp.sqrt(jnp.maximum(squared, limit**2)))
 
 
-def save_policy(path: str | Path, policy: CommandPolicy, manifest: Mapping[str, Any]) -> None:
-    """Write a policy as safetensors; its sizes, rate and limits join the manifest in the header.
-
-    `manifest` says what else a user must know: task, features, units, what it was trained on.
-    """
-    own = {
-        "kind": _KIND,
-        "features": policy.mean.shape[0],
-        "width": policy.network.width_size,
-        "depth": policy.network.depth,
-        "action_shape": policy.action_shape,
-        "period": policy.period,
-        "limit": policy.limit,
-        "rate_limit": policy.rate_limit,
-    }
-    save_arrays(path, policy, {**manifest, "policy": own})
-
-
 def load_policy(path: str | Path) -> tuple[CommandPolicy, dict[str, Any]]:
-    """The policy that `save_policy` wrote, and its manifest.
+    """The network that `save_controller` wrote, and its manifest.
 
-    Raises `PalpateError` when the file holds something else, `DamagedFileError` when it is
-    damaged.
+    Raises `PalpateError` for a controller of another kind, and as `load_controller`.
     """
-    own = read_manifest(path).get("policy")
-    if not isinstance(own, dict) or own.get("kind") != _KIND:
+    policy, manifest = load_controller(path)
+    if not isinstance(policy, CommandPolicy):
         raise PalpateError(
-            f"{path} holds no policy: expected a file written by `palpate train` or `save_policy`"
+            f"{path} holds a {manifest['controller']['kind']}: expected a network, as "
+            "`palpate train` writes it"
         )
-    try:
-        like = eqx.filter_eval_shape(
-            CommandPolicy.create,
-            jax.random.key(0),
-            jax.ShapeDtypeStruct((2, own["features"]), jnp.float32),
-            action_shape=tuple(own["action_shape"]),
-            period=own["period"],
-            limit=own["limit"],
-            rate_limit=own["rate_limit"],
-            width=own["width"],
-            depth=own["depth"],
-        )
-    except (KeyError, TypeError) as error:
-        raise PalpateError(f"{path} does not say which network it holds: {error}") from error
-    return load_arrays(path, like)
+    return policy, manifest

@@ -8,6 +8,7 @@ import equinox as eqx
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.models.model import Model
+from palpate.networks import Channel
 
 
 class Start(eqx.Module):
@@ -37,6 +38,8 @@ class Task(eqx.Module):
     outcome_units: ClassVar[Mapping[str, str]] = {}  # of what `outcome` gives; "" if not named
     stages: ClassVar[tuple[float, ...]] = (0.5, 1.0)
     action_lag: ClassVar[float] = 0.0
+    action_name: ClassVar[str] = "action"
+    action_unit: ClassVar[str] = ""
     duration: eqx.AbstractVar[float]
     action_limit: eqx.AbstractVar[float]
     action_rate_limit: eqx.AbstractVar[float | None]
@@ -69,8 +72,13 @@ class Task(eqx.Module):
         """What a policy sees of a state and of what is asked for."""
 
     @abstractmethod
-    def feature_names(self, model: Model) -> dict[str, str]:
-        """The blocks of `features` in their order, with shape and unit, for manifests."""
+    def feature_channels(self, model: Model) -> tuple[Channel, ...]:
+        """What `features` are made of, in their order."""
+
+    def action_channels(self, model: Model) -> tuple[Channel, ...]:
+        """What an action is made of: one channel, unless the task has several."""
+        limits = self.action_limit, self.action_rate_limit
+        return (Channel(self.action_name, model.action_shape, self.action_unit, *limits),)
 
     @abstractmethod
     def loss(self, models: Model, start: Start, states: Any, actions: Array) -> Float[Array, " b"]:

@@ -53,10 +53,9 @@ class Actor(CommandPolicy):
             network=network,
             mean=policy.mean,
             scale=policy.scale,
-            action_shape=policy.action_shape,
+            observations=policy.observations,
+            actions=policy.actions,
             period=policy.period,
-            limit=policy.limit,
-            rate_limit=policy.rate_limit,
         )
 
     def told(
@@ -64,8 +63,7 @@ class Actor(CommandPolicy):
     ) -> Float[Array, "*batch inputs"]:
         """What the network is given: scaled features, and the command as a share of its limit."""
         scaled = (features - self.mean) / self.scale
-        previous = command.reshape(*features.shape[:-1], -1) / self.limit
-        return jnp.concatenate([scaled, previous], axis=-1)
+        return jnp.concatenate([scaled, self.shares(command, features)], axis=-1)
 
     def moved(
         self, command: Float[Array, "*batch driven 3"], action: Float[Array, "*batch outputs"]
@@ -126,10 +124,8 @@ class Episodes(eqx.Module):
         actor = Actor.untrained(
             for_actor,
             task.features(pool.state, pool.goal),
-            action_shape=model.action_shape,
+            actions=task.action_channels(model),
             period=model.control_period,
-            limit=task.action_limit,
-            rate_limit=task.action_rate_limit,
             width=training.width,
             depth=training.depth,
         )

@@ -18,7 +18,6 @@ import numpy as np
 from palpate.commands.folders import POLICY
 from palpate.commands.train import trained
 from palpate.errors import PalpateError
-from palpate.families.rope.options import TrainRopeStabilization
 from palpate.families.rope.recording import GRIPPER, MARKERS, constants, record_rope, starting_rope
 from palpate.identification.gradient.descent import Settings, identify
 from palpate.learning import Training
@@ -203,8 +202,7 @@ def trained_policy(
     }
     with Run.open(path, configuration) as run:
         if not run.finished:
-            action = TrainRopeStabilization.action
-            trained(task, model, training, seed, run, action=action, command=command)
+            trained(task, model, training, seed, run, command=command)
             finish(run, task.name, "train", {})
         return load_policy(run.path / POLICY)
 

@@ -200,7 +200,6 @@ class TrainRopeStabilization(Train):
     """
 
     task: ClassVar[str] = "rope-stabilization"
-    action: ClassVar[str] = "gripper velocity, m/s"
 
     observation_noise: float = NOISE
     """Standard deviation of a marker's coordinate as the policy will see it, m."""
@@ -283,7 +282,6 @@ class TrainRopeTracking(Train):
     """
 
     task: ClassVar[str] = "rope-tracking"
-    action: ClassVar[str] = "gripper velocity, m/s"
 
     observation_noise: float = NOISE
     """Standard deviation of a marker's coordinate as the policy will see it, m."""

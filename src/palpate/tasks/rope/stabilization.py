@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
+from palpate.networks import Channel
 from palpate.tasks.task import Start, Task
 
 STABILISED = 0.01  # of the start's energy: the seed's bar
@@ -42,6 +43,8 @@ class RopeStabilization(Task):
     """
 
     name: ClassVar[str] = "rope-stabilization"
+    action_name: ClassVar[str] = "gripper velocity"
+    action_unit: ClassVar[str] = "m/s"
     outcome_units: ClassVar[Mapping[str, str]] = {
         "settling_time": "s",
         "settling_periods": "periods",
@@ -185,13 +188,13 @@ class RopeStabilization(Task):
         seen = jnp.concatenate([relative, state.velocity[..., 1:, :]], axis=-2)
         return seen.reshape(*seen.shape[:-2], -1)
 
-    def feature_names(self, model: Rope) -> dict[str, str]:
-        """See `Task.feature_names`."""
-        nodes = model.nodes - 1
-        return {
-            "node position relative to the gripper": f"({nodes}, 3) m",
-            "node velocity": f"({nodes}, 3) m/s",
-        }
+    def feature_channels(self, model: Rope) -> tuple[Channel, ...]:
+        """See `Task.feature_channels`."""
+        shape = (model.nodes - 1, 3)
+        return (
+            Channel("node position relative to the gripper", shape, "m"),
+            Channel("node velocity", shape, "m/s"),
+        )
 
     def loss(
         self, models: Rope, start: Start, states: RopeState, actions: Array

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
+from palpate.networks import Channel
 from palpate.tasks.rope.paths import DesiredPath, random_paths
 from palpate.tasks.rope.stabilization import RopeStabilization
 from palpate.tasks.task import Start, Task
@@ -44,6 +45,8 @@ class RopeTracking(Task):
     """
 
     name: ClassVar[str] = "rope-tracking"
+    action_name: ClassVar[str] = "gripper velocity"
+    action_unit: ClassVar[str] = "m/s"
     outcome_units: ClassVar[Mapping[str, str]] = {
         "mean_tip_error": "cm",
         "rms_tip_error": "cm",
@@ -134,14 +137,11 @@ class RopeTracking(Task):
         seen = _ROPE.features(state, None)
         return jnp.concatenate([seen, path.reshape(*path.shape[:-2], -1)], axis=-1)
 
-    def feature_names(self, model: Rope) -> dict[str, str]:
-        """See `Task.feature_names`."""
+    def feature_channels(self, model: Rope) -> tuple[Channel, ...]:
+        """See `Task.feature_channels`."""
         instants = ", ".join(f"{instant:g}" for instant in PREVIEW)
-        return _ROPE.feature_names(model) | {
-            f"desired tip position relative to the gripper, {instants} s ahead": (
-                f"({len(PREVIEW)}, 3) m"
-            )
-        }
+        ahead = f"desired tip position relative to the gripper, {instants} s ahead"
+        return (*_ROPE.feature_channels(model), Channel(ahead, (len(PREVIEW), 3), "m"))
 
     def loss(
         self, models: Rope, start: Start, states: RopeState, actions: Array

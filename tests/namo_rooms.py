@@ -1,12 +1,17 @@
 """Small maps among movable obstacles that several tests plan on."""
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
 from shapely import box
 
+from palpate.numerics.polygons import LEAST_AREA
+from palpate.planning.movable_obstacles.maps.description import FORMAT
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot, map_of
+from palpate.runs.storage import write_json
 
 Box = tuple[float, float, float, float]
 
@@ -46,6 +51,46 @@ def two_rooms(
         bounds=(0.0, 0.0, width, height),
         cell_size=cell,
         margin=margin,
+    )
+
+
+def write_map(path: str | Path, world: Map) -> None:
+    """Put a map into a JSON file that `read_described` reads back, without slivers of walls."""
+    robot: dict[str, Any] = {"radius": world.robot.radius, "drive": world.robot.drive}
+    if world.robot.reach is not None:
+        robot["reach"] = world.robot.reach
+    if world.robot.push_only:
+        robot["push_only"] = True
+    walls = [
+        {
+            "outline": np.asarray(part.exterior.coords)[:-1],
+            "holes": [
+                np.asarray(hole.coords)[:-1]
+                for hole in part.interiors
+                if shapely.Polygon(hole).area >= LEAST_AREA
+            ],
+        }
+        for part in shapely.get_parts(world.walls)
+        if part.area >= LEAST_AREA
+    ]
+    movables = {
+        name: {"polygon": movable.outline, "pose": movable.pose, "hints": dict(movable.hints)}
+        for name, movable in world.movables.items()
+    }
+    write_json(
+        path,
+        {
+            "format": FORMAT,
+            "name": world.name,
+            "bounds": world.bounds,
+            "cell_size": world.cell_size,
+            "margin": world.margin,
+            "robot": robot,
+            "start": world.start,
+            "goals": world.goals,
+            "walls": walls,
+            "movables": movables,
+        },
     )
 
 

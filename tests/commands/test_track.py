@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from image_folders import write_image_folder
 from palpate.cli import main
 from palpate.commands import folders
 from palpate.families.rope.tracking import OVERLAY, follow
 from palpate.models.files import save_model
 from palpate.models.rope import Rope
-from palpate.perception.image_folder import write_image_folder
 from palpate.perception.rope.segmentation import Appearance
 from palpate.recordings.files import read_recording
 from palpate.worlds.camera import Sensor

@@ -6,10 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from namo_rooms import IN_DOOR, two_rooms
+from namo_rooms import IN_DOOR, two_rooms, write_map
 from palpate.errors import PalpateError
 from palpate.experiments.furniture import namo_scenarios as study
-from palpate.planning.movable_obstacles.maps.description import write_map
 from palpate.planning.movable_obstacles.search.planner import Planner
 
 

@@ -69,7 +69,7 @@ def test_a_free_body_turns_about_its_centre_of_mass_which_goes_straight(float64)
 def test_a_force_off_the_centre_turns_the_body_by_its_moment_of_inertia(float64):
     model = body(gyration=1.3)
     inertia = 10.0 * 1.3**2 * (1.2**2 + 0.6**2) / 12.0
-    action = model.wrench_at(at().pose, 0, jnp.array([0.6, 0.0]), jnp.array([0.0, 3.0]))
+    action = jnp.array([[0.0, 3.0, 0.6 * 3.0]])  # 3 N at 0.6 m from the centre
     following = model.step(at(), action)
     np.testing.assert_allclose(
         following.velocity[0], [0.0, 0.02 * 0.3, 0.02 * 1.8 / inertia], rtol=1e-12

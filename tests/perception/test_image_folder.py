@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from image_folders import write_image_folder
 from palpate.errors import PalpateError
 from palpate.numerics.pinhole import Frame, Pinhole
-from palpate.perception.image_folder import read_image_folder, write_image_folder
+from palpate.perception.image_folder import read_image_folder
 
 CAMERA = Pinhole.looking_at((0.0, 0.0, 1.0), (0.3, -2.0, 1.2), 24, 16, 1.0)
 

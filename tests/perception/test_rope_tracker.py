@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from image_folders import write_image_folder
 from palpate.errors import PalpateError
 from palpate.models.rope import Rope
 from palpate.numerics.pinhole import Frame
-from palpate.perception.image_folder import read_image_folder, write_image_folder
+from palpate.perception.image_folder import read_image_folder
 from palpate.perception.rope.segmentation import Appearance
 from palpate.perception.rope.tracking import LOST_FRAMES, RopeTracker
 from palpate.worlds.camera import Sensor

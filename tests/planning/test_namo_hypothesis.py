@@ -94,7 +94,6 @@ def test_any_map_ends_in_a_checked_plan_or_a_sentence(drawn):
         assert len(said) < 400
     else:
         assert faults_of(plan, world) == []
-        assert plan.valid_on(world)
     assert time.perf_counter() - began < LONGEST
 
 

@@ -11,10 +11,9 @@ from shapely import affinity
 from shapely.geometry import Polygon
 
 from namo_grids import CORNERS, OWN, room, ros_map
-from namo_rooms import IN_DOOR, two_rooms
+from namo_rooms import IN_DOOR, two_rooms, write_map
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import checked_polygon, checked_pose, shown
-from palpate.planning.movable_obstacles.maps.description import write_map
 from palpate.planning.movable_obstacles.maps.files import maps_in, read_map
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot
 

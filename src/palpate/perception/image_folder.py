@@ -14,16 +14,14 @@ The folder holds
 from __future__ import annotations
 
 import csv
-import io
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.numerics.pinhole import Frame, Pinhole
-from palpate.runs.storage import read_json, write_bytes, write_json, write_text
+from palpate.runs.storage import read_json
 
 CAMERA, TIMES, COLOUR, DEPTH = "camera.json", "times.csv", "colour", "depth"
 FILMS = [f"{COLOUR}{suffix}" for suffix in (".mp4", ".mkv", ".avi", ".mov", ".webm")]
@@ -55,38 +53,6 @@ def read_image_folder(path: str | Path) -> tuple[Pinhole, list[Frame], np.ndarra
             depth = np.where(millimetres > 0, millimetres / 1e3, np.nan).astype(np.float32)
         frames.append(Frame(moment, colour, depth))
     return pinhole, frames, np.array([place for *_, place in rows])
-
-
-def write_image_folder(
-    path: str | Path, pinhole: Pinhole, frames: Sequence[Frame], gripper: np.ndarray
-) -> None:
-    """Write what `read_image_folder` reads; depth is rounded to whole millimetres, to 65 m."""
-    path = Path(path)
-    for folder in (COLOUR, DEPTH) if frames[0].depth is not None else (COLOUR,):
-        (path / folder).mkdir(parents=True, exist_ok=True)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for index, (frame, place) in enumerate(zip(frames, gripper, strict=True)):
-        name = f"{index:06d}.png"
-        write_bytes(path / COLOUR / name, _png(frame.colour))
-        if frame.depth is not None:
-            millimetres = np.nan_to_num(np.round(frame.depth * 1e3), nan=0.0, posinf=0.0)
-            depth = np.clip(millimetres, 0, 65535).astype(np.uint16)
-            write_bytes(path / DEPTH / name, _png(depth))
-        writer.writerow([name, f"{frame.time:.6f}", *(f"{part:.6f}" for part in place)])
-    write_text(path / TIMES, text.getvalue())
-    write_json(
-        path / CAMERA,
-        {
-            "width": pinhole.width,
-            "height": pinhole.height,
-            "focal": pinhole.focal,
-            "centre": pinhole.centre,
-            "position": pinhole.position,
-            "world_from_camera": pinhole.world_from_camera,
-        },
-    )
 
 
 def _camera(path: Path) -> Pinhole:
@@ -175,11 +141,3 @@ def _picture(path: Path, mode: str) -> np.ndarray:
             return np.asarray(image)
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise PalpateError(f"{path} is no PNG or JPEG that can be read: {error}") from error
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG")
-    return buffer.getvalue()

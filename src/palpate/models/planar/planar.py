@@ -155,33 +155,6 @@ class Planar(PlanarParameters):
         to_world = (self.link_to < 0)[..., None]
         return dataclasses.replace(self, link_pose=jnp.where(to_world, own, relative))
 
-    def wrench_at(
-        self,
-        pose: Float[Array, "*batch bodies 3"],
-        body: int,
-        point: Float[Array, "*batch 2"],
-        force: Float[Array, "*batch 2"],
-    ) -> Float[Array, "*batch bodies 3"]:
-        """The action that pushes one body with a force (N, world axes) at a point of it.
-
-        `point` is in m in the body's frame: where it is touched or grasped.
-        """
-        angle = pose[..., body, 2]
-        x, y = turn(point[..., 0], point[..., 1], jnp.cos(angle), jnp.sin(angle))
-        torque = x * force[..., 1] - y * force[..., 0]
-        wrench = jnp.concatenate([force, torque[..., None]], axis=-1)
-        return jnp.zeros_like(pose).at[..., body, :].set(wrench)
-
-    def kinetic_energy(self, state: PlanarState) -> Float[Array, "*batch bodies"]:
-        """Kinetic energy of each body, J."""
-        centre = self.centre_of_mass * self.half_extent
-        angle, rate = state.pose[..., 2], state.velocity[..., 2]
-        x, y = turn(centre[..., 0], centre[..., 1], jnp.cos(angle), jnp.sin(angle))
-        squared = jnp.square(state.velocity[..., 0] - rate * y)
-        squared = squared + jnp.square(state.velocity[..., 1] + rate * x)
-        gyration = self.gyration * self.even_gyration
-        return 0.5 * self.mass * (squared + jnp.square(gyration * rate))
-
     def _step_each(self, state: PlanarState, action: Array) -> PlanarState:
         """`step` of bodies that links or contacts couple."""
 

@@ -246,10 +246,6 @@ class Rope(RopeParameters):
         change = self.free_nodes()[:, None] * (following.velocity - state.velocity)
         return own_frame.turned_in(change, frame)
 
-    def stability_load(self) -> Float[Array, "*batch nodes"]:
-        """How much of the explicit stability limit each node uses: see `stability`."""
-        return stability.load(self)
-
     def constrain(self) -> "Rope":
         """The rope softened where the integration would be unstable: see `stability`."""
         return stability.soften(self)

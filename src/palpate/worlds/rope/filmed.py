@@ -66,11 +66,6 @@ class FilmedRope(World):
     def control_period(self) -> float:
         return self._world.control_period
 
-    @property
-    def frame_rate(self) -> float:
-        """Pictures per second."""
-        return self._sensor.rate
-
     def reset(self, seed: int, start: str = "hanging") -> FilmedObservation:
         """As `RopeWorld.reset`; `seed` draws the clutter and the camera's noise too."""
         observation = self._world.reset(seed, start=start)

@@ -32,7 +32,6 @@ from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import (
-    LEAST_AREA,
     centred,
     checked_polygon,
     checked_pose,
@@ -43,7 +42,7 @@ from palpate.numerics.polygons import (
     shown,
 )
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose, Robot, map_of
-from palpate.runs.storage import read_json, write_json
+from palpate.runs.storage import read_json
 
 FORMAT = "palpate map 1"
 SIDE_CAR = ".movables"
@@ -64,8 +63,7 @@ def read_described(path: str | Path) -> Map:
     content = checked_keys(read_json(path), str(path), _MAP_KEYS)
     if content.get("format") != FORMAT:
         raise PalpateError(
-            f"{path} has the format {shown(content.get('format'))}: expected {FORMAT!r}, as "
-            "`write_map` writes it"
+            f"{path} has the format {shown(content.get('format'))}: expected {FORMAT!r}"
         )
     for key in ("robot", "start", "bounds", "cell_size"):
         if key not in content:
@@ -86,50 +84,6 @@ def read_described(path: str | Path) -> Map:
         bounds=_bounds(content["bounds"], str(path)),
         cell_size=number(content["cell_size"], f"cell_size of {path}"),
         margin=None if "margin" not in content else number(content["margin"], f"margin of {path}"),
-    )
-
-
-def write_map(path: str | Path, world: Map) -> None:
-    """Put a map into a JSON file that `read_described` reads back.
-
-    Objects are written as outlines about their centroids, with their poses; pieces of walls and
-    holes in them of less than a square millimetre, which no reader takes, are left out.
-    """
-    robot: dict[str, Any] = {"radius": world.robot.radius, "drive": world.robot.drive}
-    if world.robot.reach is not None:
-        robot["reach"] = world.robot.reach
-    if world.robot.push_only:
-        robot["push_only"] = True
-    walls = [
-        {
-            "outline": np.asarray(part.exterior.coords)[:-1],
-            "holes": [
-                np.asarray(hole.coords)[:-1]
-                for hole in part.interiors
-                if shapely.Polygon(hole).area >= LEAST_AREA
-            ],
-        }
-        for part in shapely.get_parts(world.walls)
-        if part.area >= LEAST_AREA
-    ]
-    movables = {
-        name: {"polygon": movable.outline, "pose": movable.pose, "hints": dict(movable.hints)}
-        for name, movable in world.movables.items()
-    }
-    write_json(
-        path,
-        {
-            "format": FORMAT,
-            "name": world.name,
-            "bounds": world.bounds,
-            "cell_size": world.cell_size,
-            "margin": world.margin,
-            "robot": robot,
-            "start": world.start,
-            "goals": world.goals,
-            "walls": walls,
-            "movables": movables,
-        },
     )
 
 
@@ -263,7 +217,7 @@ def _at(name: str, corners: Any, pose: Pose, hints: dict[str, Any], what: str) -
     """An object from corners in body coordinates, whose origin is put at `pose`."""
     polygon = checked_polygon(corners, what)
     outline, centroid = centred(polygon)
-    if np.linalg.norm(centroid) <= _CENTRED:  # as `write_map` writes it: the same numbers again
+    if np.linalg.norm(centroid) <= _CENTRED:  # the same numbers again
         return Movable(name, corners_of(polygon), pose, hints)
     ((x, y),) = placed(np.array([centroid]), pose)
     return Movable(name, outline, (float(x), float(y), pose[2]), hints)

@@ -14,7 +14,6 @@ from scipy import ndimage
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 
 _EIGHT = np.ones((3, 3), int)
-_MOST_COVERING = 4  # objects on one place that are still worth moving all
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ import numpy as np
 from palpate.planning.movable_obstacles.motion.manipulation import Grasp, Primitive
 
 FREE, AXIS, PIVOT, STATIC = "free", "axis", "pivot", "static"
-CONSTRAINTS = (FREE, AXIS, PIVOT, STATIC)
 LEVER = 0.2  # m between hand and fixed point: nearer, the hand's own torque would have to turn it
 FACING = math.cos(math.radians(50))  # between a face's normal and the free axis
 ASIDE = 0.5  # m beside the wheels of an axis

@@ -1,19 +1,16 @@
-"""What a planner hands out: where to drive, what to carry where; and whether that still holds."""
+"""What a planner hands out: where to drive, and what to carry where."""
 
 import time
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
-from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import corners_of, length_of, lines, placed, polygons
+from palpate.numerics.polygons import length_of
 from palpate.planning.movable_obstacles.maps.map import Map, Pose
-from palpate.planning.movable_obstacles.motion.collisions import SHRUNK, TOUCHING
 from palpate.planning.movable_obstacles.motion.manipulation import Grasp
 from palpate.runs.storage import read_json, write_json
 
@@ -53,8 +50,7 @@ class Plan:
 
     `planning_s` is the wall time it took; `regions`, `borders`, `evaluations` and `sweeps` say of
     what size the problem was: free regions, borders between abstract states, abstract actions that
-    got rollouts, sweeps of value iteration. `beliefs` is what the model believed of the objects
-    that are moved; it is not written to files.
+    got rollouts, sweeps of value iteration.
     """
 
     map_name: str
@@ -62,7 +58,6 @@ class Plan:
     segments: tuple[Segment, ...]
     planning_s: float
     sizes: Mapping[str, int] = field(default_factory=dict)
-    beliefs: Mapping[str, Hashable] = field(default_factory=dict)
 
     # --- figures ------------------------------------------------------------------------------
 
@@ -113,47 +108,6 @@ class Plan:
         `direct` (m) is the shortest way with no movable there.
         """
         return min(1.0, direct / self.distance) if self.distance > 0 else 1.0
-
-    # --- validity -----------------------------------------------------------------------------
-
-    def valid_on(self, world: Map, begin: int = 0) -> bool:
-        """Whether the segments from index `begin` on can still be carried out on that map."""
-        return self.conflict_on(world, begin) is None
-
-    def conflict_on(self, world: Map, begin: int = 0) -> tuple[int, str] | None:
-        """The first segment that cannot be carried out, and what is in its way; None if all can.
-
-        Objects are where the map has them, and where earlier segments leave them. Ways are
-        checked exactly, transfers at every step; both end-points may be as near to something as
-        they are. A few milliseconds.
-        """
-        standing = {name: movable.polygon for name, movable in world.movables.items()}
-        for index in range(begin, len(self.segments)):
-            segment = self.segments[index]
-            held = segment.name
-            if held is not None and held not in world.movables:
-                return index, f"there is no '{held}'"
-            beside = [s.name for s in self.segments[max(begin, index - 1) : index + 2]]
-            touched = {name for name in beside if name is not None}
-            obstacles = [shape for name, shape in standing.items() if name != held]
-            hit = _way_hit(segment, world, standing, touched, held)
-            if hit is None and held is not None:
-                assert segment.object_poses is not None
-                expected = world.movables[held].polygon_at(segment.object_poses[0])
-                off = expected.hausdorff_distance(standing[held])
-                if not expected.intersects(standing[held]) or off > world.cell_size:
-                    return index, f"'{held}' is not where it would be taken up"
-                # Held where it stands, it stays as far off on the way as it is.
-                x, y, theta = segment.object_poses[0]
-                outline = placed(corners_of(standing[held]) - (x, y), (0.0, 0.0, -theta))
-                bodies = polygons(placed(outline, segment.object_poses))
-                hit = _body_hit(bodies, world, obstacles)
-                standing[held] = bodies[-1]
-            if hit is not None:
-                return index, hit
-        return None
-
-    # --- files --------------------------------------------------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
         """As it stands in JSON."""
@@ -245,50 +199,3 @@ def _poses(value: Any) -> np.ndarray:
 def timed() -> float:
     """The clock that planning times are taken with, s."""
     return time.perf_counter()
-
-
-# --- what is in the way -----------------------------------------------------------------------
-
-
-def _way_hit(
-    segment: Segment,
-    world: Map,
-    standing: Mapping[str, BaseGeometry],
-    touched: set[str],
-    held: str | None,
-) -> str | None:
-    """What the robot's disc comes too near to on a segment."""
-    places = segment.poses[:, :2]
-    if len(places) == 1:
-        places = np.repeat(places, 2, axis=0)
-    way = lines(np.stack([places[:-1], places[1:]], axis=1))
-    ends = shapely.points(places[[0, -1]])
-    names = [name for name in standing if name != held]
-    shapes = np.array([standing[name] for name in names] + [world.walls], object)
-    for name, shape in zip([*names, "a wall"], shapes, strict=True):
-        if shapely.is_empty(shape):
-            continue
-        gap = float(shapely.distance(way, shape).min())
-        allowed = world.clearance
-        if name in touched:
-            allowed = min(allowed, world.robot.radius + world.reach)
-        if gap < allowed - _TOLERANCE:
-            near = float(shapely.distance(ends, shape).min())
-            if near < world.robot.radius - _TOLERANCE or gap < near - _TOLERANCE:
-                return name
-    return None
-
-
-def _body_hit(bodies: np.ndarray, world: Map, obstacles: Sequence[BaseGeometry]) -> str | None:
-    """What the carried object, a polygon at every step, comes too near to."""
-    tree = shapely.STRtree([*world.wall_edges, *obstacles])
-    step, which = tree.query(bodies, predicate="dwithin", distance=world.margin)
-    near = tree.geometries[which]
-    began, now = shapely.distance(bodies[0], near), shapely.distance(bodies[step], near)
-    hit = now < np.minimum(world.margin, began) - _TOLERANCE
-    touching = began < TOUCHING  # it may slide along, but not enter
-    inner = shapely.buffer(bodies, -SHRUNK)
-    entered = shapely.intersects(inner[step], near) & ~shapely.intersects(inner[0], near)
-    if (hit | (touching & entered)).any():
-        return "something that stands nearer than the margin to where it would be carried"
-    return None

@@ -91,31 +91,7 @@ class Planner:
             self._known.clear()
         sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
         done = self._found(world, goal, fixed, sizes, _HALVINGS)
-        segments = tuple(done.segments)
-        beliefs = {s.name: self.model.belief(s.name) for s in segments if s.name is not None}
-        return Plan(world.name, goal, segments, timed() - began, sizes, beliefs)
-
-    def replan(
-        self,
-        plan: Plan,
-        world: Map,
-        begin: int = 0,
-        immovable: Iterable[str] = (),
-    ) -> Plan:
-        """What is left of a plan from segment `begin` on, or another where that no longer holds.
-
-        `world` is the map as it now is. The rest is kept if the robot is where that segment begins,
-        nothing is in its way, no object that it carries counts as immovable, and the model believes
-        of these what it believed when the plan was made. Raises as `plan`.
-        """
-        fixed = set(immovable)
-        rest = plan.segments[begin:]
-        carried = {segment.name for segment in rest if segment.name is not None}
-        same = all(plan.beliefs.get(name) == self.model.belief(name) for name in carried)
-        begins = rest and np.allclose(rest[0].poses[0, :2], world.start[:2], atol=world.cell_size)
-        if same and begins and not carried & fixed and plan.valid_on(world, begin):
-            return dataclasses.replace(plan, segments=rest, planning_s=0.0)
-        return self.plan(world, plan.goal, fixed)
+        return Plan(world.name, goal, tuple(done.segments), timed() - began, sizes)
 
     # --- above --------------------------------------------------------------------------------
 

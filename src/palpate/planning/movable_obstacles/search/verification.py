@@ -1,7 +1,7 @@
 """An independent, exact look at a plan: swept polygons against walls and objects, no grid.
 
-It shares with the search only outlines, the walls' edges and where a grasp is, and is slower than
-`Plan.valid_on`: what is handed out, or counts as reached in an experiment, has passed it.
+It shares with the search only outlines, the walls' edges and where a grasp is. What is handed out,
+or counts as reached in an experiment, has passed it.
 """
 
 import math

@@ -22,6 +22,7 @@ from palpate.planning.movable_obstacles.search.planner import Planner
 from palpate.planning.movable_obstacles.search.policy import NoWayError
 from palpate.planning.movable_obstacles.search.regrasps import stops_of
 from palpate.planning.movable_obstacles.search.situation import whole
+from palpate.planning.movable_obstacles.search.transfers import Move
 from palpate.planning.movable_obstacles.search.verification import faults_of
 
 ALONG_WALL = math.pi / 2  # the wall between the rooms runs along y, and so does the body's y
@@ -114,20 +115,12 @@ def test_stops_are_apart_and_say_how_sure_they_are():
     space = Space(world)
 
     def stops(*draws: Constraint):
-        return stops_of(
-            OpeningSearch(
-                space,
-                model(*draws),
-                "piece",
-                np.array(world.start),
-                np.array(world.goals[0][:2]),
-                (),
-                whole(space),
-            )
-        )
+        move = Move(0, "piece", world.goals[0][:2], frozenset(), 0.0)
+        start = np.array(world.start)
+        return stops_of(OpeningSearch(space, model(*draws), start, move, whole(space)))
 
     found = stops(NEAR_END)
-    turned = [stop.object_pose[2] for stop in found]
+    turned = [stop.object_poses[-1, 2] for stop in found]
     assert min(turned) < -0.2
     assert max(turned) > 0.2
     assert sorted(np.abs(turned), reverse=True) == list(np.abs(turned))

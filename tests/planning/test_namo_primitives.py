@@ -23,11 +23,11 @@ from palpate.planning.movable_obstacles.motion.physics_manipulation import (
     swept,
 )
 from palpate.planning.movable_obstacles.motion.primitives import (
-    APART,
     AXIS,
     FREE,
     LEVER,
     PIVOT,
+    SEPARATION,
     STATIC,
     Constraint,
     Turn,
@@ -151,7 +151,7 @@ def test_points_to_turn_about_are_where_most_draws_have_one():
     found = anchors([Constraint(STATIC), Constraint(FREE), *near])
     assert found[0] == pytest.approx((0.4, 0.21))
     assert (0.0, 0.0) in found
-    assert all(math.dist(a, b) >= APART for a in found for b in found if a != b)
+    assert all(math.dist(a, b) >= SEPARATION for a in found for b in found if a != b)
 
 
 def test_a_twist_is_swept_as_small_steps_of_it_are():

@@ -52,7 +52,7 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
             "model": name,
             "structure": {name: getattr(physics, name) for name in structure_of(type(physics))},
             "parameters": describe(physics),
-            **({} if network is None else {"correction": _arrays(network)}),
+            **({} if network is None else {"correction": dict(vars(network))}),
             "about": dict(about or {}),
         },
     )
@@ -89,8 +89,10 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
     _check_names(path, "structure", structure, structure_of(kind))
     axes, given = axes_of(kind), rows | structure
     arrays = {name: _whole(_numbers(path, name, given[name]), of) for name, of in axes.items()}
-    for name, value in arrays.items():
-        _check_axes(path, name, value, axes[name])
+    for name, value in arrays.items():  # without the batch's axes
+        if value.ndim != len(axes[name]):
+            expected = f"the axes ({', '.join(axes[name])})" if axes[name] else "one number"
+            raise PalpateError(f"'{name}' in {path} must be {expected}, got shape {value.shape}")
     settings = {name: value for name, value in structure.items() if name not in arrays}
     model = built(path, kind, arrays, settings)
     if _VERSIONS[version]:
@@ -158,10 +160,6 @@ def built(
         raise PalpateError(f"{path} is damaged: {error}") from error
 
 
-def _arrays(network: SiteNetwork) -> dict[str, Any]:
-    return {field.name: getattr(network, field.name) for field in dataclasses.fields(network)}
-
-
 def _corrected(path: str | Path, physics: Model, content: Any) -> Residual:
     """The physics with the network of a file on top of it, every array of which is checked."""
     if not isinstance(content, dict):
@@ -208,12 +206,9 @@ def _whole(value: np.ndarray, axes: list[str]) -> np.ndarray:
 
 def _check_names(path: str | Path, what: str, came: Any, expected: Any) -> None:
     if set(came) != set(expected):
-        missing = sorted(set(expected) - set(came))
-        unknown = sorted(set(came) - set(expected))
-        raise PalpateError(
-            f"the {what} in {path} do not fit: missing {missing or 'none'}, "
-            f"unknown {unknown or 'none'}"
-        )
+        missing = sorted(set(expected) - set(came)) or "none"
+        unknown = sorted(set(came) - set(expected)) or "none"
+        raise PalpateError(f"the {what} in {path} do not fit: missing {missing}, unknown {unknown}")
 
 
 def _alike(value: Any, default: Any) -> bool:
@@ -223,13 +218,6 @@ def _alike(value: Any, default: Any) -> bool:
     if isinstance(default, tuple):
         return isinstance(value, tuple) and all(_alike(item, default[0]) for item in value)
     return type(value) is type(default) or (type(default), type(value)) == (float, int)
-
-
-def _check_axes(path: str | Path, name: str, value: np.ndarray, axes: list[str]) -> None:
-    """A file holds one model: an array has the axes of its annotation, without the batch's."""
-    if value.ndim != len(axes):
-        expected = f"the axes ({', '.join(axes)})" if axes else "one number"
-        raise PalpateError(f"'{name}' in {path} must be {expected}, got shape {value.shape}")
 
 
 def _numbers(path: str | Path, name: str, value: Any) -> np.ndarray:

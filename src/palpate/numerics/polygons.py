@@ -4,6 +4,7 @@ Outlines are (points, 2) arrays in metres without the first point repeated. A po
 and theta in radians; an outline in body coordinates has its centroid at the origin.
 """
 
+import math
 import reprlib
 from collections.abc import Iterable, Sequence
 
@@ -111,6 +112,12 @@ def placed(outline: np.ndarray, pose: np.ndarray | Sequence[float]) -> np.ndarra
     points[..., 0] = pose[..., :1] + cos * x - sin * y
     points[..., 1] = pose[..., 1:2] + sin * x + cos * y
     return points
+
+
+def turned(vector: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
+    """(x, y) turned by an angle in rad."""
+    (x, y), cos, sin = vector, math.cos(angle), math.sin(angle)
+    return np.array([cos * x - sin * y, sin * x + cos * y])
 
 
 def circumscribed_radius(outline: np.ndarray) -> float:

@@ -60,14 +60,9 @@ def _camera(path: Path) -> Pinhole:
     names = ("width", "height", "focal", "centre", "position", "world_from_camera")
     try:
         width, height, focal, centre, position, rotation = (document[name] for name in names)
-        return Pinhole(
-            int(width),
-            int(height),
-            (float(focal[0]), float(focal[1])),
-            (float(centre[0]), float(centre[1])),
-            (float(position[0]), float(position[1]), float(position[2])),
-            tuple((float(row[0]), float(row[1]), float(row[2])) for row in rotation),
-        )
+        rows = tuple((float(row[0]), float(row[1]), float(row[2])) for row in rotation)
+        (f_u, f_v), (c_u, c_v), (x, y, z) = (map(float, each) for each in (focal, centre, position))
+        return Pinhole(int(width), int(height), (f_u, f_v), (c_u, c_v), (x, y, z), rows)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise PalpateError(
             f"{path} describes no camera: expected {', '.join(names)} ({error})"

@@ -8,10 +8,18 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib
 import numpy as np
 import shapely
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, PathPatch, Polygon
+from matplotlib.path import Path as Outline
+from PIL import Image
 
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import placed
@@ -21,16 +29,15 @@ from palpate.planning.movable_obstacles.maps.regions import regions_of
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan
 from palpate.runs.storage import write_bytes
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 _INK, _QUIET, _WALL = "#1c2127", "#5b6570", "#3d4650"
 _OBJECT, _MOVED, _ROBOT, _CARRY = "#f3d9a0", "#e8a33d", "#0062a8", "#c04d00"
 _TINTS = ("#e4eef7", "#e6f3ec", "#f6ebf3", "#fbf3df", "#ececf6", "#f0f0ea")
 _WIDE = 7.0  # inches of the longer side
 _GHOSTS = 6  # poses of an object that are shown on its way
 _SUFFIXES = (".png", ".svg")
+_STAR: Any = {
+    "marker": "*", "ms": 11, "color": _ROBOT, "mec": _INK, "mew": 0.6, "ls": "", "zorder": 9
+}  # fmt: skip
 _SETTINGS: Any = {"font.size": 8, "svg.hashsalt": "palpate", "axes.edgecolor": "#dfe3e7"}
 
 
@@ -50,8 +57,6 @@ def plan_picture(
 
     Raises `PalpateError` for another suffix.
     """
-    import matplotlib
-
     out = Path(out)
     if out.suffix not in _SUFFIXES:
         raise PalpateError(f"{out} has the suffix '{out.suffix}': expected .png or .svg")
@@ -75,35 +80,18 @@ def plan_picture(
         if plan is not None:
             _draw_ways(axes, plan)
         if driven is not None:
-            axes.plot(
-                driven[:, 0], driven[:, 1], color=_INK, lw=0.8, ls=":", label="driven", zorder=6
-            )
+            axes.plot(*driven[:, :2].T, color=_INK, lw=0.8, ls=":", label="driven", zorder=6)
         _draw_robot(axes, world, np.array(world.start), "start")
         goal = plan.goal if plan is not None else next(iter(world.goals), None)
         if goal is not None:
-            axes.plot(
-                *goal[:2],
-                marker="*",
-                ms=11,
-                color=_ROBOT,
-                mec=_INK,
-                mew=0.6,
-                zorder=9,
-                ls="",
-                label="goal",
-            )
+            axes.plot(*goal[:2], label="goal", **_STAR)
         _legend(figure, axes)
         _write(figure, out)
     return out
 
 
 def plan_animation(
-    out: str | Path,
-    world: Map,
-    plan: Plan,
-    *,
-    frames: int = 60,
-    period: float = 0.08,
+    out: str | Path, world: Map, plan: Plan, *, frames: int = 60, period: float = 0.08
 ) -> Path:
     """The plan carried out, as an endless GIF of `frames` pictures that each stand `period` s.
 
@@ -133,10 +121,6 @@ def scene_animation(
     `movability` is what is believed of the objects in each frame. Where an object's pose is not
     given, it stands as on the map. An execution is shown so as well as a plan.
     """
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
-
     out = Path(out)
     pictures = []
     with matplotlib.rc_context(_SETTINGS):
@@ -146,9 +130,8 @@ def scene_animation(
         canvas.draw()  # with its layout, once: the rest is drawn over it
         figure.set_layout_engine("none")
         background = canvas.copy_from_bbox(figure.bbox)
-        star = {"marker": "*", "ms": 11, "color": _ROBOT, "mec": _INK, "mew": 0.6, "ls": ""}
         for index, robot in enumerate(robots):
-            drawn: list[Any] = axes.plot(*goal[:2], zorder=9, **star)
+            drawn: list[Any] = axes.plot(*goal[:2], **_STAR)
             drawn += axes.plot(*robots[: index + 1, :2].T, color=_ROBOT, lw=1.0, zorder=5)
             for name, movable in world.movables.items():
                 pose = np.asarray(objects[index].get(name, movable.pose))
@@ -164,9 +147,8 @@ def scene_animation(
                 axes.draw_artist(artist)
                 artist.remove()
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-            pictures.append(
-                picture.quantize(64, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-            )
+            colours = 64, Image.Quantize.FASTOCTREE
+            pictures.append(picture.quantize(*colours, dither=Image.Dither.NONE))
     buffer = io.BytesIO()
     milliseconds = [round(1000 * period)] * (len(pictures) - 1) + [1500]
     pictures[0].save(
@@ -225,9 +207,7 @@ def _final_poses(world: Map, plan: Plan | None) -> dict[str, np.ndarray]:
 # --- drawing ----------------------------------------------------------------------------------
 
 
-def _scene(world: Map, dots: int = 200) -> tuple["Figure", "Axes"]:
-    from matplotlib.figure import Figure
-
+def _scene(world: Map, dots: int = 200) -> tuple[Figure, Axes]:
     left, bottom, right, top = world.bounds
     scale = _WIDE / max(right - left, top - bottom)
     size = (max(2.5, scale * (right - left)) + 0.6, max(2.0, scale * (top - bottom)) + 0.9)
@@ -238,10 +218,8 @@ def _scene(world: Map, dots: int = 200) -> tuple["Figure", "Axes"]:
     return figure, axes
 
 
-def _draw_regions(axes: "Axes", world: Map) -> None:
+def _draw_regions(axes: Axes, world: Map) -> None:
     """Each free region of the robot's centre in a tint of its own."""
-    from matplotlib.colors import to_rgba
-
     space = Space(world)
     node = regions_of(space).node
     tints = np.array([to_rgba(tint) for tint in _TINTS])
@@ -253,29 +231,18 @@ def _draw_regions(axes: "Axes", world: Map) -> None:
     )
 
 
-def _draw_walls(axes: "Axes", world: Map) -> None:
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path as Outline
-
+def _draw_walls(axes: Axes, world: Map) -> None:
     for part in shapely.get_parts(world.walls):
         if part.is_empty:
             continue
         rings = [np.asarray(ring.coords) for ring in (part.exterior, *part.interiors)]
-        axes.add_patch(
-            PathPatch(
-                Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings)),
-                fc=_WALL,
-                ec="none",
-                zorder=2,
-            )
-        )
+        whole = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
+        axes.add_patch(PathPatch(whole, fc=_WALL, ec="none", zorder=2))
 
 
 def _draw_object(
-    axes: "Axes", corners: np.ndarray, *, moved: bool = False, left: bool = False
+    axes: Axes, corners: np.ndarray, *, moved: bool = False, left: bool = False
 ) -> list[Any]:
-    from matplotlib.patches import Polygon
-
     look: dict[str, Any] = {"fc": _OBJECT, "ec": _INK, "lw": 0.8, "zorder": 3}
     if moved:
         look |= {"fc": "none", "ls": (0, (3, 2)), "ec": _QUIET}
@@ -284,9 +251,7 @@ def _draw_object(
     return [axes.add_patch(Polygon(corners, closed=True, **look))]
 
 
-def _draw_ghosts(axes: "Axes", world: Map, plan: Plan | None, name: str) -> None:
-    from matplotlib.patches import Polygon
-
+def _draw_ghosts(axes: Axes, world: Map, plan: Plan | None, name: str) -> None:
     for segment in plan.segments if plan is not None else ():
         if segment.name != name or segment.object_poses is None:
             continue
@@ -296,9 +261,7 @@ def _draw_ghosts(axes: "Axes", world: Map, plan: Plan | None, name: str) -> None
             axes.add_patch(Polygon(corners, fc=_MOVED, alpha=0.12, ec=_CARRY, lw=0.4, zorder=3))
 
 
-def _draw_robot(axes: "Axes", world: Map, pose: np.ndarray, label: str | None = None) -> list[Any]:
-    from matplotlib.patches import Circle
-
+def _draw_robot(axes: Axes, world: Map, pose: np.ndarray, label: str | None = None) -> list[Any]:
     radius = world.robot.radius
     disc = Circle((pose[0], pose[1]), radius, fc="white", ec=_ROBOT, lw=1.4, zorder=7, alpha=0.9)
     tip = pose[:2] + radius * np.array([math.cos(pose[2]), math.sin(pose[2])])
@@ -309,7 +272,7 @@ def _draw_robot(axes: "Axes", world: Map, pose: np.ndarray, label: str | None = 
     return drawn
 
 
-def _draw_ways(axes: "Axes", plan: Plan) -> None:
+def _draw_ways(axes: Axes, plan: Plan) -> None:
     looks = {
         False: {"color": _ROBOT, "lw": 1.3, "label": "drives"},
         True: {"color": _CARRY, "lw": 2.2, "ls": (0, (2.5, 1.2)), "label": "drives and carries"},
@@ -322,21 +285,15 @@ def _draw_ways(axes: "Axes", plan: Plan) -> None:
             axes.plot(*segment.poses[-1, :2], marker="s", ms=4, color=_CARRY, zorder=7)
 
 
-def _legend(figure: "Figure", axes: "Axes") -> None:
+def _legend(figure: Figure, axes: Axes) -> None:
     handles = {}
     for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
         handles.setdefault(label, handle)
-    figure.legend(
-        list(handles.values()),
-        list(handles),
-        loc="outside upper center",
-        ncols=len(handles),
-        frameon=False,
-        handlelength=2.6,
-    )
+    look: Any = {"loc": "outside upper center", "frameon": False, "handlelength": 2.6}
+    figure.legend(list(handles.values()), list(handles), ncols=len(handles), **look)
 
 
-def _write(figure: "Figure", out: Path) -> None:
+def _write(figure: Figure, out: Path) -> None:
     buffer = io.BytesIO()
     stamp = {"Date": None} if out.suffix == ".svg" else {"Software": None}
     figure.savefig(buffer, format=out.suffix[1:], metadata=stamp)

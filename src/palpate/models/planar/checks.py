@@ -11,8 +11,8 @@ from palpate.parameters import axes_of
 
 def check_axes(model: Any) -> None:
     """Raise `PalpateError` for an array that has other axes than the model's sizes."""
-    told = {"bodies": model.mass, "wheels": model.wheel, "links": model.pivot}
-    sizes = {axis: array.shape[-1] for axis, array in told.items() if array.ndim}
+    counted = {"bodies": model.mass, "wheels": model.wheel, "links": model.pivot}
+    sizes = {axis: array.shape[-1] for axis, array in counted.items() if array.ndim}
     for name, axes in axes_of(type(model)).items():
         shape = getattr(model, name).shape
         last = shape[max(len(shape) - len(axes), 0) :]
@@ -20,9 +20,9 @@ def check_axes(model: Any) -> None:
         if len(last) < len(axes) or any(
             want not in (None, size) for want, size in zip(wanted, last, strict=True)
         ):
-            counted = ", ".join(f"{size} {axis}" for axis, size in sizes.items())
+            counts = ", ".join(f"{size} {axis}" for axis, size in sizes.items())
             raise PalpateError(
-                f"{name} must have the axes ({', '.join(axes)}) of {counted}, got shape {shape}"
+                f"{name} must have the axes ({', '.join(axes)}) of {counts}, got shape {shape}"
             )
 
 

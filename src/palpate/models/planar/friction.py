@@ -138,14 +138,8 @@ def resistance(bodies: Rolling, free: Triple, time_step: float) -> Resistance:
     zero = jnp.zeros_like(bodies.mass)
     viscous = time_step * bodies.floor_viscosity
     shift = bodies.mass + viscous
-    entries: Entries = (
-        shift,
-        shift,
-        bodies.inertia + viscous * jnp.square(bodies.floor_radius),
-        zero,
-        zero,
-        zero,
-    )
+    turning = bodies.inertia + viscous * jnp.square(bodies.floor_radius)
+    entries: Entries = (shift, shift, turning, zero, zero, zero)
     nowhere = jnp.zeros_like(bodies.foot_x)
     here = nowhere + 1.0 / STICTION
     holding = time_step * STICTION * bodies.foot_friction

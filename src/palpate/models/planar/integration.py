@@ -217,15 +217,11 @@ def solve_bodies(entries: Entries, right: tuple[Array, ...], rows: Rows) -> Trip
     jacobian = rows.jacobian.reshape(-1, size)
     joined = jacobian.T @ (rows.weight[:, None] * jacobian)
     if bodies == 1:
-        entries = (
-            x + joined[0, 0],
-            y + joined[1, 1],
-            t + joined[2, 2],
-            xy + joined[0, 1],
-            xt + joined[0, 2],
-            yt + joined[1, 2],
+        places = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)
+        x, y, t, xy, xt, yt = (
+            entry + joined[place] for entry, place in zip(entries, places, strict=True)
         )
-        return solve_three(entries, (first, second, third))
+        return solve_three((x, y, t, xy, xt, yt), (first, second, third))
     blocks = jnp.stack([x, xy, xt, xy, y, yt, xt, yt, t], axis=-1).reshape(bodies, 3, 3)
     matrix = jnp.eye(bodies, dtype=x.dtype)[:, None, :, None] * blocks[:, :, None, :]
     stacked = jnp.stack([first, second, third], axis=-1).reshape(size)

@@ -1,5 +1,6 @@
 """From outlines to a planar model: convex parts, extents, padded structure."""
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -57,7 +58,7 @@ def furniture(
     for index, (shape, pieces) in enumerate(zip(shapes, parts, strict=True)):
         low, high = np.reshape(shape.bounds, (2, 2))
         extent[index] = 0.5 * (high - low)
-        centroid = np.array([shape.centroid.x, shape.centroid.y])
+        centroid = shapely.get_coordinates(shape.centroid)[0]
         if np.max(np.abs(centroid)) > OFF_CENTRE * np.max(extent[index]):
             raise PalpateError(
                 f"the centroid of outline {index} lies at ({centroid[0]:.4g}, {centroid[1]:.4g}) "
@@ -69,7 +70,7 @@ def furniture(
         bolts[_existing(body, count)] = 1.0
     fields |= _links(count, pivots or {}, distances or {})
     fields |= {
-        "outline": _padded([_padded(pieces) for pieces in parts], axis=0),
+        "outline": _padded([_padded(pieces) for pieces in parts]),
         "walls": _padded(wall_parts) if wall_parts else np.zeros((0, 3, 2)),
         "half_extent": extent,
         "even_gyration": gyration,
@@ -87,9 +88,8 @@ def furniture(
         try:
             fields[name] = np.broadcast_to(np.asarray(value, dtype=float), shape).copy()
         except ValueError as error:
-            raise PalpateError(
-                f"{name} must fit the shape {shape}, got {np.shape(value)}"
-            ) from error
+            came = np.shape(value)
+            raise PalpateError(f"{name} must fit the shape {shape}, got {came}") from error
     model, linked = Planar(**fields), fields["pivot"].size
     if poses is None and (linked or bolts.any()):
         raise PalpateError("links and bolts need the poses (bodies, 3) at which they hold")
@@ -121,20 +121,15 @@ def convex_parts(shape: Any) -> list[Float[np.ndarray, "corners 2"]]:
         for piece in shapely.constrained_delaunay_triangles(polygon).geoms
         if piece.area > 0.0
     ]
-    joined = True
-    while joined:
-        joined = False
-        for first in range(len(pieces)):
-            for second in range(first + 1, len(pieces)):
-                both = pieces[first].union(pieces[second])
-                if _is_convex(both):
-                    pieces[first] = both
-                    del pieces[second]
-                    joined = True
-                    break
-            if joined:
+    while True:
+        for first, second in itertools.combinations(range(len(pieces)), 2):
+            both = pieces[first].union(pieces[second])
+            if _is_convex(both):
+                pieces[first] = both
+                del pieces[second]
                 break
-    return [_corners(piece) for piece in pieces]
+        else:
+            return [_corners(piece) for piece in pieces]
 
 
 def even_gyration(parts: Sequence[Float[np.ndarray, "corners 2"]]) -> float:
@@ -181,19 +176,14 @@ def _corners(polygon: Any) -> Float[np.ndarray, "corners 2"]:
     return np.asarray(orient(hull).exterior.coords)[:-1]
 
 
-def _padded(arrays: Sequence[np.ndarray], axis: int = 0) -> np.ndarray:
+def _padded(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """Stacked, all as long as the longest: the last row again where one is shorter."""
     shape = np.max([array.shape for array in arrays], axis=0)
     return np.stack(
         [
-            np.pad(
-                array,
-                [(0, most - size) for most, size in zip(shape, array.shape, strict=True)],
-                mode="edge",
-            )
+            np.pad(array, [(0, more) for more in shape - array.shape], mode="edge")
             for array in arrays
-        ],
-        axis=axis,
+        ]
     )
 
 

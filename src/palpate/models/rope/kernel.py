@@ -39,6 +39,12 @@ TWIST_FADE = 0.01  # S above: twist counts half at joints of 0.1 rad
 COINCIDENT = 1e-12  # m^2, added to l^2, which vanishes where two nodes meet
 FOLDED = 1e-3  # added to |m|^2, which vanishes where the rope is folded back on itself
 
+# Coefficients that are parameters of a rope as they stand.
+PER_ELEMENT = (
+    "rest_length", "stretch_stiffness", "stretch_damping",
+    "bend_stiffness", "bend_damping", "twist_stiffness",
+)  # fmt: skip
+
 Flat = Float[Array, " _"]  # of any length
 Axes = tuple[Flat, ...]  # x, y and z
 
@@ -82,10 +88,8 @@ def integrate(
         position, velocity = state
         velocity = _moved_by_forces(position, velocity, rest_bend, coefficients, lanes)
         velocity = tuple(v + i for v, i in zip(velocity, increment, strict=True))
-        return (
-            tuple(p + time_step * v for p, v in zip(position, velocity, strict=True)),
-            velocity,
-        )
+        position = tuple(p + time_step * v for p, v in zip(position, velocity, strict=True))
+        return position, velocity
 
     # Only the states between time steps are kept for the reverse sweep: computing forces again
     # costs less than reading their intermediates back from memory.
@@ -141,13 +145,7 @@ def edge_forces(
 
 @compiled_apart
 def _stretch(
-    position: Axes,
-    velocity: Axes,
-    rest_length: Flat,
-    stiffness: Flat,
-    damping: Flat,
-    *,
-    lanes: int,
+    position: Axes, velocity: Axes, rest_length: Flat, stiffness: Flat, damping: Flat, *, lanes: int
 ) -> tuple[Axes, Axes, Axes, Flat]:
     """Of each segment the edge, its direction, the rate of that, and the tension per length."""
     edge = tuple(_difference(p, lanes) for p in position)
@@ -219,10 +217,8 @@ def _around_joints(values: Axes, lanes: int) -> tuple[Axes, Axes]:
 
     Taken once: a slice costs its reverse sweep a copy.
     """
-    return (
-        tuple(_drop(value, -1, lanes) for value in values),
-        tuple(_drop(value, 1, lanes) for value in values),
-    )
+    earlier = tuple(_drop(value, -1, lanes) for value in values)
+    return earlier, tuple(_drop(value, 1, lanes) for value in values)
 
 
 def _minus(a: Axes, b: Axes) -> Axes:
@@ -234,11 +230,7 @@ def _dot(a, b) -> Flat:
 
 
 def _cross(a: Axes, b: Axes) -> Axes:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def _difference(values: Flat, lanes: int) -> Flat:

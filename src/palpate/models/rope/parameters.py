@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
 from palpate.models.model import Model
-from palpate.parameters import LogNormal, Normal, Parameter, parameter
+from palpate.parameters import LogNormal, Normal, Parameter, axes_of, parameter
 
 
 class RopeState(eqx.Module):
@@ -141,16 +141,12 @@ class RopeParameters(Model):
     @staticmethod
     def _elements(nodes: int) -> dict[str, int]:
         """How many elements each of the remaining parameters has; 0: one number for the rope."""
-        per_rope = dict.fromkeys(
-            ("grip_stiffness", "grip_damping", "air_drag", "quadratic_drag", "gravity"), 0
-        )
-        return {
-            "stretch_stiffness": nodes - 1,
-            "stretch_damping": nodes - 1,
-            "bend_stiffness": nodes - 2,
-            "bend_damping": nodes - 2,
-            "twist_stiffness": nodes - 3,
-        } | per_rope
+        missing = {"segments": 1, "joints": 2, "torsions": 3}
+        counts = {}
+        for name, axes in axes_of(RopeParameters).items():
+            if name not in ("node_mass", "rest_length", "rest_bend"):
+                counts[name] = nodes - missing[axes[0]] if axes else 0
+        return counts
 
     @property
     def nodes(self) -> int:

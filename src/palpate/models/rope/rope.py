@@ -86,22 +86,20 @@ class Rope(RopeParameters):
     def step(self, state: RopeState, action: Float[Array, "*batch driven 3"]) -> RopeState:
         """The state one control period later. On CPUs a batch goes in blocks of `LANES` ropes."""
         state, increment = self._drive(state, action)
-        rest_bend = self._rest_bend(state.position)
+        motion = state, increment, self._rest_bend(state.position)
         coefficients = self._coefficients()
         batch = state.position.shape[:-2]
         if not batch:
             batch = jnp.broadcast_shapes(
                 *(leaf.shape[:-1] for leaf in jax.tree.leaves(coefficients)),
-                *(leaf.shape[:-2] for leaf in jax.tree.leaves(rest_bend)),
+                *(leaf.shape[:-2] for leaf in jax.tree.leaves(motion[2])),
             )
             if not batch:
-                return self._integrate((state, increment, rest_bend), coefficients, 1)
-            state, increment, rest_bend = jax.tree.map(
-                lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape[-2:]),
-                (state, increment, rest_bend),
+                return self._integrate(motion, coefficients, 1)
+            motion = jax.tree.map(
+                lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape[-2:]), motion
             )
-        count = state.position.shape[0]
-        return self._integrate_blocks((state, increment, rest_bend), coefficients, count)
+        return self._integrate_blocks(motion, coefficients, *batch)
 
     def _rest_bend(self, position: Array) -> Array | None:
         """Bend at rest in the world frame, (*batch, joints, 3); None for a straight rope.
@@ -113,16 +111,7 @@ class Rope(RopeParameters):
             return None
         chord = position[..., -1, :2] - position[..., 0, :2]
         along = chord / jnp.sqrt(jnp.sum(jnp.square(chord), axis=-1, keepdims=True) + 1e-6)
-        x, y = along[..., None, 0], along[..., None, 1]
-        bend = self.rest_bend
-        return jnp.stack(
-            [
-                x * bend[..., 0] - y * bend[..., 1],
-                y * bend[..., 0] + x * bend[..., 1],
-                jnp.broadcast_to(bend[..., 2], jnp.broadcast_shapes(x.shape, bend.shape[:-1])),
-            ],
-            axis=-1,
-        )
+        return own_frame.turned_out(self.rest_bend, along)
 
     def _drive(self, state: RopeState, action: Array) -> tuple[RopeState, Array]:
         """Start velocity of the driven nodes, and what each integration step adds to it."""
@@ -136,11 +125,8 @@ class Rope(RopeParameters):
         else:
             increment = action * self.time_step
         velocity = state.velocity.at[..., nodes, :].set(start)
-        everywhere = jnp.zeros(velocity.shape, velocity.dtype)
-        return (
-            RopeState(state.position, velocity),
-            everywhere.at[..., nodes, :].set(increment),
-        )
+        increment = jnp.zeros_like(velocity).at[..., nodes, :].set(increment)
+        return RopeState(state.position, velocity), increment
 
     def _coefficients(self) -> kernel.Coefficients:
         """The parameters as the integration uses them, each (*batch, elements)."""
@@ -154,12 +140,7 @@ class Rope(RopeParameters):
             return stability.spread(held * value[..., None], self.nodes - 1, 0)
 
         return kernel.Coefficients(
-            rest_length=self.rest_length,
-            stretch_stiffness=self.stretch_stiffness,
-            stretch_damping=self.stretch_damping,
-            bend_stiffness=self.bend_stiffness,
-            bend_damping=self.bend_damping,
-            twist_stiffness=self.twist_stiffness,
+            **{name: getattr(self, name) for name in kernel.PER_ELEMENT},
             grip_stiffness=at_the_grip(self.grip_stiffness),
             grip_damping=at_the_grip(self.grip_damping),
             linear_drag=per_node(self.air_drag),
@@ -265,16 +246,15 @@ class Rope(RopeParameters):
                 f"this one is driven at {self.driven}"
             )
         head = state.position[..., 0, :]
-        below = jnp.cumsum(self.node_mass[..., ::-1], axis=-1)[..., ::-1][..., 1:]
-        tension = below * self.gravity[..., None]
+        mass_below = jnp.cumsum(self.node_mass[..., ::-1], axis=-1)[..., ::-1][..., 1:]
+        tension = mass_below * self.gravity[..., None]
         hanging_length = self.rest_length + tension / self.stretch_stiffness
         hanging_height = -jnp.cumsum(hanging_length, axis=-1)
         height = state.position[..., 1:, 2] - head[..., None, 2] - hanging_height
         weight = self.node_mass[..., 1:] * self.gravity[..., None]
         gravity = jnp.sum(weight * height, axis=-1)
-        kinetic = 0.5 * jnp.sum(
-            self.node_mass * jnp.sum(jnp.square(state.velocity), axis=-1), axis=-1
-        )
+        squared_speed = jnp.sum(jnp.square(state.velocity), axis=-1)
+        kinetic = 0.5 * jnp.sum(self.node_mass * squared_speed, axis=-1)
         elastic_at_rest = 0.5 * jnp.sum(jnp.square(tension) / self.stretch_stiffness, axis=-1)
         return gravity + kinetic + self.elastic_energy(state.position) - elastic_at_rest
 
@@ -292,16 +272,9 @@ class Rope(RopeParameters):
         triple = jnp.sum(direction[..., :-2, :] * binormal[..., 1:, :], axis=-1)
         stretch = self.stretch_stiffness * jnp.square(length - self.rest_length)
         bending = self.bend_stiffness * jnp.sum(jnp.square(bend), axis=-1)
-        twist = (
-            self.twist_stiffness
-            * jnp.square(triple)
-            / (sine_squared[..., :-1] * sine_squared[..., 1:])
-        )
+        fade = sine_squared[..., :-1] * sine_squared[..., 1:]
+        twist = self.twist_stiffness * jnp.square(triple) / fade
         down = jnp.array([0.0, 0.0, -1.0], position.dtype)
         from_down = jnp.sum(jnp.square(direction[..., 0, :] - down), axis=-1)
-        return 0.5 * (
-            jnp.sum(stretch, axis=-1)
-            + jnp.sum(bending, axis=-1)
-            + jnp.sum(twist, axis=-1)
-            + float(0 in self.driven) * self.grip_stiffness * from_down
-        )
+        elastic = sum(jnp.sum(each, axis=-1) for each in (stretch, bending, twist))
+        return 0.5 * (elastic + float(0 in self.driven) * self.grip_stiffness * from_down)

@@ -52,8 +52,8 @@ GRID_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin"}
 _MAP_KEYS = GRID_KEYS | {"bounds", "walls", "format", "name"}
 _DRAWING_KEYS = {"movables"}
 _ROBOT_KEYS = {"radius", "footprint", "drive", "reach", "push_only"}
-_TRUTHS = {"yes": True, "on": True, "true": True, "1": True}
-_TRUTHS |= {"no": False, "off": False, "false": False, "0": False}
+_TRUTHS = dict.fromkeys(("yes", "on", "true", "1"), True)
+_TRUTHS |= dict.fromkeys(("no", "off", "false", "0"), False)
 _CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
 
 
@@ -74,16 +74,28 @@ def read_described(path: str | Path) -> Map:
     name = content.get("name", path.stem)
     if not isinstance(name, str):
         raise PalpateError(f"{path} has the name {shown(name)}: expected a text")
+    solid = shapely.union_all([_wall(wall, f"wall {k}") for k, wall in enumerate(walls)])
+    bounds = _bounds(content["bounds"], str(path))
+    return described_map(name, str(path), content, solid, bounds, content["cell_size"])
+
+
+def described_map(
+    name: str, what: str, content: Mapping[str, Any], walls: BaseGeometry, bounds: Any, cell: Any
+) -> Map:
+    """The map of these walls and bounds (m), with all else as `content` describes it.
+
+    `cell` (m) is the size of its cells where `content` has none. Raises `PalpateError`.
+    """
     return map_of(
         name,
-        walls=shapely.union_all([_wall(wall, f"wall {k}") for k, wall in enumerate(walls)]),
-        movables=movables_from(content.get("movables", {}), str(path)),
-        robot=robot_from(content["robot"], str(path)),
+        walls=walls,
+        movables=movables_from(content.get("movables", {}), what),
+        robot=robot_from(content["robot"], what),
         start=content["start"],
-        goals=goals_from(content.get("goals", []), str(path)),
-        bounds=_bounds(content["bounds"], str(path)),
-        cell_size=number(content["cell_size"], f"cell_size of {path}"),
-        margin=None if "margin" not in content else number(content["margin"], f"margin of {path}"),
+        goals=goals_from(content.get("goals", []), what),
+        bounds=bounds,
+        cell_size=number(content.get("cell_size", cell), f"cell_size of {what}"),
+        margin=number(content["margin"], f"margin of {what}") if "margin" in content else None,
     )
 
 
@@ -135,13 +147,7 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.error import YAMLError
     from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
-    try:
-        content = path.read_bytes()
-    except (OSError, ValueError) as error:  # no path has a null character
-        reason = getattr(error, "strerror", None) or error
-        raise PalpateError(f"cannot read {path}: {reason}") from error
-    if len(content) > _LARGEST:
-        raise PalpateError(f"{path} is of {len(content)} bytes: expected at most {_LARGEST}")
+    content = read_bytes(path, _LARGEST)
     try:
         events = YAML(typ="safe", pure=True).parse(content) if b"*" in content else ()
         depth = 0
@@ -160,6 +166,18 @@ def read_yaml(path: Path) -> Any:
     except (YAMLError, ValueError, LookupError, ArithmeticError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise PalpateError(f"{path} is no plain YAML: {reason}") from error
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """The content of a file of at most so many bytes; raises `PalpateError` for any other."""
+    try:
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:  # no path has a null character
+        reason = getattr(error, "strerror", None) or error
+        raise PalpateError(f"cannot read {path}: {reason}") from error
+    if len(content) > most:
+        raise PalpateError(f"{path} is of {len(content)} bytes: expected at most {most}")
+    return content
 
 
 # --- parts ------------------------------------------------------------------------------------

@@ -76,8 +76,7 @@ class Movable:
 
     def moved(self, pose: Pose | np.ndarray) -> "Movable":
         """The same at another pose."""
-        x, y, theta = (float(value) for value in pose)
-        return dataclasses.replace(self, pose=(x, y, theta))
+        return dataclasses.replace(self, pose=as_pose(pose))
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +257,12 @@ class Map:
                     f"at its start ({gap:.3g} m from its centre): expected a free start"
                 )
         return goal
+
+
+def as_pose(values: Iterable[Any]) -> Pose:
+    """x, y, theta as floats."""
+    x, y, theta = map(float, values)
+    return x, y, theta
 
 
 def map_of(

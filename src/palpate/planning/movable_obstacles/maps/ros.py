@@ -18,15 +18,13 @@ from palpate.errors import PalpateError
 from palpate.numerics.polygons import shown
 from palpate.planning.movable_obstacles.maps.description import (
     GRID_KEYS,
-    goals_from,
-    movables_from,
+    described_map,
     number,
     read_yaml,
-    robot_from,
     side_car,
     truth,
 )
-from palpate.planning.movable_obstacles.maps.map import MOST_CELLS, Map, map_of
+from palpate.planning.movable_obstacles.maps.map import MOST_CELLS, Map
 
 MODES = ("trinary", "scale", "raw")
 _BROKEN = (OSError, ValueError, SyntaxError)  # what Pillow raises for the middle of a picture
@@ -52,18 +50,9 @@ def read_ros(path: str | Path) -> Map:
                 f"{path} says nothing of the {key}: expected a file {path.stem}.movables.json "
                 "beside it with robot, start, goals and movables"
             )
-    margin = beside.get("margin")
-    return map_of(
-        path.stem,
-        walls=walls,
-        movables=movables_from(beside.get("movables", {}), str(path)),
-        robot=robot_from(beside["robot"], str(path)),
-        start=beside["start"],
-        goals=goals_from(beside.get("goals", []), str(path)),
-        bounds=bounds,
-        cell_size=number(beside.get("cell_size", resolution), f"cell_size of {path}"),
-        margin=None if margin is None else number(margin, f"margin of {path}"),
-    )
+    if beside.get("margin", 0) is None:  # as if it were left out
+        del beside["margin"]
+    return described_map(path.stem, str(path), beside, walls, bounds, resolution)
 
 
 def described(path: Path) -> dict[str, Any]:

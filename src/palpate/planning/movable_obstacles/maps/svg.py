@@ -27,7 +27,7 @@ from palpate.numerics.polygons import (
     circumscribed_radius,
     shown,
 )
-from palpate.planning.movable_obstacles.maps.description import truth
+from palpate.planning.movable_obstacles.maps.description import read_bytes, truth
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose, Robot, map_of
 from palpate.planning.movable_obstacles.maps.svg_paths import (
     joined,
@@ -62,8 +62,7 @@ class _Drawn:
     @cached_property
     def outlines(self) -> list[np.ndarray]:
         """Each of points (points, 2), m."""
-        matrix = self.matrix
-        every = path_outlines(self.attributes["d"], self.called)
+        every, matrix = path_outlines(self.attributes["d"], self.called), self.matrix
         return [points @ matrix[:2, :2].T + matrix[:2, 2] for points in every]
 
     @property
@@ -83,7 +82,7 @@ class Drawing:
     paths: list[_Drawn] = field(default_factory=list)
     config: Any = None
 
-    def of(self, identifier: str | None, what: str) -> tuple[_Drawn, float]:
+    def shape_of(self, identifier: str | None, what: str) -> tuple[_Drawn, float]:
         """The shape of that id, or the one in the group of that id, and its direction in rad."""
         if not identifier:
             raise PalpateError(f"the namo_config has {what} without an id: expected one of a path")
@@ -99,8 +98,7 @@ class Drawing:
         shape = shapes[0]
         if "angle" in shape.attributes:
             return shape, _angle(shape)
-        arrows = (path for path in inside if path.type in _DIRECTIONS)
-        arrow = next(arrows, None)
+        arrow = next((path for path in inside if path.type in _DIRECTIONS), None)
         return shape, 0.0 if arrow is None else _direction(arrow)
 
 
@@ -120,10 +118,8 @@ class _Meant:
         parents = {child: one for one in root.iter() for child in one}
         holders: set[Any] = set()
         inside: set[Any] = set()
-        named = {one.get(key) for one in root.iter() for key in ("agent_id", "goal_id")} - {
-            None,
-            "",
-        }
+        named = {one.get(key) for one in root.iter() for key in ("agent_id", "goal_id")}
+        named -= {None, ""}
         for element in root.iter():
             layer = bool(_layers(element))
             if layer and element not in inside:
@@ -138,9 +134,8 @@ class _Meant:
     def check(self, element: Any, called: str, layer: str) -> None:
         """Refuse an element that would have to be read and is no path."""
         tag = _local(element.tag)
-        if tag == "g":  # what is in it is looked at by itself
-            refused = element.get("type") in _TYPES
-        else:
+        refused = element.get("type") in _TYPES  # of a group, whose parts are looked at themselves
+        if tag != "g":
             drawn = layer and any(_local(one.tag) in _DRAWN for one in element.iter())
             refused = drawn or element in self.holders
         if tag == "use":  # a copy of what is elsewhere
@@ -174,16 +169,16 @@ def read_svg(path: str | Path) -> Map:
     if not agents:
         raise PalpateError(f"{path} has no agent in its namo_config: expected one, with its goals")
     agent = agents[0]
-    shape, heading = drawing.of(agent.get("agent_id"), "agent")
+    shape, heading = drawing.shape_of(agent.get("agent_id"), "agent")
     outline, (x, y) = centred(checked_polygon(shape.points, f"agent {shown(shape.name)}"))
     parameters = [element for element in agent.iter() if _local(element.tag) == "parameters"]
     said = parameters[0].attrib if parameters else {}
     goals = []
     for element in agent:
         if _local(element.tag) == "goal":
-            found, angle = drawing.of(element.get("goal_id"), "goal")
+            found, angle = drawing.shape_of(element.get("goal_id"), "goal")
             goals.append((*_middle(found), angle))
-    others = [drawing.of(other.get("agent_id"), "agent")[0] for other in agents[1:]]
+    others = [drawing.shape_of(other.get("agent_id"), "agent")[0] for other in agents[1:]]
     standing = [checked_polygon(one.points, f"agent {shown(one.name)}") for one in others]
     return map_of(
         path.stem,
@@ -211,11 +206,8 @@ def drawn_walls(drawing: Drawing) -> list[BaseGeometry]:
 
 def movables_of(drawing: Drawing) -> list[Movable]:
     """Paths of type movable; where no path has a type, those of the layer of movables."""
-    return [
-        Movable.from_corners(drawn.name, drawn.points)
-        for drawn in drawing.paths
-        if drawn.type == "movable"
-    ]
+    movables = [drawn for drawn in drawing.paths if drawn.type == "movable"]
+    return [Movable.from_corners(drawn.name, drawn.points) for drawn in movables]
 
 
 def goals_of(drawing: Drawing, agent: str) -> list[tuple[float, float, float]]:
@@ -294,13 +286,7 @@ def read_drawing(path: Path, scale: float, corner: tuple[float, float] | None = 
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 
-    try:
-        content = path.read_bytes()
-    except (OSError, ValueError) as error:  # no path has a null character
-        reason = getattr(error, "strerror", None) or error
-        raise PalpateError(f"cannot read {path}: {reason}") from error
-    if len(content) > _LARGEST_FILE:
-        raise PalpateError(f"{path} is of {len(content)} bytes: expected at most {_LARGEST_FILE}")
+    content = read_bytes(path, _LARGEST_FILE)
     try:
         root = fromstring(content, forbid_dtd=False, forbid_entities=True, forbid_external=True)
     except DefusedXmlException as error:
@@ -311,9 +297,10 @@ def read_drawing(path: Path, scale: float, corner: tuple[float, float] | None = 
         raise PalpateError(f"{path} is no XML: {error}") from error
     if _local(root.tag) != "svg":
         raise PalpateError(f"{path} has the root {shown(_local(root.tag))}: expected <svg>")
-    box = [
-        _number(text, f"viewBox of {path}") for text in re.split(r"[\s,]+", _viewbox(root, path))
-    ]
+    view = root.get("viewBox")
+    if view is None:
+        raise PalpateError(f"{path} has no viewBox, which gives its size in cm")
+    box = [_number(text, f"viewBox of {path}") for text in re.split(r"[\s,]+", view.strip())]
     if len(box) != 4 or box[2] <= 0 or box[3] <= 0:
         raise PalpateError(f"{path} has the viewBox {box}: expected x, y, width, height above 0")
     width, height = box[2] * scale, box[3] * scale
@@ -355,11 +342,8 @@ def _walk(
                     "orientation, or none"
                 )
             if child.get("d"):
-                unnamed = f"path_{len(drawing.paths)}"
-                attributes = dict(child.attrib)
-                drawing.paths.append(
-                    _Drawn(name or unnamed, called, kind, groups, attributes, here)
-                )
+                own = name or f"path_{len(drawing.paths)}"
+                drawing.paths.append(_Drawn(own, called, kind, groups, dict(child.attrib), here))
         elif tag not in _NEVER_DRAWN:
             meant.check(child, called, layer)
             if tag == "g":
@@ -371,13 +355,6 @@ def _layers(element: Any) -> list[str]:
     """Which of namosim's layers an element is, by its id or by the label that Inkscape shows."""
     labels = (value for key, value in element.attrib.items() if _local(key) in ("id", "label"))
     return [label for label in labels if label in _LAYERS]
-
-
-def _viewbox(root: Any, path: Path) -> str:
-    text = root.get("viewBox")
-    if text is None:
-        raise PalpateError(f"{path} has no viewBox, which gives its size in cm")
-    return text.strip()
 
 
 def _local(tag: object) -> str:

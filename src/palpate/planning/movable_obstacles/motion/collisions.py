@@ -64,18 +64,15 @@ class Clearance:
         gap, margin = (
             math.hypot(least, self.step / 2) for least in (world.clearance, world.margin)
         )
-        apart = np.repeat([gap, margin], count)
-        which, others = self._obstacles.query(shapes, predicate="dwithin", distance=apart)
+        distance = np.repeat([gap, margin], count)
+        which, others = self._obstacles.query(shapes, predicate="dwithin", distance=distance)
         gaps = np.where(which < count, math.inf, self._near[others])
         which = which % count
         bad[which[gaps == math.inf]] = True
         close = gaps < math.inf
         if close.any():
-            which, gaps, others = (
-                which[close],
-                gaps[close],
-                self._obstacles.geometries[others[close]],
-            )
+            which, gaps = which[close], gaps[close]
+            others = self._obstacles.geometries[others[close]]
             touching = gaps < TOUCHING
             nearer = shapely.distance(bodies[which], others) < gaps - 1e-6
             if touching.any():

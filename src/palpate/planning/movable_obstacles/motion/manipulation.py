@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import placed, turned
 from palpate.planning.movable_obstacles.maps.map import Movable, Pose
 
 _SHORTEST_FACE = 0.5  # of the least distance between grasps
@@ -29,13 +29,8 @@ class Grasp:
     def robot_pose(self, pose: Pose | np.ndarray, standoff: float) -> np.ndarray:
         """The base's pose (3,) when the object is at `pose`; `standoff` from its centre, m."""
         (x, y), angle = placed(np.array([self.point]), np.asarray(pose))[0], self.normal + pose[2]
-        return np.array(
-            [
-                x + standoff * math.cos(angle),
-                y + standoff * math.sin(angle),
-                math.atan2(-math.sin(angle), -math.cos(angle)),
-            ]
-        )
+        cos, sin = math.cos(angle), math.sin(angle)
+        return np.array([x + standoff * cos, y + standoff * sin, math.atan2(-sin, -cos)])
 
 
 @dataclass(frozen=True)
@@ -136,25 +131,16 @@ class RigidCarry:
 
 
 def base_poses(pose: np.ndarray, primitive: Primitive, lengths: np.ndarray) -> np.ndarray:
-    """Poses (steps, 3) of a base that starts at `pose` (3,) and does what it is told."""
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    step = np.array(
-        [
-            cos * primitive.forward - sin * primitive.left,
-            sin * primitive.forward + cos * primitive.left,
-            primitive.turn,
-        ]
-    )
-    return pose + lengths[:, None] * step
+    """Poses (steps, 3) of a base that starts at `pose` (3,) and follows a primitive."""
+    step = [*turned((primitive.forward, primitive.left), pose[2]), primitive.turn]
+    return pose + lengths[:, None] * np.array(step)
 
 
 def carried(object_pose: np.ndarray, robot_pose: np.ndarray, robot_poses: np.ndarray) -> np.ndarray:
     """The object's poses (steps, 3) if it keeps its place (3,) relative to the robot's (3,)."""
-    cos, sin = math.cos(robot_pose[2]), math.sin(robot_pose[2])
-    x, y = object_pose[:2] - robot_pose[:2]
-    relative = np.array([[cos * x + sin * y, cos * y - sin * x]])
-    turned = object_pose[2] + robot_poses[:, 2:] - robot_pose[2]
-    return np.concatenate([placed(relative, robot_poses)[:, 0], turned], axis=1)
+    relative = turned(object_pose[:2] - robot_pose[:2], -robot_pose[2])[None]
+    angles = object_pose[2] + robot_poses[:, 2:] - robot_pose[2]
+    return np.concatenate([placed(relative, robot_poses)[:, 0], angles], axis=1)
 
 
 def outline_grasps(outline: np.ndarray, spacing: float) -> tuple[Grasp, ...]:
@@ -166,13 +152,13 @@ def outline_grasps(outline: np.ndarray, spacing: float) -> tuple[Grasp, ...]:
     along = ends - outline
     lengths = np.linalg.norm(along, axis=1)
     faces = np.flatnonzero(lengths >= min(_SHORTEST_FACE * spacing, lengths.max()))
-    placed_at: list[tuple[float, Grasp]] = []
+    found: list[tuple[float, Grasp]] = []
     for face in faces:
         normal = math.atan2(-along[face, 0], along[face, 1])  # outward: the outline runs leftwards
         count = max(1, 2 * round(lengths[face] / spacing / 2) - 1)
         for index in range(count):
             share = (index + 1) / (count + 1)
             x, y = outline[face] + share * along[face]
-            placed_at.append((abs(share - 0.5), Grasp((float(x), float(y)), normal)))
-    placed_at.sort(key=lambda item: item[0])
-    return tuple(grasp for _, grasp in placed_at[:_MOST_GRASPS])
+            found.append((abs(share - 0.5), Grasp((float(x), float(y)), normal)))
+    found.sort(key=lambda item: item[0])
+    return tuple(grasp for _, grasp in found[:_MOST_GRASPS])

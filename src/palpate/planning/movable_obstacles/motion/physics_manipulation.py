@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import placed, turned
 from palpate.planning.movable_obstacles.maps.map import Movable
 from palpate.planning.movable_obstacles.motion.manipulation import (
     BACKWARD,
@@ -88,8 +88,8 @@ class ConstrainedManipulation:
             straight += [BACKWARD, FORWARD]
         if (np.sqrt(1 - across**2) > FACING).any():
             straight += [LEFT, RIGHT]
-        turned = [one for one in self._turns[key] if math.dist(grasp.point, one.anchor) >= LEVER]
-        return [*straight, *turned]
+        turns_of = [t for t in self._turns[key] if math.dist(grasp.point, t.anchor) >= LEVER]
+        return [*straight, *turns_of]
 
     def motion(
         self,
@@ -109,7 +109,7 @@ class ConstrainedManipulation:
             lever = float(np.hypot(*hand))
         else:
             step = base_poses(robot_pose, primitive, np.ones(1))[0] - robot_pose
-            wanted, lever = _into_body(step, object_pose[2]), 0.0
+            wanted, lever = np.array([*turned(step[:2], -object_pose[2]), step[2]]), 0.0
         rate = twist(constraint, wanted, lever, YIELDING)
         if constraint.force > self.force:
             rate = np.zeros(3)
@@ -123,18 +123,13 @@ def swept(pose: np.ndarray, rate: np.ndarray, lengths: np.ndarray) -> np.ndarray
     """Poses (steps, 3) after a constant twist (3,) of the body frame for `lengths` (steps,)."""
     angle = rate[2] * lengths
     if rate[2]:
-        sine, versine = np.sin(angle) / rate[2], (1 - np.cos(angle)) / rate[2]
+        along, across = np.sin(angle) / rate[2], (1 - np.cos(angle)) / rate[2]
     else:
-        sine, versine = lengths, np.zeros_like(lengths)
-    local = np.stack([rate[0] * sine - rate[1] * versine, rate[0] * versine + rate[1] * sine], -1)
-    cosine, turned = math.cos(pose[2]), math.sin(pose[2])
-    world = local @ np.array([[cosine, turned], [-turned, cosine]])
+        along, across = lengths, np.zeros_like(lengths)
+    local = np.stack([rate[0] * along - rate[1] * across, rate[0] * across + rate[1] * along], -1)
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    world = local @ np.array([[cosine, sine], [-sine, cosine]])
     return np.concatenate([pose[:2] + world, (pose[2] + angle)[:, None]], axis=1)
-
-
-def _into_body(step: np.ndarray, angle: float) -> np.ndarray:
-    cosine, sine = math.cos(angle), math.sin(angle)
-    return np.array([cosine * step[0] + sine * step[1], cosine * step[1] - sine * step[0], step[2]])
 
 
 def _way(poses: np.ndarray, start: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ FREE, AXIS, PIVOT, STATIC = "free", "axis", "pivot", "static"
 LEVER = 0.2  # m between hand and fixed point: nearer, the hand's own torque would have to turn it
 FACING = math.cos(math.radians(50))  # between a face's normal and the free axis
 ASIDE = 0.5  # m beside the wheels of an axis
-APART = 0.15  # m between points worth turning about
+SEPARATION = 0.15  # m between points worth turning about
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ def turning_points(constraint: Constraint) -> list[tuple[float, float]]:
 def anchors(constraints: Sequence[Constraint], most: int = 5) -> list[tuple[float, float]]:
     """Points that any of them can be turned about, m: the more often they come, the sooner.
 
-    Points nearer than `APART` to one another are one, at their mean.
+    Points nearer than `SEPARATION` to one another are one, at their mean.
     """
     groups: list[list[tuple[float, float]]] = []
     for point in (point for one in constraints for point in turning_points(one)):
-        near = (group for group in groups if math.dist(np.mean(group, axis=0), point) < APART)
+        near = (group for group in groups if math.dist(np.mean(group, axis=0), point) < SEPARATION)
         group = next(near, None)
         if group is None:
             groups.append([point])

@@ -40,18 +40,6 @@ def _ends(search_of: OpeningSearch, candidate: Found) -> list[State]:
 
 def _opening(search_of: OpeningSearch, ends: list[State]) -> Opening | None:
     """What succeeds in the draws of `ends`; None if there is no way to the grasp."""
-    first = ends[0]
-    grasp = search_of.grasps[first.grasp]
-    way = search_of.approach_path(grasp)
-    if way is None:
-        return None
-    return Opening(
-        search_of.name,
-        grasp,
-        way,
-        search_of.approach(first.grasp),
-        _cost(ends),
-        len(ends) / search_of.draws,
-        float(np.mean([end.energy for end in ends])),
-        first.parts,
-    )
+    probability = len(ends) / search_of.draws
+    energy = float(np.mean([end.energy for end in ends]))
+    return search_of.opening(ends[0], _cost(ends), probability, energy)

@@ -6,27 +6,26 @@ by a model of manipulation until the way is open or something is in the way.
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from shapely.geometry.base import BaseGeometry
 
 from palpate.numerics.polygons import placed
+from palpate.planning.movable_obstacles.maps.map import as_pose
 from palpate.planning.movable_obstacles.maps.occupancy import Space, Window
 from palpate.planning.movable_obstacles.motion.collisions import Clearance
 from palpate.planning.movable_obstacles.motion.manipulation import (
     FORWARD,
-    Grasp,
     ManipulationModel,
     Motion,
     Primitive,
 )
 from palpate.planning.movable_obstacles.search.passages import Passage
 from palpate.planning.movable_obstacles.search.paths import distances
-from palpate.planning.movable_obstacles.search.transfers import Carry
+from palpate.planning.movable_obstacles.search.transfers import Carry, Move, Opening
 from palpate.planning.movable_obstacles.search.tree_search import Step
 
 CARRYING = 2.0  # what a metre carried costs, in metres driven: namosim's transfer coefficient
@@ -77,11 +76,9 @@ class _Sweep:
 
 
 class OpeningSearch:
-    """The search for one object: a `Domain` of `tree_search`.
+    """The search for one move of an object: a `Domain` of `tree_search`.
 
-    The way is open when the robot, once it has let go, gets to `towards` (2,) without the objects
-    in `ignored`, which are to be moved later, and the object stands outside `keep_out`. The robot
-    begins at `robot` (3,).
+    The way is open as `Passage` says. The robot begins at `robot` (3,).
     """
 
     depth = 1 + _PRIMITIVES
@@ -90,26 +87,23 @@ class OpeningSearch:
         self,
         space: Space,
         model: ManipulationModel,
-        name: str,
         robot: np.ndarray,
-        towards: np.ndarray,
-        ignored: Collection[str],
+        move: Move,
         window: Window,
-        keep_out: BaseGeometry | None = None,
     ) -> None:
-        self.space, self.model, self.name = space, model, name
+        self.space, self.model, self.name = space, model, move.name
         self.draws = model.draws
-        self.movable = space.movables[name]
+        self.movable = space.movables[move.name]
         world = space.map
         self.standoff = world.robot.radius + world.reach
-        self._nearby = {name: self.standoff}
+        self._nearby = {move.name: self.standoff}
         self._reached = distances(space, window, robot, standing=True)
-        self._passage = Passage(space, window, name, towards, ignored, keep_out)
+        self._passage = Passage(space, window, move)
         spacing = max(world.robot.radius / 2, 2 * world.cell_size)
         self.grasps = tuple(model.grasps(self.movable, spacing))
         # what is kept for between two steps is to be little beside the margin
         self._step = min(world.cell_size / 2, max(world.margin, world.cell_size / 10))
-        self._clearance = Clearance.at_start(space, name, self._step)
+        self._clearance = Clearance.at_start(space, move.name, self._step)
         self._fine = self._clearance.between(self._step / _FINE)
         size = world.clearance + self.movable.radius
         self._farthest = _REACH * size
@@ -123,8 +117,7 @@ class OpeningSearch:
 
     def begin(self, draw: int) -> State:
         """See `Domain`."""
-        x, y, theta = self.movable.pose
-        return State(draw, object_pose=(x, y, theta))
+        return State(draw, object_pose=self.movable.pose)
 
     def actions(self, state: State) -> list[Any]:
         """Grasps that can be reached, nearest to the way first; then primitives with a share."""
@@ -229,19 +222,23 @@ class OpeningSearch:
             self._approaches[grasp] = self._reached.to(self._robot_at[grasp], self._nearby)
         return self._approaches[grasp]
 
-    def approach_path(self, grasp: Grasp) -> np.ndarray | None:
-        """The way (points, 2) there."""
-        pose = grasp.robot_pose(self.movable.pose, self.standoff)
-        return self._reached.path_to(pose, self._nearby)
+    def opening(
+        self, state: State, cost: float, probability: float, energy: float
+    ) -> Opening | None:
+        """What leads to that state, with these figures; None if there is no way to the grasp."""
+        way = self._reached.path_to(self._robot_at[state.grasp], self._nearby)
+        if way is None:
+            return None
+        grasp, approach = self.grasps[state.grasp], self.approach(state.grasp)
+        return Opening(self.name, grasp, way, approach, cost, probability, energy, state.parts)
 
     def _grasped(self, state: State, grasp: int) -> Step:
         length = self.approach(grasp)
         if length == math.inf:
             return Step(state, 0.0)
-        x, y, theta = (float(value) for value in self._robot_at[grasp])
-        spent = length + self._handling
+        spent, pose = length + self._handling, as_pose(self._robot_at[grasp])
         least = spent + float(self._beyond[grasp])
-        return Step(State(state.draw, grasp, state.object_pose, (x, y, theta), spent, least))
+        return Step(State(state.draw, grasp, state.object_pose, pose, spent, least))
 
     # --- carrying -----------------------------------------------------------------------------
 
@@ -288,10 +285,8 @@ class OpeningSearch:
         done, chunk = 0, _CHUNK
         while done < limit:
             end, chunk = min(limit, done + chunk), 2 * chunk
-            free = self._clearance.steps(
-                motion.object_poses[done:end], motion.robot_poses[done:end]
-            )
-            done += free
+            part = slice(done, end)
+            done += self._clearance.steps(motion.object_poses[part], motion.robot_poses[part])
             if done < end:
                 break
         return done
@@ -334,13 +329,11 @@ class OpeningSearch:
     def _after(
         self, state: State, part: Carry, sweep: _Sweep, last: int, left: float = math.inf
     ) -> State:
-        ox, oy, ot = (float(value) for value in part.object_poses[-1])
-        rx, ry, rt = (float(value) for value in part.robot_poses[-1])
         return State(
             state.draw,
             state.grasp,
-            (ox, oy, ot),
-            (rx, ry, rt),
+            as_pose(part.object_poses[-1]),
+            as_pose(part.robot_poses[-1]),
             float(sweep.spent[last]),
             float(sweep.least[last]),
             state.energy + float(sweep.motion.energy[last]),

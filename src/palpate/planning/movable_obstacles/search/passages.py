@@ -1,44 +1,36 @@
 """Whether the robot gets by once one object is put down somewhere else, and how far it then is."""
 
 import math
-from collections.abc import Collection
 from functools import cached_property
 
 import numpy as np
 import shapely
 from scipy import ndimage
-from shapely.geometry.base import BaseGeometry
 
 from palpate.numerics.polygons import placed, polygons
 from palpate.planning.movable_obstacles.maps.occupancy import Footprint, Space, Window
 from palpate.planning.movable_obstacles.motion.manipulation import Motion
 from palpate.planning.movable_obstacles.search.paths import distances
+from palpate.planning.movable_obstacles.search.transfers import Move
 
 _STRIDE = 4  # steps between looks whether the way is open
 _EIGHT = np.ones((3, 3), int)
 
 
 class Passage:
-    """The way on to `towards` (2,), past object `name` wherever it is put.
+    """The way on to where a move leads, past its object wherever that is put.
 
-    It is open when the robot, once it has let go, gets there without the objects in `ignored`, and
-    the object stands outside `keep_out`.
+    It is open when the robot, once it has let go, gets to `towards` without the objects in
+    `ignored`, which are to be moved later, and the object stands outside `keep_out`.
     """
 
-    def __init__(
-        self,
-        space: Space,
-        window: Window,
-        name: str,
-        towards: np.ndarray,
-        ignored: Collection[str],
-        keep_out: BaseGeometry | None,
-    ) -> None:
-        self._space, self._window, self._name, self._keep_out = space, window, name, keep_out
-        self._towards = np.asarray(towards, float)[:2]
-        self._ignored = set(ignored) - {name}
+    def __init__(self, space: Space, window: Window, move: Move) -> None:
+        name = move.name
+        self._space, self._window, self._name = space, window, name
+        self._keep_out, self._towards = move.keep_out, np.array(move.towards)
+        self._ignored = set(move.ignored) - {name}
         self._passed = dict.fromkeys(self._ignored, 0.0)
-        self._base = space.free_without({name, *ignored}, window)
+        self._base = space.free_without({name, *move.ignored}, window)
         nearby = {**self._passed, name: 0.0}
         self._lengths = distances(space, window, self._towards, self._base, nearby).lengths
         self._movable = space.movables[name]
@@ -137,8 +129,8 @@ class Passage:
         """(rows, columns) of the window: where a way to the aim of less than `limit` m may lead."""
         x, y = robot_pose[:2]
         xs, ys = self._space.xs[self._window[1]], self._space.ys[self._window[0]]
-        apart = np.sqrt((xs - x) ** 2 + ((ys - y) ** 2)[:, None])
-        return self._nearest + apart <= limit + 2 * self._space.cell
+        straight = np.sqrt((xs - x) ** 2 + ((ys - y) ** 2)[:, None])
+        return self._nearest + straight <= limit + 2 * self._space.cell
 
     @cached_property
     def _nearest(self) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import length_of
-from palpate.planning.movable_obstacles.maps.map import Map, Pose
+from palpate.planning.movable_obstacles.maps.map import Map, Pose, as_pose
 from palpate.planning.movable_obstacles.motion.manipulation import Grasp
 from palpate.runs.storage import read_json, write_json
 
@@ -99,8 +99,7 @@ class Plan:
             for s in self.segments
             if s.name is not None and s.object_poses is not None
         }
-        x, y, theta = (float(value) for value in self.segments[-1].poses[-1])
-        return world.moved(last, (x, y, theta))
+        return world.moved(last, as_pose(self.segments[-1].poses[-1]))
 
     def path_efficiency(self, direct: float) -> float:
         """Interactive Gibson's (Xia et al. 2020), 0 to 1: the shortest way over the one taken.
@@ -175,10 +174,9 @@ def read_plan(path: str | Path) -> Plan:
             elif segment.kind != TRANSIT:
                 raise ValueError(f"a segment is a transit or a transfer, not {segment.kind!r}")
             segments.append(segment)
-        x, y, theta = (float(value) for value in document["goal"])
         return Plan(
             str(document["map"]),
-            (x, y, theta),
+            as_pose(document["goal"]),
             tuple(segments),
             float(document["planning_s"]),
             {str(key): int(value) for key, value in document["sizes"].items()},

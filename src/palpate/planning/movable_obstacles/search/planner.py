@@ -22,12 +22,7 @@ from palpate.planning.movable_obstacles.motion.manipulation import ManipulationM
 from palpate.planning.movable_obstacles.search.judgement import open_way
 from palpate.planning.movable_obstacles.search.openings import OpeningSearch
 from palpate.planning.movable_obstacles.search.plan import TRANSIT, Plan, timed
-from palpate.planning.movable_obstacles.search.policy import (
-    Move,
-    NoWayError,
-    PolicyGraph,
-    WalledError,
-)
+from palpate.planning.movable_obstacles.search.policy import NoWayError, PolicyGraph, WalledError
 from palpate.planning.movable_obstacles.search.regrasps import stops_of
 from palpate.planning.movable_obstacles.search.situation import (
     Situation,
@@ -37,7 +32,7 @@ from palpate.planning.movable_obstacles.search.situation import (
     driven_to,
     whole,
 )
-from palpate.planning.movable_obstacles.search.transfers import Opening
+from palpate.planning.movable_obstacles.search.transfers import Move, Opening
 from palpate.planning.movable_obstacles.search.tree_search import Settings
 
 _MOST_KNOWN = 10_000  # searches whose outcome is kept
@@ -76,6 +71,7 @@ class Planner:
         self.seed = seed
         self._known: dict[Hashable, tuple[Opening | None, bool]] = {}
         self._world: Hashable = None
+        self._sizes: dict[str, int] = {}  # of the plan that is being made: see `Plan`
 
     def plan(self, world: Map, goal: Pose | None = None, immovable: Iterable[str] = ()) -> Plan:
         """From the map's start to `goal` (its first one if None); objects `immovable` are walls.
@@ -89,34 +85,30 @@ class Planner:
         world.check_names(fixed)
         if len(self._known) > _MOST_KNOWN:
             self._known.clear()
-        sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
-        done = self._found(world, goal, fixed, sizes, _HALVINGS)
-        return Plan(world.name, goal, tuple(done.segments), timed() - began, sizes)
+        self._sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
+        done = self._found(world, goal, fixed, _HALVINGS)
+        return Plan(world.name, goal, tuple(done.segments), timed() - began, self._sizes)
 
     # --- above --------------------------------------------------------------------------------
 
-    def _found(
-        self, world: Map, goal: Pose, fixed: set[str], sizes: dict[str, int], halvings: int
-    ) -> Situation:
+    def _found(self, world: Map, goal: Pose, fixed: set[str], halvings: int) -> Situation:
         """The situation at the goal; raises `NoWayError`."""
         self._world = unmoved(world)
         begin = Situation(Space(world, fixed), np.array(world.start))
         try:
-            return self._planned(begin, goal, sizes, regrasps=False)
+            return self._planned(begin, goal, regrasps=False)
         except WalledError:
             finer = world.finer if halvings else None
             if finer is None:
                 raise
         except NoWayError as closed:
             try:
-                return self._planned(begin, goal, sizes, regrasps=True)
+                return self._planned(begin, goal, regrasps=True)
             except NoWayError:
                 raise closed from None
-        return self._found(finer, goal, fixed, sizes, halvings - 1)
+        return self._found(finer, goal, fixed, halvings - 1)
 
-    def _planned(
-        self, now: Situation, goal: Pose, sizes: dict[str, int], regrasps: bool
-    ) -> Situation:
+    def _planned(self, now: Situation, goal: Pose, regrasps: bool) -> Situation:
         """The situation at the goal, stage by stage; raises `NoWayError`."""
         world = now.space.map
         hoped, stale = np.inf, 0
@@ -126,8 +118,11 @@ class Planner:
             stale = stale + 1 if graph.hoped >= hoped - 1e-6 else 0
             hoped = min(hoped, graph.hoped)
             if stage == 0:
-                sizes |= {"regions": graph.regions.free, "borders": len(graph.regions.borders)}
-            reached = self._advance(graph, now, goal, sizes, regrasps)
+                self._sizes |= {
+                    "regions": graph.regions.free,
+                    "borders": len(graph.regions.borders),
+                }
+            reached = self._advance(graph, now, goal, regrasps)
             if reached is None or stale == _STALE:
                 error = NoWayError if graph.tried else WalledError
                 raise error(graph.complaint(world.name))
@@ -139,26 +134,21 @@ class Planner:
         return now
 
     def _advance(
-        self,
-        graph: PolicyGraph,
-        now: Situation,
-        goal: Pose,
-        sizes: dict[str, int],
-        regrasps: bool,
+        self, graph: PolicyGraph, now: Situation, goal: Pose, regrasps: bool
     ) -> Situation | None:
         """To the goal, or as far as the policy leads before it needs another graph."""
         farthest: Situation | None = None
         while True:
-            moves = graph.policy(sizes)
+            moves = graph.policy(self._sizes)
             if moves is None:
                 return farthest
             ahead = Situation(now.space, now.robot, list(now.segments))
             changed, failed = False, False
             spent: dict[int, tuple[float, float]] = {}  # an action may need several moves
             for move in moves:
-                resolved = self._resolve(ahead, move, sizes, _DEPTH)
+                resolved = self._resolve(ahead, move, _DEPTH)
                 if resolved is None and regrasps:
-                    resolved = self._regrasped(ahead, move, sizes)
+                    resolved = self._regrasped(ahead, move)
                 if resolved is None:
                     graph.fail(move.action)
                     failed = True
@@ -181,15 +171,13 @@ class Planner:
 
     # --- below --------------------------------------------------------------------------------
 
-    def _resolve(
-        self, ahead: Situation, move: Move, sizes: dict[str, int], depth: int
-    ) -> _Resolved | None:
+    def _resolve(self, ahead: Situation, move: Move, depth: int) -> _Resolved | None:
         """Make the move, after clearing what stands in its way if it is not possible at once.
 
         What stands in its way is what the best transfer would hit if the object were the only one
         on the map: an artificial constraint on where these may be (Stilman et al. 2007).
         """
-        opening = self._open(ahead, move, sizes)
+        opening = self._open(ahead, move)
         if opening is not None:
             return _Resolved(carried_out(ahead, opening), opening.cost, opening.probability)
         if depth == 0:
@@ -197,18 +185,18 @@ class Planner:
         others = set(ahead.space.movables) - {move.name}
         near = at_hand(ahead) & others
         for away in (near, others) if near != others else (others,):
-            resolved = self._cleared(ahead, move, away, sizes, depth) if away else None
+            resolved = self._cleared(ahead, move, away, depth) if away else None
             if resolved is not None:
                 return resolved
         return None
 
     def _cleared(
-        self, ahead: Situation, move: Move, away: set[str], sizes: dict[str, int], depth: int
+        self, ahead: Situation, move: Move, away: set[str], depth: int
     ) -> _Resolved | None:
         """The move, planned as if the objects `away` were not there, and these put aside first."""
         alone = Situation(ahead.space.without(away), ahead.robot)
         lone_move = dataclasses.replace(move, ignored=move.ignored - away)
-        wanted = self._open(alone, lone_move, sizes)
+        wanted = self._open(alone, lone_move)
         if wanted is None:
             return None
         world = ahead.space.map
@@ -223,24 +211,24 @@ class Planner:
         for index, name in enumerate(blocking):
             later = move.ignored | {move.name} | set(blocking[index + 1 :])
             aside = Move(move.action, name, (x, y), frozenset(later), 0.0, room)
-            resolved = self._resolve(ahead, aside, sizes, depth - 1)
+            resolved = self._resolve(ahead, aside, depth - 1)
             if resolved is None:
                 return None
             ahead = resolved.ahead
             probability, cost = probability * resolved.probability, cost + resolved.cost_m
-        opening = self._open(ahead, move, sizes)
+        opening = self._open(ahead, move)
         if opening is None:
             return None
         return _Resolved(
             carried_out(ahead, opening), cost + opening.cost, probability * opening.probability
         )
 
-    def _regrasped(self, ahead: Situation, move: Move, sizes: dict[str, int]) -> _Resolved | None:
+    def _regrasped(self, ahead: Situation, move: Move) -> _Resolved | None:
         """The move in two carries of the same object, the cheaper the better."""
         best: _Resolved | None = None
         for stop in self._stops(ahead, move):
             halfway = carried_out(ahead, stop)
-            opening = self._open(halfway, move, sizes)
+            opening = self._open(halfway, move)
             if opening is None:
                 continue
             cost, probability = stop.cost + opening.cost, stop.probability * opening.probability
@@ -256,7 +244,7 @@ class Planner:
                 return stops_of(below)
         return []
 
-    def _open(self, ahead: Situation, move: Move, sizes: dict[str, int]) -> Opening | None:
+    def _open(self, ahead: Situation, move: Move) -> Opening | None:
         """What the tree search says of one move, in a window if that is enough."""
         space = ahead.space
         windows = [window_of(space, ahead.robot, move), whole(space)]
@@ -265,12 +253,12 @@ class Planner:
             key = self._key(ahead, move, window)
             if key not in self._known:
                 most = _SEARCHES[0] + _SEARCHES[1] * len(space.map.movables)
-                if sizes["evaluations"] == most:
+                if self._sizes["evaluations"] == most:
                     raise NoWayError(
                         f"no way to the goal on map '{space.map.name}' within {most} searches for "
                         "an opening: its objects stand too much in one another's way"
                     )
-                sizes["evaluations"] += 1
+                self._sizes["evaluations"] += 1
                 below = self._below(ahead, move, window)
                 self._known[key] = open_way(below, self.settings, self.seed), below.reachable
             opening, reachable = self._known[key]
@@ -279,16 +267,7 @@ class Planner:
         return None
 
     def _below(self, ahead: Situation, move: Move, window: Window) -> OpeningSearch:
-        return OpeningSearch(
-            ahead.space,
-            self.model,
-            move.name,
-            ahead.robot,
-            np.array(move.towards),
-            move.ignored,
-            window,
-            move.keep_out,
-        )
+        return OpeningSearch(ahead.space, self.model, ahead.robot, move, window)
 
     def _key(self, ahead: Situation, move: Move, window: Window) -> Hashable:
         """All that decides what a search finds."""
@@ -296,12 +275,8 @@ class Planner:
         inside = []
         for name, movable in space.movables.items():
             rows, columns = space.covers[name].window
-            if (
-                rows.start < window[0].stop
-                and rows.stop > window[0].start
-                and columns.start < window[1].stop
-                and columns.stop > window[1].start
-            ):
+            crosses = rows.start < window[0].stop and rows.stop > window[0].start
+            if crosses and columns.start < window[1].stop and columns.stop > window[1].start:
                 inside.append((name, movable.pose, self.model.belief(name)))
         return (
             self._world,

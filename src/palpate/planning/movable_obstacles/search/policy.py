@@ -1,11 +1,9 @@
 """The abstract actions of an arrangement, what is known of each, and the best policy so far."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.maps.map import Pose
@@ -16,25 +14,10 @@ from palpate.planning.movable_obstacles.search.abstract import Actions, iterate
 from palpate.planning.movable_obstacles.search.openings import HANDLING
 from palpate.planning.movable_obstacles.search.paths import links
 from palpate.planning.movable_obstacles.search.situation import whole
+from palpate.planning.movable_obstacles.search.transfers import Move
 
 _HOPE = 0.8  # of what an opening like it cost is what another is hoped to cost
 _ENOUGH = 1.15  # times the least that any policy is hoped to cost is good enough
-
-
-@dataclass(frozen=True)
-class Move:
-    """An object to be moved so that the robot gets on `towards` (2,); `ignored` are moved later.
-
-    `beyond` (m) is the least length from the border to `towards`, which later actions count.
-    `keep_out` is where the object must not be left, because another is to be carried through.
-    """
-
-    action: int
-    name: str
-    towards: tuple[float, float]
-    ignored: frozenset[str]
-    beyond: float
-    keep_out: BaseGeometry | None = None
 
 
 class NoWayError(PalpateError):
@@ -70,7 +53,7 @@ class PolicyGraph:
             leaving.setdefault(border.source, []).append(index)
         index_of = {name: index for index, name in enumerate(self.names)}
         source, target, cost, group = [], [], [], []
-        self.needed: list[tuple[str, ...]] = []
+        self.needed: list[tuple[str, ...]] = []  # objects to be moved for each action
         handling = HANDLING * space.map.robot.radius
         for state, node in enumerate(entered):
             # where the robot stands nothing has been moved, however near it is

@@ -14,7 +14,7 @@ from palpate.planning.movable_obstacles.search.openings import OpeningSearch, St
 from palpate.planning.movable_obstacles.search.transfers import Opening
 
 _STOPS = 6  # of one object, at most
-_APART = 0.25  # of the object's size between stops
+_SEPARATION = 0.25  # of the object's size between stops
 
 
 def stops_of(search_of: OpeningSearch) -> list[Opening]:
@@ -27,9 +27,9 @@ def stops_of(search_of: OpeningSearch) -> list[Opening]:
     distinct: list[tuple[tuple, State]] = []
     for actions, state in sorted(_ends(search_of), key=lambda one: one[1].spent):
         others = [start, *(other for _, other in distinct)]
-        if min(_apart(state, other, size) for other in others) > _APART * size:
+        if min(_separation(state, other, size) for other in others) > _SEPARATION * size:
             distinct.append((actions, state))
-    distinct.sort(key=lambda one: -_apart(one[1], start, size))
+    distinct.sort(key=lambda one: -_separation(one[1], start, size))
     found = [_stop(search_of, *one) for one in distinct[:_STOPS]]
     return [stop for stop in found if stop is not None]
 
@@ -50,29 +50,18 @@ def _ends(search_of: OpeningSearch) -> Iterator[tuple[tuple, State]]:
 
 def _stop(search_of: OpeningSearch, actions: tuple, state: State) -> Opening | None:
     grasp, motion = actions
-    held = search_of.grasps[grasp]
-    way = search_of.approach_path(held)
-    if way is None or not search_of.keep_clear(state.parts):
+    if not search_of.keep_clear(state.parts):
         return None
     alike = 0
     for draw in range(search_of.draws):
         begun = search_of.act(search_of.begin(draw), grasp)
         ended = search_of.act(begun.state, motion)
-        near = _apart(ended.state, state, search_of.movable.radius) <= search_of.space.cell
+        near = _separation(ended.state, state, search_of.movable.radius) <= search_of.space.cell
         alike += ended.reward is None and near
-    return Opening(
-        search_of.name,
-        held,
-        way,
-        search_of.approach(grasp),
-        state.spent,
-        alike / search_of.draws,
-        state.energy,
-        state.parts,
-    )
+    return search_of.opening(state, state.spent, alike / search_of.draws, state.energy)
 
 
-def _apart(one: State, other: State, size: float) -> float:
+def _separation(one: State, other: State, size: float) -> float:
     """How far a point of the object at `size` m from its middle is in one from in the other, m."""
     (x, y, theta), (u, v, phi) = one.object_pose, other.object_pose
     turned = math.remainder(theta - phi, math.tau)

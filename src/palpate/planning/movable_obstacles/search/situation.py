@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import ndimage
 
+from palpate.numerics.polygons import length_of
 from palpate.planning.movable_obstacles.maps.map import Pose
 from palpate.planning.movable_obstacles.maps.occupancy import Space, Window
 from palpate.planning.movable_obstacles.search.paths import distances, links
@@ -46,15 +47,9 @@ def beside(now: Situation) -> dict[str, float]:
 
 def carried_out(ahead: Situation, opening: Opening) -> Situation:
     """The situation after an opening."""
-    way = opening.way
-    robot = opening.parts[0].robot_poses[0]
-    transit = Segment(TRANSIT, headed(way, ahead.robot[2], robot[2]), opening.approach)
-    poses = np.vstack(
-        [opening.parts[0].robot_poses, *(p.robot_poses[1:] for p in opening.parts[1:])]
-    )
-    bodies = np.vstack(
-        [opening.parts[0].object_poses, *(p.object_poses[1:] for p in opening.parts[1:])]
-    )
+    poses, bodies = opening.robot_poses, opening.object_poses
+    way = headed(opening.way, ahead.robot[2], poses[0, 2])
+    transit = Segment(TRANSIT, way, opening.approach)
     transfer = Segment(
         TRANSFER,
         poses,
@@ -66,11 +61,8 @@ def carried_out(ahead: Situation, opening: Opening) -> Situation:
         opening.probability,
         opening.energy,
     )
-    return Situation(
-        ahead.space.moved(opening.name, opening.object_pose),
-        opening.robot_pose,
-        [*ahead.segments, transit, transfer],
-    )
+    space = ahead.space.moved(opening.name, bodies[-1])
+    return Situation(space, poses[-1], [*ahead.segments, transit, transfer])
 
 
 def driven_to(ahead: Situation, goal: Pose) -> Situation | None:
@@ -82,8 +74,8 @@ def driven_to(ahead: Situation, goal: Pose) -> Situation | None:
     if way is None:
         return None
     poses = headed(way, float(ahead.robot[2]), goal[2])
-    segment = Segment(TRANSIT, poses, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()))
-    return Situation(ahead.space, np.array(goal), [*ahead.segments, segment])
+    segment = Segment(TRANSIT, poses, length_of(way))
+    return Situation(space, np.array(goal), [*ahead.segments, segment])
 
 
 def headed(way: np.ndarray, first: float, last: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""One object carried so that a way opens: what the search below hands to the planner above."""
+"""A move that the planner wants, and how the search below it would open the way."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,22 @@ from shapely.geometry.base import BaseGeometry
 from palpate.numerics.polygons import placed
 from palpate.planning.movable_obstacles.maps.map import Movable
 from palpate.planning.movable_obstacles.motion.manipulation import Grasp, Primitive
+
+
+@dataclass(frozen=True)
+class Move:
+    """An object to be moved so that the robot gets on `towards` (2,); `ignored` are moved later.
+
+    `beyond` (m) is the least length from the border to `towards`, which later actions count.
+    `keep_out` is where the object must not be left, because another is to be carried through.
+    """
+
+    action: int
+    name: str
+    towards: tuple[float, float]
+    ignored: frozenset[str]
+    beyond: float
+    keep_out: BaseGeometry | None = None
 
 
 @dataclass(frozen=True)
@@ -40,14 +56,14 @@ class Opening:
     parts: tuple[Carry, ...]
 
     @property
-    def robot_pose(self) -> np.ndarray:
-        """Where the robot lets go, (3,)."""
-        return self.parts[-1].robot_poses[-1]
+    def robot_poses(self) -> np.ndarray:
+        """(steps, 3) of all parts, from the grasp to where the robot lets go."""
+        return np.vstack([p.robot_poses[k > 0 :] for k, p in enumerate(self.parts)])
 
     @property
-    def object_pose(self) -> np.ndarray:
-        """Where the object is left, (3,)."""
-        return self.parts[-1].object_poses[-1]
+    def object_poses(self) -> np.ndarray:
+        """(steps, 3) of all parts, to where the object is left."""
+        return np.vstack([p.object_poses[k > 0 :] for k, p in enumerate(self.parts)])
 
     def room(self, movable: Movable, radius: float, margin: float) -> BaseGeometry:
         """What robot and object pass over, and the margin (m) around it."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from palpate.models.rope import Rope
 from palpate.perception.rope import filter as rope_filter
-from palpate.perception.rope.filter import Belief, Sighting, View, advance, correct
+from palpate.perception.rope.filter import RopeBelief, Sighting, View, advance, correct
 from palpate.worlds.rope.filmed import TRIPOD
 
 GRIPPER = np.array([0.0, 0.0, 1.5], np.float32)
@@ -24,14 +24,14 @@ MODEL = Rope.uniform(
 jitted = eqx.filter_jit(advance), eqx.filter_jit(correct)  # compiled once for all tests
 
 
-def belief(deviation: float = 0.03) -> Belief:
+def belief(deviation: float = 0.03) -> RopeBelief:
     """A rope that hangs 30 degrees to the side, at rest; as uncertain as said."""
     direction = np.array([np.sin(np.pi / 6), 0.0, -np.cos(np.pi / 6)])
     nodes = GRIPPER + np.arange(1, 11)[:, None] * 0.1 * direction
     mean = np.concatenate([nodes.ravel(), np.zeros(31)]).astype(np.float32)
     deviations = jnp.full(10, deviation)
     covariance = rope_filter._block(deviations, deviations, 0.02)
-    return Belief(jnp.asarray(mean), covariance, jnp.asarray(GRIPPER), jnp.zeros(3))
+    return RopeBelief(jnp.asarray(mean), covariance, jnp.asarray(GRIPPER), jnp.zeros(3))
 
 
 def sighting(nodes: np.ndarray, age: float = 0.0) -> Sighting:
@@ -109,7 +109,7 @@ def test_a_frame_of_earlier_is_seen_where_the_rope_was():
     speed = np.tile([0.0, 1.0, 0.0], (10, 1)) * np.arange(1, 11)[:, None] / 10
     mean = np.asarray(prior.mean).copy()
     mean[30:60] = speed.ravel()
-    prior = Belief(jnp.asarray(mean), 1e-2 * prior.covariance, prior.gripper, jnp.zeros(3))
+    prior = RopeBelief(jnp.asarray(mean), 1e-2 * prior.covariance, prior.gripper, jnp.zeros(3))
     earlier = np.asarray(prior.state().position).copy()
     earlier[1:] -= 0.005 * speed
     after, _ = jitted[1](MODEL, View.of(TRIPOD), prior, sighting(earlier, age=0.005))

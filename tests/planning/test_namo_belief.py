@@ -12,10 +12,10 @@ from palpate.models.planar import Planar, PlanarState, furniture
 from palpate.models.planar.shapes import rectangle
 from palpate.planning.movable_obstacles.motion import belief as beliefs
 from palpate.planning.movable_obstacles.motion.belief import (
-    LEAST,
+    LEAST_PROBABILITY,
     PIECES,
-    Belief,
     ObjectBelief,
+    SceneBelief,
     cut,
 )
 from palpate.planning.movable_obstacles.motion.primitives import AXIS, FREE, PIVOT, STATIC
@@ -111,14 +111,14 @@ def test_a_belief_does_not_die_of_nonsense():
     poses, wrenches, alone = handled(FREE)
     one.learn(cut(poses + random.normal(size=poses.shape), 1e3 * wrenches, alone))
     assert np.isfinite(one.probabilities).all()
-    assert one.probabilities.min() >= LEAST / 2
+    assert one.probabilities.min() >= LEAST_PROBABILITY / 2
     for seed in range(3):  # and comes round
         one.learn(cut(*handled(FREE, seed=seed)))
     assert share(one, FREE) > 0.5
 
 
 def test_short_and_crowded_contacts_change_nothing():
-    belief = Belief({"piece": OUTLINE})
+    belief = SceneBelief({"piece": OUTLINE})
     poses, wrenches, alone = handled(STATIC)
     belief.learn("piece", poses[:12], wrenches[:12], alone[:12])
     belief.learn("piece", poses, wrenches, np.zeros_like(alone))
@@ -138,7 +138,7 @@ def test_pieces_do_not_overlap_and_start_as_the_object_moved():
 
 
 def test_draws_stay_until_something_is_learnt_and_relaxing_goes_towards_the_prior():
-    belief = Belief({"piece": OUTLINE, "other": rectangle(0.6, 0.6)})
+    belief = SceneBelief({"piece": OUTLINE, "other": rectangle(0.6, 0.6)})
     first = belief.drawn(8)
     assert belief.drawn(8) == first
     belief.learn("piece", *handled(STATIC))

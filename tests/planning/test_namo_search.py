@@ -26,6 +26,7 @@ from palpate.planning.movable_obstacles.search.abstract import Actions, iterate
 from palpate.planning.movable_obstacles.search.passages import Passage
 from palpate.planning.movable_obstacles.search.paths import distances
 from palpate.planning.movable_obstacles.search.situation import whole
+from palpate.planning.movable_obstacles.search.transfers import Move
 from palpate.planning.movable_obstacles.search.tree_search import Settings, Step, search
 
 # --- value iteration --------------------------------------------------------------------------
@@ -229,10 +230,13 @@ def test_an_object_hits_what_is_nearer_than_the_margin_and_its_robot_what_is_nea
     assert not clearance.hits(objects[:0], robots[:0]).size
 
 
+TO_GOAL = Move(0, "a", (7.0, 1.5), frozenset(), 0.0)
+
+
 def opened_door() -> tuple[Space, Passage, Motion]:
     """An object that stands in a door, pushed out of it and on."""
     space = Space(two_rooms({"a": IN_DOOR}))
-    passage = Passage(space, whole(space), "a", np.array([7.0, 1.5]), (), None)
+    passage = Passage(space, whole(space), TO_GOAL)
     movable = space.movables["a"]
     robot = np.array([3.3, 1.5, 0.0])
     lengths = 0.05 * np.arange(1, 61)
@@ -260,7 +264,7 @@ def test_a_way_is_found_open_at_the_first_step_that_is_allowed_wherever_one_begi
 def test_what_lies_beyond_is_no_longer_than_the_way_and_infinite_outside_of_the_window():
     space = Space(two_rooms({"a": IN_DOOR}))
     part = slice(5, space.shape[0] - 5), slice(20, space.shape[1])
-    passage = Passage(space, part, "a", np.array([7.0, 1.5]), (), None)
+    passage = Passage(space, part, TO_GOAL)
     places = np.array([[1.0, 1.5, 0.0], [5.0, 1.5, 0.0], [9.0, 1.5, 0.0], [5.0, 0.2, 0.0]])
     beyond = passage.beyond(places)
     assert np.isinf(beyond).tolist() == [True, False, True, True]

@@ -38,6 +38,20 @@ def test_a_decimated_world_holds_the_action():
     assert world.render(4, 2).shape == (2, 4, 3)
 
 
+def test_what_stands_between_the_rates_sees_each_observation_and_changes_the_action():
+    seen = []
+
+    def capped(observation, action):
+        seen.append(observation)
+        return min(action, 15 - observation)
+
+    world = Decimated(Counter(), every=3, between=capped)
+    world.reset(2)
+    assert world.step(5) == 15
+    assert seen == [2, 7, 12]
+    assert world.step(1) == 15
+
+
 @pytest.mark.parametrize("every", [0, -2])
 def test_a_decision_is_held_for_at_least_one_period(every):
     with pytest.raises(PalpateError, match="whole number of control periods"):

@@ -7,6 +7,7 @@ import functools
 import os
 import sys
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,28 +63,32 @@ class World(ABC):
 class Decimated(World):
     """A world seen by a slower decision: each action is held for `every` control periods.
 
-    The observation returned is the last of them.
+    `between`, if given, stands between the two rates, such as a filter or a reflex: of the newest
+    observation and the action it makes what is done in the next control period. The observation
+    returned is the last one.
     """
 
-    def __init__(self, world: World, every: int):
+    def __init__(self, world: World, every: int, between: Callable[[Any, Any], Any] | None = None):
         if not isinstance(every, int | np.integer) or every < 1:
             raise PalpateError(
                 f"a decision is held for a whole number of control periods, 1 or more, not {every}"
             )
-        self.world = world
-        self.every = int(every)
+        self.world, self.every, self.between = world, int(every), between
+        self._observation: Any = None
 
     @property
     def control_period(self) -> float:
         return self.every * self.world.control_period
 
     def reset(self, seed: int, **options: Any) -> Any:
-        return self.world.reset(seed, **options)
+        self._observation = self.world.reset(seed, **options)
+        return self._observation
 
     def step(self, action: Any) -> Any:
         for _ in range(self.every):
-            observation = self.world.step(action)
-        return observation
+            done = self.between(self._observation, action) if self.between else action
+            self._observation = self.world.step(done)
+        return self._observation
 
     def truth(self) -> Any:
         return self.world.truth()

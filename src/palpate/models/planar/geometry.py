@@ -101,8 +101,8 @@ def pick(values: Array, index: Array) -> Array:
 def _furthest_edge(polygon: Array, other: Array) -> tuple[Array, Array]:
     """How far outside of one edge of the polygon all of the other lies at most, and which edge."""
     outward, exists = _outward(polygon)
-    apart = other[:, None, :] - polygon[None, :, :]
-    distance = jnp.min(jnp.sum(apart * outward, axis=-1), axis=0)
+    offset = other[:, None, :] - polygon[None, :, :]
+    distance = jnp.min(jnp.sum(offset * outward, axis=-1), axis=0)
     distance = jnp.where(exists, distance, -FAR)
     return jnp.max(distance), jnp.argmax(distance)
 

@@ -65,7 +65,7 @@ def link_rows(
     # who a link holds, as products: the derivative of an index is a loop
     here = jnp.repeat(jnp.eye(bodies, dtype=pose.dtype)[:, None], count, axis=1)
     there = jax.nn.one_hot(links.to, bodies, dtype=pose.dtype)  # none for the world
-    own, apart = links.anchor - here @ centre, links.other_anchor - there @ centre
+    own, others = links.anchor - here @ centre, links.other_anchor - there @ centre
 
     def placed(lever: Array, who: Array) -> tuple[Array, Array]:
         angle = who @ pose[:, 2]
@@ -73,7 +73,7 @@ def link_rows(
         return x + who @ pose[:, 0], y + who @ pose[:, 1]
 
     own_x, own_y = placed(own, here)
-    other_x, other_y = placed(apart, there)  # a point of the world stays as it is
+    other_x, other_y = placed(others, there)  # a point of the world stays as it is
     gap_x, gap_y = own_x - other_x, own_y - other_y
     length = jnp.sqrt(jnp.square(gap_x) + jnp.square(gap_y) + COINCIDENT)
     # a pivot's rows are the world's axes, a distance's first row points from anchor to anchor
@@ -92,7 +92,7 @@ def link_rows(
             side = jnp.stack([a, b, lever[..., 0] * b - lever[..., 1] * a], axis=-1)
             return who[..., None] * side[..., None, :]
 
-        return of(own, here) - of(apart, there)
+        return of(own, here) - of(others, there)
 
     stiff = STIFFNESS * mass[:, None]
     return Rows(

@@ -149,9 +149,9 @@ class Planar(PlanarParameters):
         other = poses[self.link_to]
         own = jnp.broadcast_to(poses[:, None], other.shape)
         cosine, sine = jnp.cos(other[..., 2]), -jnp.sin(other[..., 2])
-        apart = own - other
-        x, y = turn(apart[..., 0], apart[..., 1], cosine, sine)
-        relative = jnp.stack([x, y, apart[..., 2]], axis=-1)
+        offset = own - other
+        x, y = turn(offset[..., 0], offset[..., 1], cosine, sine)
+        relative = jnp.stack([x, y, offset[..., 2]], axis=-1)
         to_world = (self.link_to < 0)[..., None]
         return dataclasses.replace(self, link_pose=jnp.where(to_world, own, relative))
 

@@ -30,8 +30,8 @@ def features(
     edge = jnp.concatenate([edge, jnp.zeros_like(edge[..., :1, :])], axis=-2)
     place = (state.position - state.position[..., :1, :]) / length
     span = place[..., -1:, :]
-    apart = jnp.sqrt(jnp.sum(jnp.square(span[..., :2]), axis=-1, keepdims=True) + 1e-12)
-    ends = jnp.concatenate([apart, span[..., 2:]], axis=-1)
+    distance = jnp.sqrt(jnp.sum(jnp.square(span[..., :2]), axis=-1, keepdims=True) + 1e-12)
+    ends = jnp.concatenate([distance, span[..., 2:]], axis=-1)
     local = [turned_in(vectors, along) for vectors in (following, edge, place)]
     ends = jnp.broadcast_to(ends, (*local[0].shape[:-1], ends.shape[-1]))
     return jnp.concatenate([*local, ends], axis=-1)

@@ -99,7 +99,7 @@ class Rope(RopeParameters):
             motion = jax.tree.map(
                 lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape[-2:]), motion
             )
-        return self._integrate_blocks(motion, coefficients, *batch)
+        return self._integrate_blocks(motion, coefficients, motion[0].position.shape[0])
 
     def _rest_bend(self, position: Array) -> Array | None:
         """Bend at rest in the world frame, (*batch, joints, 3); None for a straight rope.

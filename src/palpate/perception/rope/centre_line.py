@@ -1,7 +1,7 @@
 """From the rope's pixels to its centre line: a curve from the gripper, gaps filled.
 
 Points of the centre line are found to a fraction of a pixel as ridges of the picture (Steger 1998,
-IEEE TPAMI 20:113-125). Where along the rope a pixel lies is told in one of two ways.
+IEEE TPAMI 20:113-125). Where along the rope a pixel lies is found in one of two ways.
 
 With depth, by the shortest way from the gripper from pixel to pixel through space (the geodesic
 distances of Tenenbaum, de Silva and Langford 2000, Science 290:2319-2323): strands that cross or
@@ -190,14 +190,14 @@ def _through_space(points: np.ndarray, length: float) -> CentreLine:
 
     A way that leaves a strand is longer by as much as the gap is wider than `STRIDE`.
     """
-    apart = np.linalg.norm(points[:, None] - points, axis=-1)
-    cost = apart * np.maximum(apart / STRIDE, 1.0)
-    cost[apart > REACH_OVER_GAP * length] = np.inf
+    separation = np.linalg.norm(points[:, None] - points, axis=-1)
+    cost = separation * np.maximum(separation / STRIDE, 1.0)
+    cost[separation > REACH_OVER_GAP * length] = np.inf
     far, before = dijkstra(cost, indices=0, return_predecessors=True)
     order = np.argsort(far, kind="stable")[: np.isfinite(far).sum()]
     along = np.zeros(len(points))
     for point in order[1:]:
-        along[point] = along[before[point]] + apart[point, before[point]]
+        along[point] = along[before[point]] + separation[point, before[point]]
     order = order[np.argsort(along[order], kind="stable")]
     return CentreLine.through(_smooth_curve(along[order], points[order]))
 
@@ -214,8 +214,8 @@ def _misfit(line: CentreLine, points: np.ndarray, length: float) -> float:
 
     Mean distances in strides, of at most two each; a length that is wrong by a tenth is a stride.
     """
-    apart = np.linalg.norm(line.points[:, None] - points, axis=-1)
-    far = [np.minimum(apart.min(axis) / STRIDE, 2.0).mean() for axis in (0, 1)]
+    separation = np.linalg.norm(line.points[:, None] - points, axis=-1)
+    far = [np.minimum(separation.min(axis) / STRIDE, 2.0).mean() for axis in (0, 1)]
     return sum(far) + min(abs(math.log(max(line.length, 1e-3) / length)) / 0.1, 2.0)
 
 

@@ -41,7 +41,7 @@ UNEXPLAINED = 4.5  # nats: what a point costs that is nowhere near the rope
 ALONE = 0.2  # of a point's evidence that its neighbours do not give already
 
 
-class Belief(eqx.Module):
+class RopeBelief(eqx.Module):
     """What is believed of the rope at one instant.
 
     `mean` (6 n + 1,): positions (m) and velocities (m/s) of the n free nodes, each (n, 3) row by
@@ -108,7 +108,7 @@ class View(eqx.Module):
         return self.centre + local[..., :2] / depth[..., None] * self.focal, depth
 
 
-def advance(model: Rope, belief: Belief, gripper: Float[Array, "3"]) -> Belief:
+def advance(model: Rope, belief: RopeBelief, gripper: Float[Array, "3"]) -> RopeBelief:
     """The belief one control period later, with the gripper then at `gripper` (m).
 
     `model` is driven by position at node 0. Its error is an acceleration that neighbouring nodes
@@ -130,10 +130,12 @@ def advance(model: Rope, belief: Belief, gripper: Float[Array, "3"]) -> Belief:
     error += ACCELERATION_ERROR * change
     noise = _block(jnp.full(free, 1e-4), error, LENGTH_DRIFT)
     covariance = transition @ belief.covariance @ transition.T + noise
-    return Belief(mean, 0.5 * (covariance + covariance.T), gripper, gripper_velocity)
+    return RopeBelief(mean, 0.5 * (covariance + covariance.T), gripper, gripper_velocity)
 
 
-def correct(model: Rope, view: View, belief: Belief, sighting: Sighting) -> tuple[Belief, Fit]:
+def correct(
+    model: Rope, view: View, belief: RopeBelief, sighting: Sighting
+) -> tuple[RopeBelief, Fit]:
     """The belief after a frame, and how that fits.
 
     Gauss-Newton with the belief as prior, written in the prior's own scale w = L^-1 (x - mean),
@@ -188,12 +190,12 @@ def correct(model: Rope, view: View, belief: Belief, sighting: Sighting) -> tupl
         ends = sighting.may_end[tip] & (jnp.sum(reach > reach[tip] - PER_SEGMENT // 2) > 3)
         missed = residual(mean, match, tip)
         jacobian = jax.jacfwd(residual)(mean, match, tip) @ root
-        apart = jnp.abs(missed) / jnp.sqrt(1.0 + jnp.sum(jacobian**2, axis=-1))
+        deviations = jnp.abs(missed) / jnp.sqrt(1.0 + jnp.sum(jacobian**2, axis=-1))
         count = len(sighting.valid)
         near = close & sighting.valid & on_rope
         # Where a whipping tip's depth is missed, what lies across may still be right.
-        across, in_depth = near & (apart[: 2 * count].reshape(2, count) < GATE)
-        ends &= jnp.all(apart[2 * count : 2 * count + 2] < TIP_GATE)
+        across, in_depth = near & (deviations[: 2 * count].reshape(2, count) < GATE)
+        ends &= jnp.all(deviations[2 * count : 2 * count + 2] < TIP_GATE)
         rows = jnp.concatenate(
             [
                 across,
@@ -220,7 +222,7 @@ def correct(model: Rope, view: View, belief: Belief, sighting: Sighting) -> tupl
     w, found = jax.lax.scan(iterate, jnp.zeros(size), None, length=3)
     half, fit = jax.tree.map(lambda each: each[-1], found)
     half = jax.scipy.linalg.solve_triangular(half, root.T, lower=True)
-    corrected = Belief(
+    corrected = RopeBelief(
         belief.mean + root @ w, half.T @ half, belief.gripper, belief.gripper_velocity
     )
     return corrected, fit
@@ -229,12 +231,12 @@ def correct(model: Rope, view: View, belief: Belief, sighting: Sighting) -> tupl
 def _associate(view: View, places: Array, sighting: Sighting) -> tuple[Array, Array]:
     """To which of the `places` (k, 3) along the curve each point belongs, and whether to any."""
     pixels, depth = view.project(places)
-    apart = jnp.sum((sighting.pixels[:, None] - pixels) ** 2, axis=-1)
+    squared = jnp.sum((sighting.pixels[:, None] - pixels) ** 2, axis=-1)
     further = sighting.depth[:, None] - depth
     further = jnp.where(jnp.isfinite(further), further, 0.0)
-    distance = apart / 2.0**2 + (further / 0.03) ** 2
+    distance = squared / 2.0**2 + (further / 0.03) ** 2
     match = jnp.argmin(distance, axis=-1)
-    return match, jnp.take_along_axis(apart, match[:, None], axis=1)[:, 0] < 12.0**2
+    return match, jnp.take_along_axis(squared, match[:, None], axis=1)[:, 0] < 12.0**2
 
 
 def bent(model: Rope, position: Array, logarithm: Array) -> Rope:
@@ -299,7 +301,7 @@ def curve_weights(nodes: int, slope: bool = False) -> np.ndarray:
 
 def first_belief(
     model: Rope, nodes: np.ndarray, logarithm: float, sight: np.ndarray | None
-) -> Belief:
+) -> RopeBelief:
     """A rope whose `nodes` (nodes, 3) lie about there, of unknown velocity.
 
     `logarithm`: of its length as a share of the model's. `sight` (nodes, 3): unit vectors along
@@ -315,4 +317,6 @@ def first_belief(
         covariance = covariance.at[: 3 * free, : 3 * free].add(along @ unsure @ along.T)
     mean = np.concatenate([nodes[1:].ravel(), np.zeros(3 * free), [logarithm]])
     gripper = jnp.asarray(nodes[0], jnp.float32)
-    return Belief(jnp.asarray(mean, jnp.float32), covariance, gripper, jnp.zeros(3, jnp.float32))
+    return RopeBelief(
+        jnp.asarray(mean, jnp.float32), covariance, gripper, jnp.zeros(3, jnp.float32)
+    )

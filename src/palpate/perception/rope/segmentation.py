@@ -1,6 +1,6 @@
 """Which pixels show the rope: by its colour, its thinness and, where there is depth, its reach.
 
-Nothing is learned from pictures: the rope's colour is told. A rope is about as thin as a pixel, so
+Nothing is learned from pictures: the rope's colour is given. A rope is about as thin as a pixel, so
 its pixels are mixtures with what lies behind; hence a share of each pixel and not a yes or no.
 """
 

@@ -21,7 +21,7 @@ from palpate.perception.rope.centre_line import FEWEST, centre_lines, line_point
 from palpate.perception.rope.filter import (
     MOST_POINTS,
     PER_SEGMENT,
-    Belief,
+    RopeBelief,
     Sighting,
     View,
     advance,
@@ -49,7 +49,7 @@ NEARER = 0.15  # m: what is nearer by more hides the rope
 class _Hypothesis:
     """A belief, how badly it explained the frames so far (nats), and for how many in a row."""
 
-    belief: Belief
+    belief: RopeBelief
     surprise: float = 0.0
     unexplained: int = 0
 
@@ -116,7 +116,7 @@ class RopeTracker:
         return state
 
     @property
-    def belief(self) -> Belief:
+    def belief(self) -> RopeBelief:
         """What is believed at the time of the last frame, to the nearest control period."""
         return self._hypotheses[0].belief
 
@@ -188,7 +188,7 @@ class RopeTracker:
         fits &= self._shown(each.belief, frame, seen) > LEAST_SHOWN
         each.unexplained = 0 if fits else each.unexplained + 1
 
-    def _shown(self, belief: Belief, frame: Frame, seen: Segmentation) -> float:
+    def _shown(self, belief: RopeBelief, frame: Frame, seen: Segmentation) -> float:
         """The share of the rope, as believed, where the picture shows a rope.
 
         Of what nothing hides; 0 where everything is hidden, which confirms nothing.
@@ -249,9 +249,13 @@ def _distinct(ranked: list[_Hypothesis]) -> list[_Hypothesis]:
     positions: list[np.ndarray] = []
     for each in ranked[: 2 * MOST_BELIEFS]:
         position = np.asarray(each.belief.state().position)
-        apart = [np.sqrt(((position - other) ** 2).sum(-1).mean()) for other in positions]
+        separations = [np.sqrt(((position - other) ** 2).sum(-1).mean()) for other in positions]
         worse = each.surprise > ranked[0].surprise + BEHIND
-        if len(kept) < MOST_BELIEFS and not worse and all(distance > ALIKE for distance in apart):
+        if (
+            len(kept) < MOST_BELIEFS
+            and not worse
+            and all(distance > ALIKE for distance in separations)
+        ):
             kept.append(each)
             positions.append(position)
     least = kept[0].surprise
@@ -261,9 +265,9 @@ def _distinct(ranked: list[_Hypothesis]) -> list[_Hypothesis]:
 
 
 _advance, _correct = eqx.filter_jit(advance), eqx.filter_jit(correct)
-_state = eqx.filter_jit(Belief.state)
+_state = eqx.filter_jit(RopeBelief.state)
 
 
 @eqx.filter_jit
-def _forecast(model: Rope, belief: Belief, state: RopeState, gripper: Array) -> RopeState:
+def _forecast(model: Rope, belief: RopeBelief, state: RopeState, gripper: Array) -> RopeState:
     return bent(model, state.position, belief.mean[-1]).step(state, gripper[None])

@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.maps.map import Map
-from palpate.planning.movable_obstacles.motion.belief import Belief
+from palpate.planning.movable_obstacles.motion.belief import SceneBelief
 from palpate.planning.movable_obstacles.motion.physics_manipulation import (
     ConstrainedManipulation,
     Drawn,
@@ -140,7 +140,7 @@ class Learner:
     curious = True
 
     def __init__(self, outlines: Mapping[str, np.ndarray], seed: int) -> None:
-        self.belief = Belief(outlines, seed)
+        self.belief = SceneBelief(outlines, seed)
 
     def model(self) -> ConstrainedManipulation:
         """See `Opinion`."""

@@ -2,7 +2,7 @@
 
 Pieces of three dimensions stand on casters, fixed wheels, locked casters or feet, roll with dry
 and viscous friction, slide by Coulomb's law, hang on hinges, and collide with walls and each
-other. See `furniture_pieces` for the kinds and `furniture_scene` for how they are built.
+other. See `pieces` for the kinds and `scene` for how they are built.
 """
 
 from __future__ import annotations
@@ -41,19 +41,10 @@ from palpate.worlds.furniture.touch import felt_wrenches
 from palpate.worlds.world import DivergedError, OffscreenCamera, World
 
 __all__ = [
-    "KINDS",
-    "FurnitureObservation",
-    "FurnitureSensors",
-    "FurnitureTruth",
-    "FurnitureWorld",
-    "Piece",
-    "PieceKind",
-    "PieceParameters",
-    "Robot",
-    "RobotAction",
-    "RobotObservation",
+    "KINDS", "FurnitureObservation", "FurnitureSensors", "FurnitureTruth", "FurnitureWorld",
+    "Piece", "PieceKind", "PieceParameters", "Robot", "RobotAction", "RobotObservation",
     "RobotTruth",
-]
+]  # fmt: skip
 
 CONTROL_PERIOD = 0.02  # s
 STEPS_PER_PERIOD = round(CONTROL_PERIOD / TIME_STEP)

@@ -20,7 +20,7 @@ import shapely
 from palpate.errors import PalpateError
 from palpate.worlds.furniture.bodies import Bodies
 from palpate.worlds.furniture.pieces import BAND, HANDLE_HEIGHT, placed
-from palpate.worlds.furniture.scene import BODY_BIT, CONTACT_FRICTION
+from palpate.worlds.furniture.scene import BODY_BIT, DRAWN, SOLID
 
 BASE_MASS = 30.0  # kg
 LINK_MASS = 1.0  # kg, of each
@@ -124,16 +124,15 @@ def add_robot(spec: mujoco.MjSpec, robot: Robot, names: Sequence[str]) -> None:
     base.add_joint(name="base 1", type=slide, axis=(0, 1, 0))
     base.add_joint(name="base 2", type=hinge, axis=(0, 0, 1))
     grey, dark = (0.75, 0.77, 0.8, 1), (0.25, 0.27, 0.3, 1)
-    collides = {"contype": BODY_BIT, "conaffinity": BODY_BIT, "condim": 3}
     low, high = BAND
     base.add_geom(
         name="base", type=mujoco.mjtGeom.mjGEOM_CYLINDER, mass=BASE_MASS,
         pos=(0, 0, (low + high) / 2), size=(robot.radius, (high - low) / 2, 0), rgba=grey,
-        friction=(CONTACT_FRICTION, 0, 0), **collides,
+        **SOLID,
     )  # fmt: skip
     base.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER, mass=0, contype=0, conaffinity=0, rgba=dark,
-        pos=(0, 0, 0.08), size=(0.9 * robot.radius, 0.07, 0),
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER, mass=0, rgba=dark, pos=(0, 0, 0.08),
+        size=(0.9 * robot.radius, 0.07, 0), **DRAWN,
     )  # fmt: skip
     link, start = base, (0.0, 0.0, ARM_HEIGHT)
     for number, length in enumerate(robot.links):
@@ -144,14 +143,13 @@ def add_robot(spec: mujoco.MjSpec, robot: Robot, names: Sequence[str]) -> None:
         )  # fmt: skip
         link.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(0, 0, 0, length, 0, 0), mass=LINK_MASS,
-            size=(0.025, 0, 0), contype=0, conaffinity=0, rgba=dark,
+            size=(0.025, 0, 0), rgba=dark, **DRAWN,
         )  # fmt: skip
         start = (length, 0.0, 0.0)
     gripper = link.add_body(name="gripper", pos=(*start[:2], HANDLE_HEIGHT - ARM_HEIGHT))
     gripper.add_geom(
         name="gripper", type=mujoco.mjtGeom.mjGEOM_CYLINDER, mass=GRIPPER_MASS, rgba=grey,
-        size=(GRIPPER_RADIUS, (high - low) / 2 - 0.01, 0), friction=(CONTACT_FRICTION, 0, 0),
-        **collides,
+        size=(GRIPPER_RADIUS, (high - low) / 2 - 0.01, 0), **SOLID,
     )  # fmt: skip
     gripper.add_site(name="wrist")
     spec.add_exclude(bodyname1="base", bodyname2="gripper")

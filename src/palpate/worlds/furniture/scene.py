@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -31,6 +32,9 @@ GROUND_SOLREF = (0.01, 1.0)
 HINGE_SOLREF = (0.008, 1.0)
 
 FLOOR_BIT, BODY_BIT = 1, 2  # who collides: wheels and feet with the floor, bands with bands
+_COLLIDES = {"contype": BODY_BIT, "conaffinity": BODY_BIT, "condim": 3}
+SOLID: dict[str, Any] = _COLLIDES | {"friction": (CONTACT_FRICTION, 0, 0)}  # of a band
+DRAWN: dict[str, Any] = {"contype": 0, "conaffinity": 0}  # of what only a picture shows
 WALL_HEIGHT = 0.6  # m
 COLOURS = (
     (0.80, 0.45, 0.20), (0.25, 0.50, 0.75), (0.45, 0.65, 0.30), (0.65, 0.40, 0.65),
@@ -60,8 +64,7 @@ def furniture_scene(
     spec.modelname = "furniture"
     spec.compiler.degree = False
     option = spec.option
-    option.timestep = TIME_STEP
-    option.gravity = (0, 0, -GRAVITY)
+    option.timestep, option.gravity = TIME_STEP, (0, 0, -GRAVITY)
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Elliptic cones with this ratio let feet and locked wheels creep by micrometres per second.
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -73,7 +76,7 @@ def furniture_scene(
         for part, convex in enumerate(convex_parts(polygon)):
             _add_prism(
                 spec, spec.worldbody, f"wall {number}.{part}", convex, (0.0, WALL_HEIGHT),
-                rgba=(0.85, 0.85, 0.82, 1), **_solid(),
+                rgba=(0.85, 0.85, 0.82, 1), **SOLID,
             )  # fmt: skip
     for number, (name, kind) in enumerate(zip(names, kinds, strict=True)):
         _add_piece(
@@ -146,22 +149,22 @@ def _add_piece(
     if rest <= 0:
         raise PalpateError(f"a '{kind.name}' of {parameters.mass} kg is lighter than its wheels")
     outline = np.asarray(kind.outline, float)
-    _add_prism(spec, body, f"{name} band", outline, BAND, rgba=colour, mass=rest, **_solid())
+    _add_prism(spec, body, f"{name} band", outline, BAND, rgba=colour, mass=rest, **SOLID)
     if load:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, pos=(*parameters.load_place, HANDLE_HEIGHT),
-            size=(LOAD_SIZE,) * 3, mass=load, rgba=colour, **_drawn(),
+            size=(LOAD_SIZE,) * 3, mass=load, rgba=colour, **DRAWN,
         )  # fmt: skip
     below = kind.height - 0.04 if kind.mounts else BAND[1]  # a top on legs, or all of a chest
     _add_prism(
         spec, body, f"{name} top", outline, (below, kind.height), rgba=colour,
-        mass=0, **_drawn(),
+        mass=0, **DRAWN,
     )  # fmt: skip
     for mount in kind.mounts:
         middle = (BAND[1] + kind.height) / 2
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=(*mount.place, middle), mass=0,
-            size=(0.015, max(kind.height - BAND[1], 0.01) / 2, 0), rgba=colour, **_drawn(),
+            size=(0.015, max(kind.height - BAND[1], 0.01) / 2, 0), rgba=colour, **DRAWN,
         )  # fmt: skip
     weight = parameters.mass * GRAVITY
     for number, (mount, angle) in enumerate(zip(kind.mounts, swivels, strict=True)):
@@ -194,6 +197,9 @@ def _add_wheel(
     friction: float,
 ) -> None:
     caster = mount.type == "caster"
+    hinge: dict[str, Any] = {
+        "type": mujoco.mjtJoint.mjJNT_HINGE, "damping": (BEARING_DAMPING, 0, 0)
+    }  # fmt: skip
     fork = body.add_body(
         name=f"{name} fork", pos=(*mount.place, mount.radius),
         quat=(math.cos(angle / 2), 0, 0, math.sin(angle / 2)),
@@ -201,19 +207,14 @@ def _add_wheel(
     if caster:
         fork.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=(0, 0, mount.radius), mass=FORK_MASS,
-            size=(0.01, mount.radius, 0), rgba=(0.5, 0.5, 0.5, 1), **_drawn(),
+            size=(0.01, mount.radius, 0), rgba=(0.5, 0.5, 0.5, 1), **DRAWN,
         )  # fmt: skip
         if not locked:
-            fork.add_joint(
-                name=f"{name} swivel", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1),
-                damping=(BEARING_DAMPING, 0, 0), frictionloss=SWIVEL_FRICTION,
-            )  # fmt: skip
+            swivel = f"{name} swivel"
+            fork.add_joint(name=swivel, axis=(0, 0, 1), frictionloss=SWIVEL_FRICTION, **hinge)
     wheel = fork.add_body(name=name, pos=(-mount.trail if caster else 0, 0, 0))
     if not locked:
-        wheel.add_joint(
-            name=f"{name} roll", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 1, 0),
-            damping=(BEARING_DAMPING, 0, 0), frictionloss=dry,
-        )  # fmt: skip
+        wheel.add_joint(name=f"{name} roll", axis=(0, 1, 0), frictionloss=dry, **hinge)
     wheel.add_geom(
         type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, mass=WHEEL_MASS,
         size=(mount.radius, 0.3 * mount.radius, mount.radius), rgba=(0.2, 0.2, 0.2, 1),
@@ -271,24 +272,7 @@ def _add_prism(
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **properties)
 
 
-def _solid() -> dict:
-    return {
-        "contype": BODY_BIT,
-        "conaffinity": BODY_BIT,
-        "condim": 3,
-        "friction": (CONTACT_FRICTION, 0, 0),
-    }
-
-
-def _standing(friction: float) -> dict:
-    return {
-        "contype": 0,
-        "conaffinity": FLOOR_BIT,
-        "condim": 3,
-        "friction": (friction, 0, 0),
-        "solref": GROUND_SOLREF,
-    }
-
-
-def _drawn() -> dict:
-    return {"contype": 0, "conaffinity": 0}
+def _standing(friction: float) -> dict[str, Any]:
+    """What touches the floor, and nothing else."""
+    touches = {"contype": 0, "conaffinity": FLOOR_BIT, "condim": 3}
+    return touches | {"friction": (friction, 0, 0), "solref": GROUND_SOLREF}

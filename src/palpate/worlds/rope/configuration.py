@@ -100,31 +100,23 @@ class RopeConfiguration:
             raise PalpateError(f"a rope's grip is 'pivot' or 'clamped', not {self.grip!r}")
         if not isinstance(self.bodies, int | np.integer) or self.bodies < 3:
             raise PalpateError(f"a rope has a whole number of bodies, 3 or more, not {self.bodies}")
-        if (
-            not isinstance(self.markers, int | np.integer)
-            or self.markers < 2
-            or self.bodies % (self.markers - 1)
-        ):
+        whole = isinstance(self.markers, int | np.integer) and self.markers >= 2
+        if not whole or self.bodies % (self.markers - 1):
             fitting = [n + 1 for n in range(1, self.bodies + 1) if self.bodies % n == 0]
             raise PalpateError(
                 f"{self.markers} markers do not spread evenly over {self.bodies} bodies; "
                 f"{', '.join(map(str, fitting))} markers do"
             )
         self._whole("control_period", self.control_period / self.time_step, "time steps")
-        self._whole(
-            "observation_delay", self.observation_delay / self.control_period, "control periods"
-        )
+        delay = self.observation_delay / self.control_period
+        self._whole("observation_delay", delay, "control periods")
         if self.observation_rate is not None:
             if not 0 < self.observation_rate < math.inf:
                 raise PalpateError(
                     f"a rope's observation_rate is greater than 0, not {self.observation_rate}"
                 )
-            self._whole(
-                "observation_rate",
-                1 / (self.observation_rate * self.control_period),
-                "control periods between observations",
-                least=1,
-            )
+            every = 1 / (self.observation_rate * self.control_period)
+            self._whole("observation_rate", every, "control periods between observations", least=1)
         object.__setattr__(self, "mass_distribution", self._weights())
         object.__setattr__(self, "disturbances", tuple(self.disturbances))
         self._check_time_step()
@@ -163,13 +155,9 @@ class RopeConfiguration:
         has omega^2 = 4 GJ / (h I), where I = m r^2 / 2 is a rod's inertia about its axis.
         """
         mass, spacing = self.body_masses().min(), self.length / self.bodies
-        frequency = {
-            "bending_stiffness": math.sqrt(48 * self.bending_stiffness / (spacing**3 * mass)),
-            "twisting_stiffness": math.sqrt(
-                8 * self.twisting_stiffness / (spacing * mass * self.radius**2)
-            ),
-        }
-        for name, omega in frequency.items():
+        bending = math.sqrt(48 * self.bending_stiffness / (spacing**3 * mass))
+        twisting = math.sqrt(8 * self.twisting_stiffness / (spacing * mass * self.radius**2))
+        for name, omega in (("bending_stiffness", bending), ("twisting_stiffness", twisting)):
             if omega * self.time_step >= 2:
                 raise PalpateError(
                     f"a {name} of {getattr(self, name):g} N m^2 needs a time_step below "

@@ -27,14 +27,9 @@ from palpate.worlds.rope.starts import (
 from palpate.worlds.world import DivergedError, OffscreenCamera, World
 
 __all__ = [
-    "START_POSES",
-    "Disturbance",
-    "RopeConfiguration",
-    "RopeObservation",
-    "RopeTruth",
-    "RopeWorld",
+    "START_POSES", "Disturbance", "RopeConfiguration", "RopeObservation", "RopeTruth", "RopeWorld",
     "sample_configurations",
-]
+]  # fmt: skip
 
 GRIPPER_START = (0.0, 0.0, 1.5)  # m, where every episode begins, at rest
 GRIPPER_MASS = 0.5  # kg
@@ -139,11 +134,8 @@ class RopeWorld(World):
         azimuth = drawn if azimuth is None else float(azimuth)
         if not math.isfinite(azimuth):
             raise PalpateError(f"an azimuth is a finite angle in radians, not {azimuth}")
-        turn = np.array([
-            [math.cos(azimuth), -math.sin(azimuth), 0],
-            [math.sin(azimuth), math.cos(azimuth), 0],
-            [0, 0, 1],
-        ])  # fmt: skip
+        cosine, sine = math.cos(azimuth), math.sin(azimuth)
+        turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
         shaken = isinstance(start, str) and start == "shaken"
         tangents = start_tangents("hanging" if shaken else start, self._configuration.bodies)
         self._place(tangents @ turn.T)
@@ -341,12 +333,10 @@ def _compile(configuration: RopeConfiguration) -> mujoco.MjModel:
         body = body.bodies[0] if body.bodies else body
     if configuration.tip_mass:
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=(2 * configuration.radius, 0, 0),
-            pos=(configuration.length / configuration.bodies, 0, 0),
-            mass=configuration.tip_mass,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(2 * configuration.radius, 0, 0),
+            pos=(configuration.length / configuration.bodies, 0, 0), mass=configuration.tip_mass,
             rgba=(0.3, 0.3, 0.35, 1),
-        )
+        )  # fmt: skip
     return spec.compile()
 
 

@@ -52,7 +52,7 @@ GRID_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin"}
 _MAP_KEYS = GRID_KEYS | {"bounds", "walls", "format", "name"}
 _DRAWING_KEYS = {"movables"}
 _ROBOT_KEYS = {"radius", "footprint", "drive", "reach", "push_only"}
-_TRUTHS = dict.fromkeys(("yes", "on", "true", "1"), True)
+_TRUTHS: dict[str, bool] = dict.fromkeys(("yes", "on", "true", "1"), True)
 _TRUTHS |= dict.fromkeys(("no", "off", "false", "0"), False)
 _CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
 

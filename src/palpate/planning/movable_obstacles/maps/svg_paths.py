@@ -33,7 +33,7 @@ def path_outlines(d: str, what: str) -> list[np.ndarray]:
             f"{what} has {rest.strip()[:20]!r} in its path: expected the commands "
             "M L H V Z C S Q T A and numbers"
         )
-    tokens = _TOKEN.findall(_ARC.sub(_flags_apart, d))
+    tokens = _TOKEN.findall(_ARC.sub(_separated_flags, d))
     if not tokens or tokens[0][0] not in ("M", "m"):
         raise PalpateError(f"{what} has a path that does not begin with M: {d[:30]!r}")
     outlines: list[list[np.ndarray]] = []
@@ -72,19 +72,19 @@ def path_outlines(d: str, what: str) -> list[np.ndarray]:
     return [points for points in every if len(points) > 1] or every[:1]
 
 
-def _flags_apart(arc: re.Match[str]) -> str:
+def _separated_flags(arc: re.Match[str]) -> str:
     """An arc command whose flags stand apart: `a 5 5 0 01-20 20` may be written without spaces."""
-    rest, apart, position, count = arc[2], [arc[1]], 0, 0
+    rest, separated, position, count = arc[2], [arc[1]], 0, 0
     while match := _NEXT.match(rest, position):
         number = match[1]
         flag = count % _COUNTS["A"] in (3, 4) and number[0] in "01"
         if flag and (number.isdigit() or float(number) not in (0.0, 1.0)):  # not one written as 1.0
             number = number[0]
-        apart.append(number)
-        position = match.start(1) + len(apart[-1])
+        separated.append(number)
+        position = match.start(1) + len(separated[-1])
         count += 1
-    apart.append(rest[position:])
-    return " ".join(apart)
+    separated.append(rest[position:])
+    return " ".join(separated)
 
 
 def _numbers(texts: list[str], what: str) -> np.ndarray:

@@ -45,7 +45,7 @@ HYPOTHESES = (
     (STATIC, 0.0, 0.2),
 )
 PARTICLES = 96  # of each hypothesis
-LEAST = 0.005  # probability of a hypothesis, whatever was seen
+LEAST_PROBABILITY = 0.005  # probability of a hypothesis, whatever was seen
 # Priors that every object's particles begin with, one coordinate each. The weak force is what an
 # axis rolls at, the strong one what holds across it and at a pivot.
 PRIORS: tuple[tuple[str, Prior], ...] = (
@@ -62,14 +62,14 @@ PRIORS: tuple[tuple[str, Prior], ...] = (
 )
 # Pieces of a contact.
 PERIOD, STRIDE = 0.04, 2  # s of a model's step: two frames of 0.02 s
-STEPS, BEFORE = 6, 8  # steps of a piece, and frames before it that give its velocity
+STEPS, FRAMES_BEFORE = 6, 8  # steps of a piece, and frames before it that give its velocity
 PIECES = 8  # of a contact, at most
 POSITION, ANGLE = 4e-3, 8e-3  # m, rad: the scale of what the model cannot explain at a piece's end
-SHARE = 0.15  # of the motion seen is unexplained as well
+UNEXPLAINED = 0.15  # share of the motion seen that is unexplained as well
 FREEDOM = 4.0  # of Student's t
-TOGETHER = 0.5  # power of the likelihood: pieces of one contact err together
+LIKELIHOOD_POWER = 0.5  # power of the likelihood: pieces of one contact err together
 # Particles move when few are left: Liu and West's kernel (2001), with the particles' mean kept.
-ENOUGH, SHRINKAGE, ROUNDS = 0.4, 0.97, 12
+LEAST_EFFECTIVE, SHRINKAGE, ROUNDS = 0.4, 0.97, 12
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class ObjectBelief:
     def probabilities(self) -> np.ndarray:
         """Of the hypotheses (hypotheses,)."""
         share = np.exp(self._log_hypothesis - self._log_hypothesis.max())
-        share = np.maximum(share / share.sum(), LEAST)
+        share = np.maximum(share / share.sum(), LEAST_PROBABILITY)
         return share / share.sum()
 
     def learn(self, pieces: Pieces) -> None:
@@ -120,12 +120,11 @@ class ObjectBelief:
         self.version += 1
         left = np.ones(len(HYPOTHESES))
         for turn in range(ROUNDS):
-            fit = TOGETHER * self._log_likelihood(pieces)
-            if turn == ROUNDS - 1:
-                change = left
-            else:
-                change = np.array([self._change(*each) for each in zip(
-                    self._log_weight, fit, left, strict=True)])  # fmt: skip
+            fit = LIKELIHOOD_POWER * self._log_likelihood(pieces)
+            change = left
+            if turn < ROUNDS - 1:
+                given = zip(self._log_weight, fit, left, strict=True)
+                change = np.array([_change(*each) for each in given])
             weight = self._log_weight + change[:, None] * fit
             evidence = _log_sum(weight)
             self._log_hypothesis = self._log_hypothesis + evidence
@@ -147,8 +146,8 @@ class ObjectBelief:
         weight = self.probabilities[:, None] * np.exp(self._log_weight)
         cumulative = np.cumsum(weight)
         points = (self._random.uniform() + np.arange(count)) / count * cumulative[-1]
-        chosen = np.searchsorted(cumulative, points)
-        chosen = self._random.permutation(np.minimum(chosen, weight.size - 1))
+        chosen = np.minimum(np.searchsorted(cumulative, points), weight.size - 1)
+        chosen = self._random.permutation(chosen)
         values = self._values()
         return tuple(self._constraint(values, *divmod(int(index), PARTICLES)) for index in chosen)
 
@@ -197,21 +196,10 @@ class ObjectBelief:
         )
         return np.nan_to_num(np.asarray(found, float), nan=-1e6, neginf=-1e6)
 
-    def _change(self, log_weight: np.ndarray, fit: np.ndarray, left: float) -> float:
-        """How much of the likelihood leaves enough particles of one hypothesis."""
-        if left == 0 or _effective(log_weight + left * fit) >= ENOUGH:
-            return left
-        low, high = 0.0, left
-        for _ in range(20):
-            middle = 0.5 * (low + high)
-            fine = _effective(log_weight + middle * fit) >= ENOUGH
-            low, high = (middle, high) if fine else (low, middle)
-        return low
-
     def _move(self) -> None:
         """Resample and jitter each hypothesis of which few particles count."""
         for index, weight in enumerate(np.exp(self._log_weight)):
-            if 1 / (weight**2).sum() > 2 * ENOUGH * PARTICLES:
+            if 1 / (weight**2).sum() > 2 * LEAST_EFFECTIVE * PARTICLES:
                 continue
             position = self._position[index]
             mean = weight @ position
@@ -226,7 +214,7 @@ class ObjectBelief:
             self._log_weight[index] = -math.log(PARTICLES)
 
 
-class Belief:
+class SceneBelief:
     """What is believed of every object, by outlines (points, 2), all from one shared prior."""
 
     def __init__(self, outlines: Mapping[str, np.ndarray], seed: int = 0) -> None:
@@ -271,26 +259,19 @@ def cut(poses: np.ndarray, wrenches: np.ndarray, alone: np.ndarray) -> Pieces:
     poses = np.asarray(poses, float).reshape(-1, 3)
     wrenches = np.asarray(wrenches, float).reshape(-1, 3)
     length = STEPS * STRIDE
-    begins = [
-        begin
-        for begin in range(BEFORE - 1, len(poses) - length)
-        if np.all(alone[begin - BEFORE + 1 : begin + length + 1])
-    ]
     kept: list[int] = []
-    for begin in begins:
-        if not kept or begin >= kept[-1] + length:
+    for begin in range(FRAMES_BEFORE - 1, len(poses) - length):
+        free = np.all(alone[begin - FRAMES_BEFORE + 1 : begin + length + 1])
+        if free and (not kept or begin >= kept[-1] + length):
             kept.append(begin)
     # Evenly over the whole pull, the beginning included.
     if len(kept) > PIECES:
         kept = [kept[k] for k in np.linspace(0, len(kept) - 1, PIECES).round().astype(int)]
-    empty = np.zeros((PIECES, 3))
-    pieces = Pieces(
-        empty.copy(), empty.copy(), np.zeros((PIECES, STEPS, 3)), empty.copy(), empty.copy(),
-        np.zeros(PIECES),
-    )  # fmt: skip
-    time = 0.02 * np.arange(1 - BEFORE, 1)
+    shapes = (3,), (3,), (STEPS, 3), (3,), (3,), ()
+    pieces = Pieces(*(np.zeros((PIECES, *shape)) for shape in shapes))
+    time = 0.02 * np.arange(1 - FRAMES_BEFORE, 1)
     for row, begin in enumerate(kept):
-        window = poses[begin - BEFORE + 1 : begin + 1]
+        window = poses[begin - FRAMES_BEFORE + 1 : begin + 1]
         slope, offset = np.polyfit(time, window, 1)
         pieces.pose[row], pieces.velocity[row] = offset, slope
         # The wrench of frame k acted before it was seen there.
@@ -314,6 +295,18 @@ _STRUCTURE = jnp.array(
         for kind, direction, _ in HYPOTHESES
     ]
 )
+
+
+def _change(log_weight: np.ndarray, fit: np.ndarray, left: float) -> float:
+    """How much of the likelihood leaves enough particles of one hypothesis."""
+    if left == 0 or _effective(log_weight + left * fit) >= LEAST_EFFECTIVE:
+        return left
+    low, high = 0.0, left
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        fine = _effective(log_weight + middle * fit) >= LEAST_EFFECTIVE
+        low, high = (middle, high) if fine else (low, middle)
+    return low
 
 
 def _effective(log_weight: np.ndarray) -> float:
@@ -380,7 +373,10 @@ def _log_likelihoods(
         moved, total = jnp.abs(end - pose), jnp.zeros(())
         far = jnp.hypot(moved[0], moved[1])
         for seen, found, share in ((middle, poses[STEPS // 2 - 1], 0.5), (end, poses[-1], 1.0)):
-            place, angle = POSITION + SHARE * share * far, ANGLE + SHARE * share * moved[2]
+            place, angle = (
+                POSITION + UNEXPLAINED * share * far,
+                ANGLE + UNEXPLAINED * share * moved[2],
+            )
             off = (seen - found) / jnp.stack([place, place, angle])
             total -= 0.5 * (FREEDOM + 1) * jnp.sum(jnp.log1p(jnp.square(off) / FREEDOM))
         return total

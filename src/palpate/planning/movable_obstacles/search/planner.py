@@ -2,7 +2,7 @@
 
 Abstract actions begin with the least they could cost. Value iteration finds the best policy; what
 it would do from where the robot stands is worked out below, in order, each on the map as the
-earlier actions leave it; what is found replaces what was hoped for, and value iteration is solved
+earlier actions leave it; what is found replaces the bound, and value iteration is solved
 anew, until the whole policy consists of actions that have been worked out (the lazy evaluation of
 LAO*, Hansen and Zilberstein 2001). Objects that the policy never needs are never simulated.
 
@@ -25,7 +25,7 @@ from palpate.planning.movable_obstacles.search.plan import TRANSIT, Plan, timed
 from palpate.planning.movable_obstacles.search.policy import NoWayError, PolicyGraph, WalledError
 from palpate.planning.movable_obstacles.search.regrasps import stops_of
 from palpate.planning.movable_obstacles.search.situation import (
-    Situation,
+    Progress,
     at_hand,
     beside,
     carried_out,
@@ -48,7 +48,7 @@ _GROWN = 2.5  # sizes of object and robot that a window reaches beyond what it h
 class _Resolved:
     """A move made, with whatever had to be moved before: `cost_m` in m as costs are counted."""
 
-    ahead: Situation
+    ahead: Progress
     cost_m: float
     probability: float
 
@@ -91,10 +91,10 @@ class Planner:
 
     # --- above --------------------------------------------------------------------------------
 
-    def _found(self, world: Map, goal: Pose, fixed: set[str], halvings: int) -> Situation:
+    def _found(self, world: Map, goal: Pose, fixed: set[str], halvings: int) -> Progress:
         """The situation at the goal; raises `NoWayError`."""
         self._world = unmoved(world)
-        begin = Situation(Space(world, fixed), np.array(world.start))
+        begin = Progress(Space(world, fixed), np.array(world.start))
         try:
             return self._planned(begin, goal, regrasps=False)
         except WalledError:
@@ -108,15 +108,15 @@ class Planner:
                 raise closed from None
         return self._found(finer, goal, fixed, halvings - 1)
 
-    def _planned(self, now: Situation, goal: Pose, regrasps: bool) -> Situation:
+    def _planned(self, now: Progress, goal: Pose, regrasps: bool) -> Progress:
         """The situation at the goal, stage by stage; raises `NoWayError`."""
         world = now.space.map
-        hoped, stale = np.inf, 0
+        least, stale = np.inf, 0
         for stage in range(2 * len(world.movables) + 3):
             graph = PolicyGraph(now.space, now.robot, goal, beside(now))
             # what was moved has to lead nearer, or it is moved to and fro without end
-            stale = stale + 1 if graph.hoped >= hoped - 1e-6 else 0
-            hoped = min(hoped, graph.hoped)
+            stale = stale + 1 if graph.lower_bound >= least - 1e-6 else 0
+            least = min(least, graph.lower_bound)
             if stage == 0:
                 self._sizes |= {
                     "regions": graph.regions.free,
@@ -134,15 +134,15 @@ class Planner:
         return now
 
     def _advance(
-        self, graph: PolicyGraph, now: Situation, goal: Pose, regrasps: bool
-    ) -> Situation | None:
+        self, graph: PolicyGraph, now: Progress, goal: Pose, regrasps: bool
+    ) -> Progress | None:
         """To the goal, or as far as the policy leads before it needs another graph."""
-        farthest: Situation | None = None
+        farthest: Progress | None = None
         while True:
             moves = graph.policy(self._sizes)
             if moves is None:
                 return farthest
-            ahead = Situation(now.space, now.robot, list(now.segments))
+            ahead = Progress(now.space, now.robot, list(now.segments))
             changed, failed = False, False
             spent: dict[int, tuple[float, float]] = {}  # an action may need several moves
             for move in moves:
@@ -171,7 +171,7 @@ class Planner:
 
     # --- below --------------------------------------------------------------------------------
 
-    def _resolve(self, ahead: Situation, move: Move, depth: int) -> _Resolved | None:
+    def _resolve(self, ahead: Progress, move: Move, depth: int) -> _Resolved | None:
         """Make the move, after clearing what stands in its way if it is not possible at once.
 
         What stands in its way is what the best transfer would hit if the object were the only one
@@ -190,11 +190,9 @@ class Planner:
                 return resolved
         return None
 
-    def _cleared(
-        self, ahead: Situation, move: Move, away: set[str], depth: int
-    ) -> _Resolved | None:
+    def _cleared(self, ahead: Progress, move: Move, away: set[str], depth: int) -> _Resolved | None:
         """The move, planned as if the objects `away` were not there, and these put aside first."""
-        alone = Situation(ahead.space.without(away), ahead.robot)
+        alone = Progress(ahead.space.without(away), ahead.robot)
         lone_move = dataclasses.replace(move, ignored=move.ignored - away)
         wanted = self._open(alone, lone_move)
         if wanted is None:
@@ -223,7 +221,7 @@ class Planner:
             carried_out(ahead, opening), cost + opening.cost, probability * opening.probability
         )
 
-    def _regrasped(self, ahead: Situation, move: Move) -> _Resolved | None:
+    def _regrasped(self, ahead: Progress, move: Move) -> _Resolved | None:
         """The move in two carries of the same object, the cheaper the better."""
         best: _Resolved | None = None
         for stop in self._stops(ahead, move):
@@ -236,7 +234,7 @@ class Planner:
                 best = _Resolved(carried_out(halfway, opening), cost, probability)
         return best
 
-    def _stops(self, ahead: Situation, move: Move) -> list[Opening]:
+    def _stops(self, ahead: Progress, move: Move) -> list[Opening]:
         """Where the object may be put down to be held elsewhere."""
         for window in (window_of(ahead.space, ahead.robot, move), whole(ahead.space)):
             below = self._below(ahead, move, window)
@@ -244,7 +242,7 @@ class Planner:
                 return stops_of(below)
         return []
 
-    def _open(self, ahead: Situation, move: Move) -> Opening | None:
+    def _open(self, ahead: Progress, move: Move) -> Opening | None:
         """What the tree search says of one move, in a window if that is enough."""
         space = ahead.space
         windows = [window_of(space, ahead.robot, move), whole(space)]
@@ -266,10 +264,10 @@ class Planner:
                 return opening
         return None
 
-    def _below(self, ahead: Situation, move: Move, window: Window) -> OpeningSearch:
+    def _below(self, ahead: Progress, move: Move, window: Window) -> OpeningSearch:
         return OpeningSearch(ahead.space, self.model, ahead.robot, move, window)
 
-    def _key(self, ahead: Situation, move: Move, window: Window) -> Hashable:
+    def _key(self, ahead: Progress, move: Move, window: Window) -> Hashable:
         """All that decides what a search finds."""
         space = ahead.space
         inside = []

@@ -16,8 +16,8 @@ from palpate.planning.movable_obstacles.search.paths import links
 from palpate.planning.movable_obstacles.search.situation import whole
 from palpate.planning.movable_obstacles.search.transfers import Move
 
-_HOPE = 0.8  # of what an opening like it cost is what another is hoped to cost
-_ENOUGH = 1.15  # times the least that any policy is hoped to cost is good enough
+_OPTIMISM = 0.8  # of what an opening cost is the least that one like it may cost
+_TOLERATED = 1.15  # times the lower bound of any policy's cost is good enough
 
 
 class NoWayError(PalpateError):
@@ -104,8 +104,8 @@ class PolicyGraph:
         return _node(self.space, self.regions, robot, "start")
 
     @property
-    def hoped(self) -> float:
-        """The least that getting to the goal is hoped to cost, m."""
+    def lower_bound(self) -> float:
+        """Of what getting to the goal costs, m, as far as is known."""
         values = iterate(self._states, self.actions, [self._states - 1], self._dead_end)
         return float(values.value[0])
 
@@ -149,10 +149,10 @@ class PolicyGraph:
         return (float(here[0]), float(here[1])), length
 
     def learn(self, move: Move, cost: float, probability: float) -> bool:
-        """Replace what an action was hoped to cost (m) by what it does; whether that is news.
+        """Replace the bound of an action's cost (m) by what it costs; whether that differs.
 
-        It is news for others as well: over the same border from elsewhere it will cost about as
-        much beyond the way there, and no opening is hoped to be much cheaper than the cheapest.
+        Bounds of others rise with it: over the same border from elsewhere it will cost about as
+        much beyond the way there, and no opening is thought much cheaper than the cheapest.
         """
         action, costs = move.action, self.actions.cost
         old = float(costs[action]), float(self.actions.probability[action])
@@ -163,15 +163,15 @@ class PolicyGraph:
         self._cheapest = min(self._cheapest, above / self._count[action])
         border = self.actions.target[action]
         alike = (self.actions.target == border) & (self._kind == self._kind[action])
-        hoped = np.where(alike, above, self._cheapest * self._count)
+        bound = np.where(alike, above, self._cheapest * self._count)
         others = (self._count > 0) & ~self._known
-        costs[others] = np.maximum(costs, self._straight + _HOPE * hoped)[others]
+        costs[others] = np.maximum(costs, self._straight + _OPTIMISM * bound)[others]
         return bool(abs(costs[action] - old[0]) > 1e-6 or probability < old[1])
 
     def good_enough(self, moves: list[Move]) -> bool:
-        """Whether the policy that led to `moves` is nearly as good as any is hoped to be."""
+        """Whether the policy that led to `moves` costs little more than any other could."""
         known = all(self._known[move.action] for move in moves)
-        return known and self._cost_of(self._taken) <= _ENOUGH * self.hoped
+        return known and self._cost_of(self._taken) <= _TOLERATED * self.lower_bound
 
     def _cost_of(self, taken: list[int]) -> float:
         """The expected cost of a sequence of actions if a failure ends it, m."""

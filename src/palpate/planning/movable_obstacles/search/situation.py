@@ -16,7 +16,7 @@ from palpate.planning.movable_obstacles.search.transfers import Opening
 
 
 @dataclass
-class Situation:
+class Progress:
     """The map as it is simulated so far, and the robot on it."""
 
     space: Space
@@ -24,7 +24,7 @@ class Situation:
     segments: list[Segment] = field(default_factory=list)
 
 
-def at_hand(now: Situation) -> set[str]:
+def at_hand(now: Progress) -> set[str]:
     """The objects that the robot can drive up to."""
     space = now.space
     labels, _ = ndimage.label(space.free, np.ones((3, 3), int))
@@ -38,14 +38,14 @@ def at_hand(now: Situation) -> set[str]:
     return found
 
 
-def beside(now: Situation) -> dict[str, float]:
+def beside(now: Progress) -> dict[str, float]:
     """The object that was let go last is as near as the robot held it."""
     last = now.segments[-1].name if now.segments else None
     world = now.space.map
     return {} if last is None else {last: world.robot.radius + world.reach}
 
 
-def carried_out(ahead: Situation, opening: Opening) -> Situation:
+def carried_out(ahead: Progress, opening: Opening) -> Progress:
     """The situation after an opening."""
     poses, bodies = opening.robot_poses, opening.object_poses
     way = headed(opening.way, ahead.robot[2], poses[0, 2])
@@ -62,10 +62,10 @@ def carried_out(ahead: Situation, opening: Opening) -> Situation:
         opening.energy,
     )
     space = ahead.space.moved(opening.name, bodies[-1])
-    return Situation(space, poses[-1], [*ahead.segments, transit, transfer])
+    return Progress(space, poses[-1], [*ahead.segments, transit, transfer])
 
 
-def driven_to(ahead: Situation, goal: Pose) -> Situation | None:
+def driven_to(ahead: Progress, goal: Pose) -> Progress | None:
     """The last stretch; None if the goal cannot be got to."""
     point = np.array(goal[:2])
     space = ahead.space
@@ -75,7 +75,7 @@ def driven_to(ahead: Situation, goal: Pose) -> Situation | None:
         return None
     poses = headed(way, float(ahead.robot[2]), goal[2])
     segment = Segment(TRANSIT, poses, length_of(way))
-    return Situation(space, np.array(goal), [*ahead.segments, segment])
+    return Progress(space, np.array(goal), [*ahead.segments, segment])
 
 
 def headed(way: np.ndarray, first: float, last: float) -> np.ndarray:

@@ -43,7 +43,7 @@ def _faults(plan: Plan, world: Map) -> Iterator[str]:
     released: str | None = None
     for index, segment in enumerate(plan.segments):
         what = f"segment {index} ({segment.kind})"
-        if np.abs(segment.poses[0] - robot)[:2].max() > _JOINED or _apart(
+        if np.abs(segment.poses[0] - robot)[:2].max() > _JOINED or _differ(
             segment.poses[0, 2], robot[2]
         ):
             yield f"{what} does not begin where the robot is"
@@ -74,7 +74,7 @@ def _faults(plan: Plan, world: Map) -> Iterator[str]:
         released = name
     if np.abs(robot[:2] - np.array(plan.goal[:2])).max() > _JOINED:
         yield "the plan does not end at the goal"
-    elif _apart(robot[2], plan.goal[2]):
+    elif _differ(robot[2], plan.goal[2]):
         yield "the plan does not end in the goal's direction"
 
 
@@ -83,7 +83,7 @@ def _turned(outline: np.ndarray, pose: np.ndarray | tuple[float, ...]) -> Polygo
     return affinity.translate(turned, float(pose[0]), float(pose[1]))
 
 
-def _apart(one: float, other: float) -> bool:
+def _differ(one: float, other: float) -> bool:
     return abs(math.remainder(one - other, 2 * math.pi)) > _JOINED
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from palpate.cli import COMMANDS, main
 from palpate.families.rope.options import RecordRope
+from palpate.family import families
 from palpate.worlds.rope.rope import RopeConfiguration
 
 KINDS = [
@@ -57,7 +58,7 @@ def test_the_first_page_names_every_command(capsys):
     page = capsys.readouterr().out
     assert main(["--help"]) == 0
     assert capsys.readouterr().out == page
-    assert all(f"  {name} " in page for name in COMMANDS)
+    assert all(f"  {name} " in page for name in (*COMMANDS, *families()))
 
 
 @pytest.mark.parametrize("words", KINDS, ids=" ".join)

@@ -14,4 +14,10 @@ FAMILY = Family(
         "cart-to-origin": "toys:CartToOrigin",
         "pendulum-damping": "toys:PendulumDamping",
     },
+    evidence={"swing": "toy_pendulum:SWING"},
+    options={
+        "record": {"toy-pendulum": "toy_pendulum:RecordPendulum"},
+        "identify": {"toy-pendulum": "toy_pendulum:IdentifyPendulum"},
+        "train": {"pendulum-damping": "toy_pendulum:TrainPendulumDamping"},
+    },
 )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from palpate import __version__
 from palpate.errors import PalpateError
-from palpate.family import check_name, options_of, places, resolve
+from palpate.family import check_name, families, options_of, places, resolve
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 BAD_INPUT = 2
@@ -173,6 +173,10 @@ def _overview() -> str:
         "Find out an object's physics by handling it, and act through what was found.",
         "",
         *(f"  {name:{width}}  {command.about}" for name, command in COMMANDS.items()),
+        "",
+        "Families of objects:",
+        "",
+        *(f"  {family.name:{width}}  {family.about}" for family in families().values()),
         "",
         "`palpate COMMAND --help` says more. A first look, in a few minutes: palpate demo",
     ]

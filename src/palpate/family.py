@@ -24,21 +24,20 @@ Places = Mapping[str, str]  # a name, and where the thing of that name is: "modu
 
 @dataclass(frozen=True)
 class Family:
-    """What one family of objects hands over. Every value is a place, "module:name".
+    """What one family of objects hands over. Every value of a table is a place, "module:name".
 
-    `models`, `tasks`, `controllers`: classes by the name that files and the command line use.
-    `worlds`: MuJoCo scenes by name. `options`: for each command the options of each thing that it
-    works on. `experiments`: what `palpate reproduce` can repeat. `evidence`: what the family adds
-    to a run's page. `readers`: files of others, by what their names end in.
+    `about` says in a few words what objects these are. `models`, `tasks`, `controllers`: classes by
+    the name that files and the command line use. `evidence`: pieces (`palpate.report.Piece`) that
+    the family adds to a run's page. `options`: for each command the options of each thing that it
+    works on (a family, a task, a problem), as `palpate.families.options` describes. `experiments`:
+    what `palpate reproduce` can repeat.
     """
 
     name: str
     about: str
     models: Places = field(default_factory=dict)
-    worlds: Places = field(default_factory=dict)
     tasks: Places = field(default_factory=dict)
     controllers: Places = field(default_factory=dict)
-    readers: Places = field(default_factory=dict)
     evidence: Places = field(default_factory=dict)
     options: Mapping[str, Places] = field(default_factory=dict)
     experiments: Places = field(default_factory=dict)

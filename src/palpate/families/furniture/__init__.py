@@ -8,7 +8,6 @@ FAMILY = Family(
     name="furniture",
     about="rigid bodies in the plane, wheels, pivots",
     models={"planar": "palpate.models.planar:Planar"},
-    worlds={"furniture": "palpate.worlds.furniture.furniture:FurnitureWorld"},
     options={
         "record": {"furniture": f"{_OPTIONS}:RecordFurniture"},
         "identify": {"furniture": f"{_OPTIONS}:IdentifyFurniture"},

@@ -8,7 +8,6 @@ FAMILY = Family(
     name="rope",
     about="deformable linear objects",
     models={"rope": "palpate.models.rope:Rope"},
-    worlds={"rope": "palpate.worlds.rope.rope:RopeWorld"},
     tasks={
         "rope-stabilization": "palpate.tasks.rope:RopeStabilization",
         "rope-tracking": "palpate.tasks.rope:RopeTracking",

@@ -357,7 +357,7 @@ def test_a_quick_run_is_held_against_the_kept_one(experiment, tmp_path, monkeypa
         "0 of 3 figures as kept; times are not compared",
     ]
     assert reproduce.compare(run, kept(Figure("error", None, "m")))[0] == "error: 0.2, kept none"
-    assert "other seeds" in reproduce.compare(run, kept(*same, seeds=[1]))[0]
+    assert "has the seed 1" in reproduce.compare(run, kept(*same, seeds=[1]))[0]
     monkeypatch.setattr(reproduce, "KEPT", tmp_path)
     write_json(tmp_path / "rope-model.json", kept(*same).to_dict())
     reproduce.run(Reproduce(out=tmp_path / "out", quick=True), "rope-model")

@@ -2,6 +2,7 @@
 
 import pytest
 
+from palpate.experiments.experiment import Experiment
 from palpate.experiments.furniture import namo_online
 from palpate.trials.furniture.namo_episode import Learner
 from palpate.trials.furniture.rooms import scenes
@@ -53,12 +54,13 @@ def test_rooms_are_taken_up_where_they_were_left(tmp_path, monkeypatch):
     monkeypatch.setattr(namo_online, "room_row", tried)
     monkeypatch.setattr(namo_online, "generated_room", lambda seed: None)
     settings = namo_online.configuration(5, 4)
+    experiment = Experiment("namo-online", tmp_path, True, 0)
     with pytest.raises(KeyboardInterrupt):
-        namo_online.outcomes(tmp_path, 5, 4, settings)
-    rows = namo_online.outcomes(tmp_path, 5, 4, settings)
+        namo_online.outcomes(experiment, 5, 4, settings)
+    rows = namo_online.outcomes(experiment, 5, 4, settings)
     assert done == [1, 2, 3, 4]
     assert [r["seed"] for r in rows] == [0, 1, 2, 3]
-    assert namo_online.outcomes(tmp_path, 5, 4, settings) == rows
+    assert namo_online.outcomes(experiment, 5, 4, settings) == rows
     assert done == [1, 2, 3, 4]
 
 

@@ -163,7 +163,7 @@ def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatc
         raise StopIteration
 
     monkeypatch.setattr(one_shot_regression, "cut", noting)
-    monkeypatch.setattr(one_shot_regression, "identify", stop)
+    monkeypatch.setattr(one_shot_regression, "compare", stop)
     seen = first_samples(aligned, 4)
     told = recorded(first, seen)
     np.testing.assert_array_equal(told.align(PERIOD, POSE, WRENCH).observation, seen.observation)

@@ -35,7 +35,7 @@ def small(monkeypatch):
     """A small world, a short trial, and searches that return their own beginning."""
     model = Rope.uniform(1.0, 0.1, 6, drive="velocity", substeps=4, bend_stiffness=1e-4)
     monkeypatch.setattr(rope_bound, "BASE", BASE)
-    monkeypatch.setattr(rope_bound, "identified_rope", lambda *_: (model, 1.5))
+    monkeypatch.setattr(rope_bound, "identified_rope", lambda *_: model)
     monkeypatch.setattr(rope_bound, "shipped_policy", lambda: (untrained(), {"task": "-"}))
     monkeypatch.setattr(rope_bound, "SEARCHED", 0.5)
     monkeypatch.setattr(rope_bound, "SHAPED", 0.25)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.experiments.rope import dagger as rope_dagger
-from palpate.experiments.rope import stabilization as rope_stabilization
+from palpate.experiments.rope import nominal as nominal_rope
 from palpate.experiments.rope.dagger import Follower, TakeOver, Work, nominal, whirled
 from palpate.learning import Training, dagger
 from palpate.learning.loss_monitor import Alarm
@@ -47,11 +47,11 @@ def small(monkeypatch):
     def collected(alarm, comparison):
         return np.full(comparison.observed.shape, bool(left and left.pop()))
 
-    for module in (rope_dagger, rope_stabilization):
+    for module in (rope_dagger, nominal_rope):
         monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
     monkeypatch.setattr(rope_dagger, "QUICK_WORK", TINY)
     monkeypatch.setattr(rope_dagger, "TRIAL_PERIODS", 0.6)
-    monkeypatch.setattr(rope_dagger, "identified_rope", lambda *_: (MODEL, 0.0))
+    monkeypatch.setattr(rope_dagger, "identified_rope", lambda *_: MODEL)
     monkeypatch.setattr(rope_dagger, "shipped_policy", lambda: (untrained(), {"seed": 0}))
     monkeypatch.setattr(dagger, "train", train)
     monkeypatch.setattr(Alarm, "collected", collected)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.experiments.rope import markerless as rope_markerless
-from palpate.experiments.rope.stabilization import shipped_policy
+from palpate.experiments.rope.nominal import shipped_policy
 from palpate.models.rope import Rope, RopeState
 from palpate.runs.run import RESULT
 from palpate.trials.rope import filming as rope_filming
@@ -61,7 +61,7 @@ def test_all_rows_are_filmed_once_and_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr(rope_markerless, "START_POSES", ("straight",))
     monkeypatch.setattr(rope_markerless, "SWINGING", 0.08)
     monkeypatch.setattr(rope_markerless, "TRIAL_PERIODS", 0.05)
-    monkeypatch.setattr(rope_markerless, "identified_rope", lambda *_: (MODEL, 1.0))
+    monkeypatch.setattr(rope_markerless, "identified_rope", lambda *_: MODEL)
     monkeypatch.setattr(rope_filming, "COMPILED", 1)
     monkeypatch.setattr(rope_filming, "TIMED", 10)
     result = rope_markerless.reproduce(tmp_path, quick=True)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.experiments.experiment import Experiment
 from palpate.experiments.rope import model as rope_model
 from palpate.experiments.rope.swing import swing_half_life
 from palpate.parameters import describe
@@ -89,9 +90,9 @@ def test_a_folder_without_captures_is_refused(small, tmp_path, monkeypatch):
         rope_model.reproduce(tmp_path / "out", quick=True, mocap=tmp_path)
 
 
-def test_the_baseline_has_no_damping_and_cannot_find_any(small):
+def test_the_baseline_has_no_damping_and_cannot_find_any(small, tmp_path):
     world = small["sim1"]
-    fitted, _ = rope_model._simulated(world, 0, quick=True)
+    fitted, _ = rope_model._simulated(Experiment("rope-model", tmp_path, True, 0), world)
     rope = rope_model.undamped(rope_model.starting_rope(fitted, mass=world.mass))
     damping = [row for row in describe(rope) if row["name"] in rope_model.DAMPING]
     assert len(damping) == len(rope_model.DAMPING)

@@ -6,6 +6,7 @@ import pytest
 from palpate.errors import PalpateError
 from palpate.experiments.rope import residual as rope_residual
 from palpate.families.rope.recording import GRIPPER, MARKERS
+from palpate.models.rope import Rope
 from palpate.recordings.files import read_recording
 from palpate.runs import Figure, Result
 from palpate.runs.storage import write_json
@@ -33,6 +34,7 @@ def asked(monkeypatch):
         return options.out
 
     monkeypatch.setattr(rope_residual.identify, "run", run)
+    monkeypatch.setattr(rope_residual, "load_model", lambda path: (Rope.uniform(), {}))
     monkeypatch.setattr(rope_residual, "DURATION", 0.3)
     return asked
 
@@ -72,6 +74,15 @@ def test_the_real_rope_is_the_command_of_the_bar(asked, tmp_path):
     assert result.figures[0].name == "l1_ratio_to_physics"
     assert (result.figures[0].value, result.figures[0].bar) == (0.8, 0.90)
     assert result.settings["real.residual"] == {"kept": True, "reason": "kept"}
+
+
+def test_one_trial_that_carries_the_gain_is_seen():
+    rows = rope_residual.gain_figures(np.array([1.0, 0.9, 2.0]), np.array([1.0, 1.0, 4.0]))
+    values = {row.name: row.value for row in rows}
+    assert values["l1_ratio_to_physics.median_trial"] == pytest.approx(0.9)
+    assert values["l1_ratio_to_physics.worst_trial"] == 1.0
+    assert values["share_of_trials_that_gain"] == pytest.approx(2 / 3)
+    assert values["share_of_gain_in_one_trial"] == pytest.approx(2.0 / 2.1)
 
 
 def test_files_that_are_not_there_are_named_before_anything_is_done(asked, tmp_path):

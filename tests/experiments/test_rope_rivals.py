@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.experiments.rope import nominal
 from palpate.experiments.rope import rivals as rope_rivals
-from palpate.experiments.rope import stabilization as rope_stabilization
-from palpate.experiments.rope.stabilization import Size
+from palpate.experiments.rope.nominal import Size
 from palpate.learning import Training
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
@@ -99,11 +99,11 @@ def calls(monkeypatch):
         made.append(("train", model, training))
         return untrained(seed)
 
-    for module in (rope_stabilization, rope_rivals):
+    for module in (nominal, rope_rivals):
         monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
-        monkeypatch.setattr(module, "identify", identify)
-    monkeypatch.setattr(rope_stabilization, "NODES", 6)
-    monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
+    monkeypatch.setattr(nominal, "identify", identify)
+    monkeypatch.setattr(nominal, "NODES", 6)
+    monkeypatch.setattr(nominal, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.02)
     monkeypatch.setattr(rope_rivals, "SMALL", TINY)

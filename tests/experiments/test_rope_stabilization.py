@@ -9,8 +9,9 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.experiments.rope import ablation as rope_ablation
+from palpate.experiments.rope import nominal
 from palpate.experiments.rope import stabilization as rope_stabilization
-from palpate.experiments.rope.stabilization import Size, shipped_policy
+from palpate.experiments.rope.nominal import Size, shipped_policy
 from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy, save_controller
@@ -39,13 +40,14 @@ def calls(monkeypatch):
         made.append(("train", model, training))
         return untrained(6 * (model.nodes - 1), seed)
 
-    for module in (rope_stabilization, rope_ablation):
+    for module in (nominal, rope_stabilization, rope_ablation):
         monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
+    for module in (rope_stabilization, rope_ablation):
         monkeypatch.setattr(module, "QUICK", TINY)
         monkeypatch.setattr(module, "FULL", TINY)
-    monkeypatch.setattr(rope_stabilization, "NODES", 6)
-    monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
-    monkeypatch.setattr(rope_stabilization, "identify", identify)
+    monkeypatch.setattr(nominal, "NODES", 6)
+    monkeypatch.setattr(nominal, "RECORDED_DURATION", 0.2)
+    monkeypatch.setattr(nominal, "identify", identify)
     monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_stabilization, "_left_when_still", lambda *_: figure())
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.05)
@@ -90,7 +92,7 @@ def test_stages_hand_on_what_they_made(calls, tmp_path):
 def test_finished_stages_are_not_done_again(calls, tmp_path, monkeypatch):
     first = rope_stabilization.reproduce(tmp_path, quick=True)
     assert len(calls) == 2
-    monkeypatch.setattr(rope_stabilization, "record_rope", None)
+    monkeypatch.setattr(nominal, "record_rope", None)
     monkeypatch.setattr(rope_evaluation, "run_trials", None)
     second = rope_stabilization.reproduce(tmp_path, quick=True)
     assert len(calls) == 2
@@ -108,8 +110,8 @@ def test_shipped_weights_are_only_evaluated(calls, tmp_path, monkeypatch):
     save_controller(
         tmp_path / "policy.safetensors", untrained(30, 0), {"task": "rope-stabilization"}
     )
-    monkeypatch.setattr(rope_stabilization.resources, "files", lambda _: tmp_path)
-    monkeypatch.setattr(rope_stabilization, "SHIPPED", "policy.safetensors")
+    monkeypatch.setattr(nominal.resources, "files", lambda _: tmp_path)
+    monkeypatch.setattr(nominal, "SHIPPED", "policy.safetensors")
     result = rope_stabilization.reproduce(tmp_path / "out", quick=True, weights="shipped")
     assert calls == []
     assert result.settings["weights"] == "shipped"
@@ -117,7 +119,7 @@ def test_shipped_weights_are_only_evaluated(calls, tmp_path, monkeypatch):
 
 
 def test_missing_shipped_weights_are_named(monkeypatch):
-    monkeypatch.setattr(rope_stabilization, "SHIPPED", "assets/nothing.safetensors")
+    monkeypatch.setattr(nominal, "SHIPPED", "assets/nothing.safetensors")
     with pytest.raises(PalpateError, match=r"no assets/nothing\.safetensors.*without --weights"):
         shipped_policy()
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.experiments.rope import stabilization as rope_stabilization
+from palpate.experiments.rope import nominal
 from palpate.experiments.rope import tracking as rope_tracking
-from palpate.experiments.rope.stabilization import Size
+from palpate.experiments.rope.nominal import Size
 from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
@@ -195,10 +195,10 @@ def test_stages_hand_on_what_they_made(tmp_path, monkeypatch) -> None:
         return untrained(seed)
 
     monkeypatch.setattr(rope_tracking, "BASE", BASE)
-    monkeypatch.setattr(rope_stabilization, "BASE", BASE)
-    monkeypatch.setattr(rope_stabilization, "NODES", 6)
-    monkeypatch.setattr(rope_stabilization, "RECORDED_DURATION", 0.2)
-    monkeypatch.setattr(rope_stabilization, "identify", lambda start, *_: start)
+    monkeypatch.setattr(nominal, "BASE", BASE)
+    monkeypatch.setattr(nominal, "NODES", 6)
+    monkeypatch.setattr(nominal, "RECORDED_DURATION", 0.2)
+    monkeypatch.setattr(nominal, "identify", lambda start, *_: start)
     monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_tracking, "SMALL", TINY)
     monkeypatch.setattr(rope_tracking, "samples_within", lambda *_: (8, 0.001))

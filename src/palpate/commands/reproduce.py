@@ -55,8 +55,8 @@ def compare(result: Result, kept: Result) -> list[str]:
 
     Figures that a clock measured are left out, and one that only one of them has is named.
     """
-    if result.seeds != kept.seeds:
-        return [f"the kept quick run has other seeds, {kept.seeds}: nothing to compare"]
+    if result.seeds[:1] != kept.seeds[:1]:  # the first is the one that was asked for
+        return [f"the kept quick run has the seed {kept.seeds[0]}: there is nothing to compare"]
     before = {figure.name: figure.value for figure in kept.figures}
     now = {figure.name: figure.value for figure in result.figures}
     lines = []

@@ -1,6 +1,186 @@
-"""What every reproduction repeats."""
+"""What every reproduction repeats: its announcement, its stages, its seeds and its result.
+
+    experiment = Experiment("rope-bound", out, quick, seed)
+    experiment.announce({"search": 4})
+    with experiment.stage("search", {"stage": "search", "seed": seed}) as stage:
+        for trial, note in resumable(stage.run, trials, arrays, "searching"):
+            arrays["time"][trial] = ...
+            note(time=...)
+    return experiment.result(figures, settings, split)
+
+A stage is a run in a folder of its own: cut off, it resumes there; finished, it is only read.
+"""
+
+import contextlib
+import dataclasses
+import numbers
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import jax
+import numpy as np
+
+from palpate.runs import Figure, Result, Run
+from palpate.runs.progress import interruptible, progress
+from palpate.runs.result import two_standard_errors
+from palpate.runs.run import RESULT
+from palpate.runs.storage import read_json
+from palpate.trials.rope.trials import wilson_interval
+
+
+@dataclasses.dataclass
+class Stage:
+    """A stage at work: its run, and the `content` that its `result.json` is to have."""
+
+    run: Run
+    content: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def path(self) -> Path:
+        """The folder of the run."""
+        return self.run.path
+
+    @property
+    def finished(self) -> bool:
+        """Whether it was finished before, and is only read now."""
+        return self.run.finished
+
+
+@dataclasses.dataclass
+class Experiment:
+    """One reproduction below the folder `out`, `quick` at a smaller size.
+
+    `seconds` and `seeds` are those that it has spent and used so far, in earlier processes too.
+    """
+
+    name: str
+    out: Path
+    quick: bool
+    seed: int
+    seconds: float = 0.0
+    seeds: list[int] = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        self.seeds = [self.seed]
+
+    @property
+    def command(self) -> str:
+        """The command that repeats it."""
+        return f"palpate reproduce {self.name} --seed {self.seed}{' --quick' * self.quick}"
+
+    def announce(self, minutes: Mapping[str, int]) -> None:
+        """Say how long it will take: `minutes` on two cores that do nothing else, by stage."""
+        parts = ", ".join(f"{stage} {time}" for stage, time in minutes.items())
+        total = sum(minutes.values())
+        print(f"{self.name}: about {total} minutes on two idle cores ({parts})", flush=True)
+
+    def uses(self, first: int, count: int = 1) -> int:
+        """The seed `first` + `seed`, and so many from it on, noted for the result."""
+        self.seeds += range(first + self.seed, first + self.seed + count)
+        return first + self.seed
+
+    @contextlib.contextmanager
+    def stage(self, folder: str, configuration: Mapping[str, Any]) -> Iterator[Stage]:
+        """Open a stage, finish it at the end of the block, and count the seconds that it took.
+
+        Raises `PalpateError` when the folder holds a stage of another configuration.
+        """
+        with Run.open(self.out / folder, configuration) as run:
+            stage = Stage(run)
+            yield stage
+            if not run.finished:
+                about = {"name": f"{self.name} {folder}", "wall_time_s": run.elapsed}
+                run.finish(about | stage.content)
+            self.seconds += read_json(run.path / RESULT).get("wall_time_s", 0.0)
+
+    def found(
+        self, folder: str, configuration: Mapping[str, Any], work: Callable[[], dict[str, Any]]
+    ) -> dict[str, Any]:
+        """What `work` found in a stage of its own, from the stage's `result.json`."""
+        with self.stage(folder, configuration) as stage:
+            if not stage.finished:
+                stage.content = work()
+        return read_json(stage.path / RESULT)
+
+    @contextlib.contextmanager
+    def counted(self) -> Iterator[None]:
+        """Count the seconds of work that is no stage and is done anew in every process."""
+        began = time.monotonic()
+        yield
+        self.seconds += time.monotonic() - began
+
+    def result(
+        self,
+        figures: list[Figure],
+        settings: Mapping[str, Any],
+        split: str | dict[str, Any],
+        seeds: Sequence[int] | None = None,
+    ) -> Result:
+        """The experiment's result; `seeds` are those noted, or the ones given."""
+        seeds = list(dict.fromkeys(self.seeds if seeds is None else seeds))
+        settings = {"quick": self.quick, **settings}
+        return Result(self.name, figures, settings, seeds, split, self.seconds)
+
+
+def resumable(
+    run: Run, items: Sequence[Any], arrays: Any, label: str
+) -> Iterator[tuple[Any, Callable[..., None]]]:
+    """Go through `items` from where the run was cut off; `arrays` are saved after each.
+
+    `arrays` is a tree of NumPy arrays to be written on; what was saved is put into them first. With
+    each item comes a function that notes numbers for it, beside the bar and in the run's metrics.
+    """
+    done, kept = run.restore(arrays) or (0, arrays)
+    jax.tree.map(np.copyto, arrays, kept)
+    bar = progress(items[done:], label, done=done)
+    with interruptible() as stop:
+        for step, item in enumerate(bar, done + 1):
+            noted: dict[str, Any] = {}
+            yield item, noted.update
+            bar.show(**{n: v for n, v in noted.items() if isinstance(v, numbers.Real)})
+            if noted:
+                run.log(step, **noted)
+            run.save(step, arrays)
+            if stop:
+                break
+
+
+# --- figures ----------------------------------------------------------------------------------
 
 
 def suffix(label: str) -> str:
     """What is said to a person, "MPPI 10 ms", as it stands in a figure's name: mppi_10_ms."""
-    return label.lower().replace(" ", "_")
+    return label.lower().replace(", ", ".").replace(" ", "_")
+
+
+def ratio(own: float | None, other: float | None) -> float | None:
+    """Of two figures; None where one is not known."""
+    return None if own is None or other is None else own / other
+
+
+def mean_of(name: str, values: Iterable[SupportsFloat], unit: str = "", **held: Any) -> Figure:
+    """The mean of independent values with two standard errors as its spread."""
+    numbers = [float(value) for value in values]
+    spread = two_standard_errors(numbers)
+    return Figure(name, sum(numbers) / len(numbers), unit, spread=spread, **held)
+
+
+def share_of(name: str, successes: int, count: int, **held: Any) -> Figure:
+    """A success rate; its spread is the wider side of Wilson's 95 % interval. None of nothing."""
+    held = {"better": "higher", **held}
+    if not count:
+        return Figure(name, None, "", **held)
+    low, high = wilson_interval(successes, count)
+    share = successes / count
+    return Figure(name, share, "", spread=max(share - low, high - share), **held)
+
+
+def decision_figures(times: Mapping[str, Sequence[float]]) -> list[Figure]:
+    """Median and 99th percentile of how long planners take to decide, ms."""
+    return [
+        Figure(f"decision_ms_{kind}.{suffix(name)}", value, "ms")
+        for name, both in times.items()
+        for kind, value in zip(("median", "p99"), both, strict=True)
+    ]

@@ -4,6 +4,9 @@ Simulation-based calibration: hundreds of times, the 14 parameters of a body on 
 from the prior, four pushes are simulated and seen with a camera's noise, and the posterior given
 them is sampled as that of any recording is. The true values' ranks among the draws are uniform if
 all is well. The same with a likelihood whose sigma is 1.5 times the noise has to fail.
+
+The likelihood is told the noise, whose scale a user's fit has to infer, and the priors are narrower
+than those of a user's fit: see `PRIORS`.
 """
 
 import dataclasses
@@ -14,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.experiments.experiment import Experiment, resumable
 from palpate.identification.posterior.calibration import (
     Problem,
     histogram,
@@ -26,9 +30,6 @@ from palpate.models.planar.shapes import rectangle
 from palpate.parameters import LogNormal, Normal, declare
 from palpate.report.posterior_chart import rank_figure
 from palpate.runs import Figure, Result, Run
-from palpate.runs.progress import interruptible, progress
-from palpate.runs.run import RESULT
-from palpate.runs.storage import read_json
 
 NAME = "calibration"
 BAR = 0.0035  # the smallest of 14 p-values lies below it in 5 % of calibrated runs
@@ -70,8 +71,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
     Raises `PalpateError` when `out` holds another run.
     """
-    size = QUICK if quick else FULL
-    print(f"{NAME}: about {size.minutes} minutes on two cores", flush=True)
+    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    experiment.announce({"posteriors": size.minutes})
     configuration = {
         "stage": "simulations",
         "seed": seed,
@@ -79,11 +80,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         "bins": size.bins,
         **constants(),
     }
-    with Run.open(out / "simulations", configuration) as run:
-        found, names = calibrated(size, seed, run)
-        if not run.finished:
-            run.finish({"name": f"{NAME} simulations", "wall_time_s": run.elapsed})
-        spent = read_json(run.path / RESULT)["wall_time_s"]
+    with experiment.stage("simulations", configuration) as stage:
+        found, names = calibrated(size, seed, stage.run)
     ranks = found["rank"]
     values = [p_values(each, DRAWS, size.bins) for each in ranks]
     labels = ("right sigma", f"sigma {WRONG:g} times too large")
@@ -93,8 +91,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     rank_figure(out / FIGURE, names, counts)
     for name, right, wrong in zip(names, *values, strict=True):
         print(f"{name:28} p {right:.3g} | with the wrong sigma {wrong:.3g}")
-    return Result(
-        NAME,
+    return experiment.result(
         [
             Figure("p_min", float(values[0].min()), "", BAR, "higher"),
             Figure("p_min_wrong_sigma", float(values[1].min()), "", BAR, "lower"),
@@ -104,17 +101,16 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             Figure("rhat_max", float(found["rhat"].max()), "", None, "lower"),
         ],
         {
-            "quick": quick,
             "sampler": "that of `palpate identify furniture`",
+            "noise scale": "known to the likelihood; a user's fit infers it",
+            "priors": "narrower than the declared ones of a user's fit",
             "draws": DRAWS,
             "bins": size.bins,
             "p": dict(zip(names, values[0].tolist(), strict=True)),
             "p_wrong_sigma": dict(zip(names, values[1].tolist(), strict=True)),
             **constants(),
         },
-        [seed],
         "parameters and motions are drawn anew for each simulation; nothing is fitted beforehand",
-        spent,
     )
 
 
@@ -157,21 +153,13 @@ def calibrated(size: Size, seed: int, run: Run) -> tuple[dict[str, np.ndarray], 
     batches = size.simulations // BATCH
     none = np.zeros((2, size.simulations, len(names)), np.float32)
     done = {"rank": none.astype(np.int32), "size": none, "rhat": none.copy()}
-    step, done = run.restore(done) or (0, done)
-    if run.finished:
-        return done, names
-    with interruptible() as stop:
-        steps = range(step + 1, 2 * batches + 1)
-        for batch in progress(steps, "batches of posteriors", done=step):
-            which, index = divmod(batch - 1, batches)
-            # The same parameters and noise for both: only the likelihood differs.
-            key = jax.random.fold_in(jax.random.key(seed), index)
-            found = ranks_of(problems[which], key, BATCH, DRAWS)
-            rows = slice(index * BATCH, (index + 1) * BATCH)
-            for name, values in done.items():
-                values[which, rows] = getattr(found, name)
-            run.log(batch, ess_median=float(np.median(found.size)), rhat=float(found.rhat.max()))
-            run.save(batch, done)
-            if stop:
-                break
+    for batch, note in resumable(run, range(2 * batches), done, "batches of posteriors"):
+        which, index = divmod(batch, batches)
+        # The same parameters and noise for both: only the likelihood differs.
+        key = jax.random.fold_in(jax.random.key(seed), index)
+        found = ranks_of(problems[which], key, BATCH, DRAWS)
+        rows = slice(index * BATCH, (index + 1) * BATCH)
+        for name, values in done.items():
+            values[which, rows] = getattr(found, name)
+        note(ess_median=float(np.median(found.size)), rhat=float(found.rhat.max()))
     return done, names

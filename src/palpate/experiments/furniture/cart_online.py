@@ -10,22 +10,21 @@ on: MuJoCo itself as the planner's model would take hours.
 All plan by the same MPPI with the same samples, on the same seeds: the same hidden parameters and
 starts.
 
-Each task is a run in a folder below `out`, and resumes with the agent and world where it was cut.
+The hand's force on the cart task's table was raised from 50 to 120 N after the first fits: see
+`palpate.tasks.furniture.cart`.
 """
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from palpate.experiments.experiment import suffix
-from palpate.experiments.rope.stabilization import announce, finish, wall_time
+from palpate.experiments.experiment import Experiment, mean_of, resumable, suffix
+from palpate.experiments.picture import band, canvas_of, curve, legend_of, save_picture
 from palpate.report.style import STYLES
-from palpate.runs import Figure, Result, Run
+from palpate.runs import Figure, Result
 from palpate.runs.progress import progress
 from palpate.runs.result import two_standard_errors
-from palpate.runs.storage import write_bytes
 from palpate.tasks.furniture.cart import DECISION, CartTask, apartment, shopping_cart
 from palpate.trials.furniture.cart_agents import Agent, Knowing, PhysicsAgent, RegressionAgent
 from palpate.trials.furniture.cart_trials import (
@@ -67,20 +66,17 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
     Raises `PalpateError` when `out` holds another run's stages.
     """
-    size = "quick" if quick else "full"
-    announce(NAME, {"cart": 4, "apartment": 8} if quick else {"cart": 25, "apartment": 40})
+    experiment, size = Experiment(NAME, out, quick, seed), "quick" if quick else "full"
+    experiment.announce({"cart": 4, "apartment": 8} if quick else {"cart": 25, "apartment": 40})
     seeds = [EVALUATION_SEEDS + 10 * seed + world for world in range(WORLDS[size])]
-    earned, spent = {}, 0.0
+    earned = {}
     for name in TASKS:
-        earned[name], took = _earned(out / name, name, seeds, DECISIONS[size])
-        spent += took
+        earned[name] = _earned(experiment, name, seeds, DECISIONS[size])
         print("\n".join(_lines(name, earned[name])), flush=True)
     draw(out / "curves.png", earned)
-    return Result(
-        NAME,
+    return experiment.result(
         [figure for name, rewards in earned.items() for figure in figures(name, rewards)],
         {
-            "quick": quick,
             "decisions": DECISIONS[size],
             "decision_s": DECISION,
             "planning": {name: vars(options) for name, options in PLANNING.items()},
@@ -93,7 +89,6 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "LWR and OO-LWR": "velocity and wrench in each piece's own axes, one regression for "
             "each piece; bandwidth and ridge by leave-one-out",
         },
-        seeds,
         {
             "chosen on": "worlds of seeds 1 to 14; the cart in 985000, 986000, 986001 and 987000 "
             "to 987004, the apartment in 988004 and 989001, where TRUE or PBRL fell short, before "
@@ -101,34 +96,31 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "evaluated": f"worlds of seeds {seeds[0]} to {seeds[-1]}: all agents begin in each "
             "without data, TRUE with its models",
         },
-        spent,
+        seeds,
     )
 
 
-def _earned(path: Path, name: str, seeds: list[int], decisions: int) -> tuple[Rewards, float]:
-    """What every agent earned in every world, and the seconds that took."""
+def _earned(experiment: Experiment, name: str, seeds: list[int], decisions: int) -> Rewards:
+    """What every agent earned in every world, in a stage."""
     configuration = {
         "stage": name,
         "seeds": seeds,
         "decisions": decisions,
         "planning": vars(PLANNING[name]),
     }
-    with Run.open(path, configuration) as run:
-        empty = {"rewards": np.zeros((len(seeds), len(AGENTS), decisions), np.float32)}
-        done, kept = run.restore(empty) or (0, empty)
-        rewards = np.array(kept["rewards"])
-        works = [(world, agent) for world in range(len(seeds)) for agent in range(len(AGENTS))]
-        for number, (world, agent) in enumerate(works[done:], start=done + 1):
+    shape = len(seeds), len(AGENTS), decisions
+    rewards = np.zeros(shape, np.float32)
+    grid = [(world, agent) for world in range(len(seeds)) for agent in range(len(AGENTS))]
+    with experiment.stage(name, configuration) as stage:
+        for (world, agent), _ in resumable(stage.run, grid, {"rewards": rewards}, name):
             rewards[world, agent] = _work(name, AGENTS[agent], seeds[world], decisions)
-            run.save(number, {"rewards": rewards})
         earned = {agent: rewards[:, index] for index, agent in enumerate(AGENTS)}
-        if not run.finished:
+        if not stage.finished:
             for step in range(SMOOTHED, decisions + 1, SMOOTHED):
                 block = slice(step - SMOOTHED, step)
                 means = {a: -float(rows[:, block].mean()) for a, rows in earned.items()}
-                run.log(step, **{f"{agent} loss": value for agent, value in means.items()})
-            finish(run, NAME, name, {})
-        return earned, wall_time(run)
+                stage.run.log(step, **{f"{agent} loss": loss for agent, loss in means.items()})
+    return earned
 
 
 def _work(name: str, who: str, seed: int, decisions: int) -> np.ndarray:
@@ -164,25 +156,17 @@ def figures(name: str, rewards: Rewards) -> list[Figure]:
     """The task's regret against its bar, that of the others, and what everybody earned."""
     later = slice(FROM, None)
     own, rival = regret(rewards, PBRL, later), regret(rewards, OO_LWR, later)
+    first = float(regret(rewards, PBRL, slice(FROM)).mean())
+    theirs = float(regret(rewards, OO_LWR, slice(FROM)).mean())
     rows = [
-        Figure(
-            f"{name}.regret",
-            float(own.mean()),
-            "",
-            bar=BAR,
+        mean_of(
+            f"{name}.regret", own, bar=BAR, rival=float(rival.mean()),
             seed_document="PBRL close to TRUE after few steps",
-            rival=float(rival.mean()),
-            spread=two_standard_errors(own),
         ),
         # TRUE may fall short too, and a mean would hide where PBRL does
         Figure(f"{name}.regret_worst_world", float(own.max()), "", rival=float(rival.max())),
-        Figure(
-            f"{name}.regret_first_{FROM}",
-            float(regret(rewards, PBRL, slice(FROM)).mean()),
-            "",
-            rival=float(regret(rewards, OO_LWR, slice(FROM)).mean()),
-        ),
-    ]
+        Figure(f"{name}.regret_first_{FROM}", first, "", rival=theirs),
+    ]  # fmt: skip
     for agent in (OO_LWR, LWR, NOTHING):
         value = float(regret(rewards, agent, later).mean())
         rows.append(Figure(f"{name}.regret.{suffix(agent)}", value, ""))
@@ -207,9 +191,7 @@ def draw(path: Path, earned: dict[str, Rewards]) -> None:
     A point is the mean over an episode and the worlds, at the episode's end; bands are two standard
     errors of the mean over the worlds either way.
     """
-    from matplotlib.figure import Figure as Canvas
-
-    canvas = Canvas(figsize=(10, 4.2), layout="constrained")
+    canvas = canvas_of(10, 4.2)
     axes = np.atleast_1d(canvas.subplots(1, len(earned)))
     for axis, (name, rewards) in zip(axes, earned.items(), strict=True):
         task = TASKS[name]()
@@ -220,18 +202,10 @@ def draw(path: Path, earned: dict[str, Rewards]) -> None:
             ends = decisions / episodes.shape[1] * np.arange(1, episodes.shape[1] + 1)
             middle = episodes.mean(axis=0)
             error = np.array([two_standard_errors(of) or 0.0 for of in episodes.T])
-            axis.fill_between(
-                ends, middle - error, middle + error, color=style.light, alpha=0.15, lw=0
-            )
-            axis.plot(
-                ends, middle, label=agent, color=style.light,
-                ls=style.linestyle, lw=style.width, marker=style.marker, ms=4,
-            )  # fmt: skip
+            band(axis, ends, middle - error, middle + error, style)
+            curve(axis, ends, middle, style, agent)
         axis.set(title=f"{name}, {task.episode} decisions an episode", xlabel="decisions")
         axis.set_xlim(left=0)
     axes[0].set_ylabel("mean reward of an episode's decisions (m)")
-    lines, names = axes[0].get_legend_handles_labels()
-    canvas.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False)
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())
+    legend_of(canvas, axes[0], "lower center")
+    save_picture(path, canvas)

@@ -5,8 +5,6 @@ deck, then generated rooms whose goal lies in another free region than the start
 are given to four planners that share search and execution (see `namo_episode`): ours, which learns
 how each piece moves from the contacts; one that is told; one that takes everything to be movable
 and never learns; and the thresholded movable flag of Levihn, Scholz and Stilman (ICRA 2013).
-
-A row for each room is kept in a run folder, and the work resumes after the last one.
 """
 
 import statistics
@@ -16,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from palpate.experiments.experiment import Experiment, resumable, share_of
 from palpate.families.furniture.plan_picture import plan_picture, scene_animation
 from palpate.planning.movable_obstacles.motion.primitives import FREE, Constraint
-from palpate.planning.movable_obstacles.search.plan import timed
-from palpate.runs import Figure, Result, Run
-from palpate.runs.progress import interruptible, progress
+from palpate.runs import Figure, Result
 from palpate.runs.run import read_metrics
 from palpate.trials.furniture import rooms as namo_rooms
 from palpate.trials.furniture.namo_episode import (
@@ -42,7 +39,6 @@ from palpate.trials.furniture.namo_episode import (
 )
 from palpate.trials.furniture.namo_execution import FORCE
 from palpate.trials.furniture.rooms import Room, generated_room, scenes
-from palpate.trials.rope.trials import wilson_interval
 
 NAME = "namo-online"
 SOLVED_BAR, ALL_MOVABLE_BAR = 0.95, 0.60
@@ -68,43 +64,29 @@ def planners(room: Room) -> dict[str, Callable[[], Opinion]]:
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     """Scenes, then rooms; `quick` is fewer rooms."""
-    count = ROOMS["quick" if quick else "full"]
+    experiment, count = Experiment(NAME, out, quick, seed), ROOMS["quick" if quick else "full"]
     first = SEEDS + 1000 * seed
-    minutes = 2 if quick else 12
-    print(
-        f"{NAME}: 4 scenes and {count} rooms, 4 planners each, about {minutes} minutes", flush=True
-    )
-    began = timed()
-    shown = {name: scene_outcome(out, name, room) for name, room in scenes().items()}
-    scenes_s = timed() - began
+    experiment.announce({"scenes": 1, f"{count} rooms, 4 planners each": 1 if quick else 11})
+    with experiment.counted():
+        shown = {name: scene_outcome(out, name, room) for name, room in scenes().items()}
     settings = configuration(first, count)
-    rows = outcomes(out, first, count, settings)
-    return Result(
-        NAME,
+    rows = outcomes(experiment, first, count, settings)
+    return experiment.result(
         figures(rows, shown),
-        settings | {"quick": quick},
-        list(range(first, first + count)),
+        settings,
         "nothing is fitted beforehand; every room's constants are drawn by its own seed, and "
         "development used rooms of seeds below 3000",
-        scenes_s + rows[-1]["time"],  # that of earlier processes included
+        range(first, first + count),
     )
 
 
 def configuration(first: int, count: int) -> dict[str, Any]:
     """All that the outcome depends on."""
     constants = (
-        "WIDTH",
-        "DEPTH",
-        "DOOR",
-        "DOORS",
-        "LENGTHS",
-        "DEPTHS",
-        "CLUTTER",
-        "TEMPTING",
-        "SHORTER",
+        *("WIDTH", "DEPTH", "DOOR", "DOORS", "LENGTHS", "DEPTHS", "CLUTTER", "TEMPTING", "SHORTER"),
+        *("OTHERS", "REST", "CONSTRAINED_ONLY", "HEAVY", "LIGHT", "RUBBER", "FELT"),
+        *("RADIUS", "MARGIN", "CELL"),
     )
-    constants += ("OTHERS", "REST", "CONSTRAINED_ONLY", "HEAVY", "LIGHT", "RUBBER", "FELT")
-    constants += ("RADIUS", "MARGIN", "CELL")
     return {
         "first_seed": first,
         "rooms": count,
@@ -119,19 +101,15 @@ def configuration(first: int, count: int) -> dict[str, Any]:
     }
 
 
-def outcomes(out: Path, first: int, count: int, settings: Mapping[str, Any]) -> list[dict]:
+def outcomes(
+    experiment: Experiment, first: int, count: int, settings: Mapping[str, Any]
+) -> list[dict]:
     """One row for each room, done or read back."""
-    with Run.open(out / "rooms", dict(settings)) as run:
-        if not run.finished:
-            done, _ = run.restore(np.zeros(1)) or (0, None)
-            with interruptible() as stop:
-                for step in progress(range(done + 1, count + 1), "rooms", done=done):
-                    run.log(step, **room_row(out, generated_room(first + step - 1), step))
-                    run.save(step, np.full(1, float(step)))
-                    if stop:
-                        raise KeyboardInterrupt
-            run.finish({"rooms": count})
-        return read_metrics(run.path)
+    with experiment.stage("rooms", settings) as stage:
+        steps = () if stage.finished else range(1, count + 1)
+        for step, note in resumable(stage.run, steps, np.zeros(1), "rooms"):
+            note(**room_row(experiment.out, generated_room(first + step - 1), step))
+    return read_metrics(stage.path)
 
 
 def room_row(out: Path, room: Room, step: int) -> dict[str, Any]:
@@ -193,26 +171,21 @@ def figures(rows: list[dict], shown: Mapping[str, Mapping[str, Any]]) -> list[Fi
     """What is held against the bars, then what each planner needed, then the scenes."""
     solvable = [row for row in rows if row[TOLD]["reached"]]
     ours = [row for row in solvable if row[OURS]["reached"]]
-    share, spread = _share(len(ours), len(solvable))
-    rates = {name: _rate(rows, name) for name in (OURS, TOLD, ALL, FLAG)}
     flag = [row for row in solvable if row[FLAG]["reached"]]
+    rates = {
+        name: (sum(row[name]["reached"] for row in rows), len(rows)) for name in (TOLD, FLAG, OURS)
+    }
+    believing = sum(row[ALL]["reached"] for row in rows)
     found = [
-        Figure(
-            "success_of_solvable",
-            share,
-            "",
-            bar=SOLVED_BAR,
-            better="higher",
-            rival=_share(len(flag), len(solvable))[0],
-            spread=spread,
+        share_of(
+            "success_of_solvable", len(ours), len(solvable), bar=SOLVED_BAR,
+            rival=share_of("", len(flag), len(solvable)).value,
         ),
-        Figure(
-            "success_rate_all_movable", rates[ALL][0], "", ALL_MOVABLE_BAR, spread=rates[ALL][1]
+        share_of(
+            "success_rate_all_movable", believing, len(rows), bar=ALL_MOVABLE_BAR, better="lower"
         ),
-    ]
-    for name in (TOLD, FLAG, OURS):
-        rate, wide = rates[name]
-        found.append(Figure(f"success_rate_{name}", rate, "", better="higher", spread=wide))
+        *(share_of(f"success_rate_{name}", *rate) for name, rate in rates.items()),
+    ]  # fmt: skip
     found.append(Figure("rooms", len(rows), "", better="higher"))
     for name in (OURS, TOLD, ALL, FLAG):
         reached = [row[name] for row in rows if row[name]["reached"]]
@@ -225,16 +198,3 @@ def figures(rows: list[dict], shown: Mapping[str, Mapping[str, Any]]) -> list[Fi
         found.append(Figure(f"{key}.time", outcome["time"], "s"))
         found.append(Figure(f"{key}.failures", outcome["failures"], ""))
     return found
-
-
-def _rate(rows: list[dict], name: str) -> tuple[float | None, float | None]:
-    return _share(sum(row[name]["reached"] for row in rows), len(rows))
-
-
-def _share(successes: int, count: int) -> tuple[float | None, float | None]:
-    """A share and the half-width of Wilson's interval on its wider side; None of nothing."""
-    if not count:
-        return None, None
-    low, high = wilson_interval(successes, count)
-    share = successes / count
-    return share, max(share - low, high - share)

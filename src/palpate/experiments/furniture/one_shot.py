@@ -5,19 +5,17 @@ palpate finds out what a piece most probably is (on a wheel, on feet, hinged, bo
 the posterior of its parameters, and predicts pushes of two seconds open loop. Beside it regressions
 after 1 to 100 samples, mujoco.sysid which is told the structure, other samplers of the same
 posterior, and five pieces in one scene fitted jointly.
-
-Each stage is a run in a folder below `out`, and resumes there.
 """
 
 import dataclasses
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from palpate.experiments.experiment import Experiment
 from palpate.experiments.furniture.one_shot_figure import shares_figure
 from palpate.experiments.furniture.one_shot_pieces import (
     BOLTED,
@@ -37,15 +35,13 @@ from palpate.experiments.furniture.one_shot_regression import OURS, RIVALS, SIZE
 from palpate.experiments.furniture.one_shot_sampling import OURS as SAMPLER
 from palpate.experiments.furniture.one_shot_sampling import Pace, race
 from palpate.experiments.rivals import mujoco_sysid as one_shot_sysid
-from palpate.experiments.rope.stabilization import announce, finish
 from palpate.families.furniture.recording import POSE, WRENCH, starting_furniture
 from palpate.identification.posterior.comparison import posterior_of
-from palpate.identification.posterior.posterior import sample
-from palpate.runs import Figure, Result, Run
+from palpate.identification.posterior.posterior import Posterior, sample
+from palpate.recordings import Recording
+from palpate.runs import Figure, Result
 from palpate.runs.progress import progress
 from palpate.runs.result import two_standard_errors
-from palpate.runs.run import RESULT
-from palpate.runs.storage import read_json
 from palpate.worlds.furniture.furniture import FurnitureWorld
 from palpate.worlds.furniture.pieces import KINDS, Piece
 
@@ -81,171 +77,166 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
     Raises `PalpateError` when `out` holds another run's stages.
     """
-    size = QUICK if quick else FULL
-    announce(NAME, size.minutes)
+    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    experiment.announce(size.minutes)
     one_shot_sysid.mujoco_sysid()  # an hour later would be late to say that it is missing
     movable = ("cart", "couch") if quick else MOVABLE
     first = SEEDS + 1000 * seed
+    work = _Work(experiment, size)
     pieces = {
-        kind: [_piece(out, kind, first + number, size) for number in range(size.pieces)]
+        kind: [work.piece(kind, first + number) for number in range(size.pieces)]
         for kind in progress((*movable, BOLTED), "handling, identifying and pushing")
     }
-    compared = {
-        kind: _compared(out, kind, first, size) for kind in progress(movable, "sample sizes")
-    }
-    told = {kind: _told(out, kind, first, size) for kind in progress(movable, "mujoco.sysid")}
-    raced = _raced(out, first, size)
-    joint = None if quick else _joint(out, first, size)
-    stages = [stage for of in pieces.values() for stage in of]
-    stages += [*compared.values(), *told.values(), raced, *([joint] if joint else [])]
+    compared = {kind: work.compared(kind, first) for kind in progress(movable, "sample sizes")}
+    sysid = {kind: work.sysid(kind, first) for kind in progress(movable, "mujoco.sysid")}
+    raced = work.raced(first)
+    joint = None if quick else work.joint(first)
     shares_figure(out / FIGURE, compared)
-    return Result(
-        NAME,
-        _figures(pieces, compared, told, raced, joint, first),
+    return experiment.result(
+        _figures(pieces, compared, sysid, raced, joint, first),
         {
-            "quick": quick,
             "handled_s": HANDLED,
             "sizes": SIZES,
+            "raced": f"the {RACED} of seed {first}; chains and leaps were tuned on that of {SEEDS}",
             **{name: value for name, value in vars(size).items() if name != "minutes"},
         },
-        [seed],
         {
             "fitted": f"{HANDLED:g} s of handling of each piece, seeds from {first}",
             "evaluated": f"{size.pushes} pushes of 2 s of the same pieces from rest",
         },
-        sum(stage["wall_time_s"] for stage in stages),
+        [seed, *range(first, first + size.pieces)],
     )
 
 
-def _stage(path: Path, configuration: dict[str, Any], work: Callable[[], dict]) -> dict[str, Any]:
-    """What a stage found, from its run if that is finished."""
-    with Run.open(path, configuration) as run:
-        if not run.finished:
-            finish(run, NAME, path.name, work())
-    return read_json(path / RESULT)
+@dataclasses.dataclass(frozen=True)
+class _Work:
+    """The stages, each found once: see `Experiment.found`."""
+
+    experiment: Experiment
+    size: Size
+
+    def piece(self, kind: str, seed: int) -> dict[str, Any]:
+        """One piece: its structure and posterior, and what they say of pushes."""
+        size = self.size
+
+        def work() -> dict[str, Any]:
+            handled, pushes = recordings(kind, seed, size.pushes)
+            found, seconds = fit(handled, size.draws, seed)
+            return {
+                **_judged(found.posterior, pushes),
+                "structure": found.structure,
+                "probability": found.probability,
+                "divergences": found.posterior.draws.divergences,
+                "fit_s": seconds,
+            }
+
+        about = {"stage": "piece", "kind": kind, "seed": seed, "pushes": size.pushes}
+        return self.experiment.found(f"{kind}-{seed}", about | {"draws": size.draws}, work)
+
+    def compared(self, kind: str, seed: int) -> dict[str, Any]:
+        """One piece after growing numbers of samples, beside regressions."""
+        size = self.size
+
+        def work() -> dict[str, Any]:
+            handled, pushes = recordings(kind, seed, size.pushes)
+            found = shares(handled, pushes, size.compared_draws, seed)
+            by_size = {name: {str(n): v for n, v in of.items()} for name, of in found.items()}
+            return {"shares": by_size}
+
+        about = {"stage": "samples", "kind": kind, "seed": seed, "pushes": size.pushes}
+        about["draws"] = size.compared_draws
+        return self.experiment.found(f"samples-{kind}", about, work)
+
+    def sysid(self, kind: str, seed: int) -> dict[str, Any]:
+        """mujoco.sysid, given all but constants, on the first piece of a kind it can be fitted to.
+
+        It needs to know where free casters point, which some handling does not show.
+        """
+
+        def work() -> dict[str, Any]:
+            refused = {}
+            for piece in range(seed, seed + self.size.pieces):
+                try:
+                    return {**_fitted_by_sysid(kind, piece, self.size.pushes), "refused": refused}
+                except one_shot_sysid.CastersUnknownError as error:
+                    refused[str(piece)] = str(error)
+            return {"error_m": [], "displacement_m": [], "refused": refused}
+
+        about = {"stage": "sysid", "kind": kind, "seed": seed, "pushes": self.size.pushes}
+        return self.experiment.found(f"sysid-{kind}", about, work)
+
+    def raced(self, seed: int) -> dict[str, Any]:
+        """The samplers on the posterior of a couch.
+
+        Ours is timed as a user waits for it: search for modes, compiling, warm-up and draws.
+        """
+        size = self.size
+
+        def work() -> dict[str, Any]:
+            handled, _ = recordings(RACED, seed, 1)
+            model = starting_furniture(handled, PERIOD)
+            target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
+            jax.clear_caches()  # what the pieces have compiled would not be there for a user
+            began = time.monotonic()
+            posterior = sample(target, draws=size.raced_draws, seed=seed)
+            spent = time.monotonic() - began
+            paces = race(posterior, seed, size.budget)
+            return {
+                "free_parameters": posterior.target.parameters,
+                "posterior_s": spent,
+                "compiling_s": posterior.draws.compiling,
+                "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
+            }
+
+        about = {"stage": "samplers", "kind": RACED, "seed": seed, "draws": size.raced_draws}
+        return self.experiment.found("samplers", about | {"budget_s": size.budget}, work)
+
+    def joint(self, seed: int) -> dict[str, Any]:
+        """Five pieces in one scene, fitted together from ten seconds in which all are handled."""
+        size = self.size
+
+        def work() -> dict[str, Any]:
+            handled, pushes = scene(seed, size.scene_pushes)
+            return _judged(fit_jointly(handled, size.scene_draws, seed), pushes)
+
+        about = {"stage": "scene", "kinds": SCENE, "seed": seed, "pushes": size.scene_pushes}
+        return self.experiment.found("scene", about | {"draws": size.scene_draws}, work)
 
 
-def _piece(out: Path, kind: str, seed: int, size: Size) -> dict[str, Any]:
-    """One piece: its structure and posterior, and what they say of pushes."""
-
-    def work() -> dict[str, Any]:
-        handled, pushes = recordings(kind, seed, size.pushes)
-        found, seconds = fit(handled, size.draws, seed)
-        model = found.posterior.target.coordinates.reference
-        asked = pushes_of(pushes, model)
-        result = judged(model, found.posterior.predict(asked), asked)
-        return {
-            **result.to_dict(),
-            "structure": found.structure,
-            "probability": found.probability,
-            "rhat": found.posterior.rhat_of_predictions,
-            "ess": found.posterior.size_of_predictions,
-            "divergences": found.posterior.draws.divergences,
-            "fit_s": seconds,
-            "sampling_s": found.posterior.draws.seconds,
-        }
-
-    stage = {"stage": "piece", "kind": kind, "seed": seed, "pushes": size.pushes}
-    return _stage(out / f"{kind}-{seed}", stage | {"draws": size.draws}, work)
+def _judged(posterior: Posterior, pushes: Recording) -> dict[str, Any]:
+    """What a posterior says of pushes, and how far its draws are to be trusted."""
+    model = posterior.target.coordinates.reference
+    asked = pushes_of(pushes, model)
+    return {
+        **judged(model, posterior.predict(asked), asked).to_dict(),
+        "rhat": posterior.rhat_of_predictions,
+        "ess": posterior.size_of_predictions,
+        "sampling_s": posterior.draws.seconds,
+    }
 
 
-def _compared(out: Path, kind: str, seed: int, size: Size) -> dict[str, Any]:
-    """One piece after growing numbers of samples, beside regressions."""
-
-    def work() -> dict[str, Any]:
-        handled, pushes = recordings(kind, seed, size.pushes)
-        found = shares(handled, pushes, size.compared_draws, seed)
-        return {"shares": {name: {str(n): v for n, v in of.items()} for name, of in found.items()}}
-
-    stage = {"stage": "samples", "kind": kind, "seed": seed, "pushes": size.pushes}
-    return _stage(out / f"samples-{kind}", stage | {"draws": size.compared_draws}, work)
-
-
-def _told(out: Path, kind: str, seed: int, size: Size) -> dict[str, Any]:
-    """mujoco.sysid, told all but constants, on the first piece of a kind that it can be fitted to.
-
-    It needs to know where free casters point, which some handling does not show.
-    """
-
-    def fitted_to(piece: int) -> dict[str, Any]:
-        handled, pushes = recordings(kind, piece, size.pushes)
-        world = FurnitureWorld([Piece(kind)])
-        world.reset(piece)
-        truth = world.truth().parameters[0]
-        fitted = one_shot_sysid.fit_scene(handled, KINDS[kind], truth.locked, truth.anchor, piece)
-        asked = pushes_of(pushes, starting_furniture(handled, PERIOD))
-        motion = one_shot_sysid.predict_pieces(fitted, asked)
-        target, start = np.asarray(asked.target), np.asarray(asked.pose)
-        return {
-            "error_m": np.linalg.norm((motion - target)[:, -1, 0, :2], axis=-1).tolist(),
-            "displacement_m": np.linalg.norm((target[:, -1] - start)[:, 0, :2], axis=-1).tolist(),
-            "converged": fitted.converged,
-            "piece": piece,
-        }
-
-    def work() -> dict[str, Any]:
-        refused = {}
-        for piece in range(seed, seed + size.pieces):
-            try:
-                return {**fitted_to(piece), "refused": refused}
-            except one_shot_sysid.CastersUnknownError as error:
-                refused[str(piece)] = str(error)
-        return {"error_m": [], "displacement_m": [], "refused": refused}
-
-    stage = {"stage": "sysid", "kind": kind, "seed": seed, "pushes": size.pushes}
-    return _stage(out / f"sysid-{kind}", stage, work)
-
-
-def _raced(out: Path, seed: int, size: Size) -> dict[str, Any]:
-    """The samplers on the posterior of a couch.
-
-    Ours is timed as a user waits for it: search for modes, compiling, warm-up and draws.
-    """
-
-    def work() -> dict[str, Any]:
-        handled, _ = recordings(RACED, seed, 1)
-        model = starting_furniture(handled, PERIOD)
-        target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
-        jax.clear_caches()  # what the pieces have compiled would not be there for a user
-        began = time.monotonic()
-        posterior = sample(target, draws=size.raced_draws, seed=seed)
-        spent = time.monotonic() - began
-        paces = race(posterior, seed, size.budget)
-        return {
-            "free_parameters": posterior.target.parameters,
-            "posterior_s": spent,
-            "compiling_s": posterior.draws.compiling,
-            "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
-        }
-
-    stage = {"stage": "samplers", "kind": RACED, "seed": seed, "draws": size.raced_draws}
-    return _stage(out / "samplers", stage | {"budget_s": size.budget}, work)
-
-
-def _joint(out: Path, seed: int, size: Size) -> dict[str, Any]:
-    """Five pieces in one scene, fitted together from ten seconds in which all are handled."""
-
-    def work() -> dict[str, Any]:
-        handled, pushes = scene(seed, size.scene_pushes)
-        posterior = fit_jointly(handled, size.scene_draws, seed)
-        model = posterior.target.coordinates.reference
-        asked = pushes_of(pushes, model)
-        result = judged(model, posterior.predict(asked), asked)
-        return {
-            **result.to_dict(),
-            "rhat": posterior.rhat_of_predictions,
-            "ess": posterior.size_of_predictions,
-            "sampling_s": posterior.draws.seconds,
-        }
-
-    stage = {"stage": "scene", "kinds": SCENE, "seed": seed, "pushes": size.scene_pushes}
-    return _stage(out / "scene", stage | {"draws": size.scene_draws}, work)
+def _fitted_by_sysid(kind: str, seed: int, pushes: int) -> dict[str, Any]:
+    """What mujoco.sysid says of the pushes of one piece, whose structure it is given."""
+    handled, pushed = recordings(kind, seed, pushes)
+    world = FurnitureWorld([Piece(kind)])
+    world.reset(seed)
+    truth = world.truth().parameters[0]
+    fitted = one_shot_sysid.fit_scene(handled, KINDS[kind], truth.locked, truth.anchor, seed)
+    asked = pushes_of(pushed, starting_furniture(handled, PERIOD))
+    motion = one_shot_sysid.predict_pieces(fitted, asked)
+    target, start = np.asarray(asked.target), np.asarray(asked.pose)
+    return {
+        "error_m": np.linalg.norm((motion - target)[:, -1, 0, :2], axis=-1).tolist(),
+        "displacement_m": np.linalg.norm((target[:, -1] - start)[:, 0, :2], axis=-1).tolist(),
+        "converged": fitted.converged,
+        "piece": seed,
+    }
 
 
 def _figures(
     pieces: dict[str, list[dict[str, Any]]],
     compared: dict[str, dict[str, Any]],
-    told: dict[str, dict[str, Any]],
+    sysid: dict[str, dict[str, Any]],
     raced: dict[str, Any],
     joint: dict[str, Any] | None,
     first: int,
@@ -288,9 +279,9 @@ def _figures(
     ]
     figures += [
         Figure(f"error_share_of_sysid.{kind}", pooled([stage]) if stage["error_m"] else None, "")
-        for kind, stage in told.items()
+        for kind, stage in sysid.items()
     ]
-    ours, theirs = of_the_same_pieces(pieces, told, first)
+    ours, theirs = of_the_same_pieces(pieces, sysid, first)
     figures += [
         Figure("error_share_of_sysid", pooled(theirs) if theirs else None, ""),
         Figure("error_share_of_the_same_pieces", pooled(ours) if ours else None, ""),
@@ -307,13 +298,13 @@ def pooled(stages: list[dict[str, Any]]) -> float:
 
 
 def of_the_same_pieces(
-    pieces: dict[str, list[dict[str, Any]]], told: dict[str, dict[str, Any]], first: int
+    pieces: dict[str, list[dict[str, Any]]], sysid: dict[str, dict[str, Any]], first: int
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Our stages and those of mujoco.sysid, of exactly the pieces that it was fitted to.
 
     `first` is the seed of the first piece of each kind; the seeds of the others follow it.
     """
-    theirs = {kind: stage for kind, stage in told.items() if stage["error_m"]}
+    theirs = {kind: stage for kind, stage in sysid.items() if stage["error_m"]}
     ours = [pieces[kind][stage["piece"] - first] for kind, stage in theirs.items()]
     return ours, list(theirs.values())
 

@@ -1,13 +1,12 @@
 """How many samples which method needs to predict a push: a panel for each kind of furniture."""
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from palpate.experiments.furniture.one_shot_regression import OURS, RIVALS
+from palpate.experiments.picture import canvas_of, curve, legend_of, save_picture
 from palpate.report.style import STYLES
-from palpate.runs.storage import write_bytes
 
 ACROSS = 3  # panels in a row
 LOOKS = STYLES[2], STYLES[1], STYLES[3], STYLES[4]
@@ -19,10 +18,8 @@ def shares_figure(out: Path, compared: Mapping[str, Mapping[str, Any]]) -> None:
 
     What diverged lies beyond the axis.
     """
-    from matplotlib.figure import Figure
-
     rows = -(-len(compared) // ACROSS)
-    canvas = Figure(figsize=(3.4 * ACROSS, 2.5 * rows + 0.5), layout="constrained")
+    canvas = canvas_of(3.4 * ACROSS, 2.5 * rows + 0.5)
     axes = canvas.subplots(rows, ACROSS, squeeze=False, sharex=True, sharey=True).ravel()
     for axis in axes[len(compared) :]:
         axis.set_visible(False)
@@ -30,18 +27,12 @@ def shares_figure(out: Path, compared: Mapping[str, Mapping[str, Any]]) -> None:
         axis.axhline(STILL, color=STYLES[0].light, lw=1.0, label="nothing moves")
         for style, method in zip(LOOKS, (OURS, *RIVALS), strict=True):
             found = {int(size): share for size, share in stage["shares"][method].items()}
-            axis.plot(
-                list(found), list(found.values()), label=method, color=style.light,
-                ls=style.linestyle, lw=style.width, marker=style.marker, ms=4,
-            )  # fmt: skip
+            curve(axis, list(found), list(found.values()), style, method)
         axis.set(title=kind, xscale="log", yscale="log", ylim=(1e-4, 30.0))
         axis.spines[["top", "right"]].set_visible(False)
         if index % ACROSS == 0:
             axis.set_ylabel("error² / displacement²")
         if index >= len(compared) - ACROSS:
             axis.set_xlabel("samples of 0.1 s since it moved")
-    lines, names = axes[0].get_legend_handles_labels()
-    canvas.legend(lines, names, loc="outside upper center", ncols=len(names), frameon=False)
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    write_bytes(out, buffer.getvalue())
+    legend_of(canvas, axes[0], "upper center")
+    save_picture(out, canvas)

@@ -6,26 +6,23 @@ MuJoCo ropes. There is no bar: what a part is worth is what is to be found out.
 """
 
 import dataclasses
-import io
 from pathlib import Path
 
 import numpy as np
 
-from palpate.experiments.rope.stabilization import (
+from palpate.experiments.experiment import Experiment, suffix
+from palpate.experiments.picture import band, canvas_of, save_picture
+from palpate.experiments.rope.nominal import (
     BASE,
-    EVALUATION_SEEDS,
     FULL,
     QUICK,
-    Size,
-    announce,
-    finish,
     identified_rope,
+    identified_split,
     trained_policy,
-    wall_time,
 )
+from palpate.experiments.rope.stabilization import EVALUATION_SEEDS
 from palpate.report.style import STYLES
-from palpate.runs import Result, Run
-from palpate.runs.storage import write_bytes
+from palpate.runs import Result
 from palpate.tasks.rope import RopeStabilization
 from palpate.tasks.rope.stabilization import STABILISED
 from palpate.trials.rope.evaluation import (
@@ -49,14 +46,7 @@ LEFT_OUT = {
     "no augmentation": "augmentation",
 }
 BUDGET = 4  # each training has this part of rope-stabilization's iterations
-ROPES = 25
-
-
-def _sized(size: Size, ropes: int) -> Size:
-    iterations = size.training.iterations // BUDGET
-    return dataclasses.replace(
-        size, training=dataclasses.replace(size.training, iterations=iterations), ropes=ropes
-    )
+ROPES = {"full": 25, "quick": 1}
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
@@ -64,63 +54,51 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
     Raises `PalpateError` when `out` holds the stages of another run.
     """
-    size = _sized(QUICK, 1) if quick else _sized(FULL, ROPES)
-    count = 1 + len(LEFT_OUT)
-    announce(
-        NAME,
-        {
-            "recording": size.minutes["recording"],
-            "identification": size.minutes["identification"],
-            "training": round(count * size.minutes["training"] / BUDGET),
-            "evaluation": round(count * size.minutes["evaluation"] / 3 * size.ropes / FULL.ropes)
-            + 1,
-        },
-    )
+    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    ropes, count = ROPES["quick" if quick else "full"], 1 + len(LEFT_OUT)
+    full = dataclasses.replace(size.training, iterations=size.training.iterations // BUDGET)
+    evaluating = round(count * size.minutes["evaluation"] / 3 * ropes / FULL.ropes) + 1
+    training = round(count * size.minutes["training"] / BUDGET)
+    minutes = size.part("recording", "identification")
+    experiment.announce(minutes | {"training": training, "evaluation": evaluating})
     print(
-        f"each of {count} trainings: {size.training.iterations} iterations of "
-        f"{size.training.batch} episodes, network of {size.training.depth} x {size.training.width}",
+        f"each of {count} trainings: {full.iterations} iterations of {full.batch} episodes, "
+        f"network of {full.depth} x {full.width}",
         flush=True,
     )
-    model, spent = identified_rope(out, size, seed)
-    switches = {FULL_TRAINING: {}} | {name: {switch: False} for name, switch in LEFT_OUT.items()}
+    model = identified_rope(experiment, size)
     controllers, abouts, task = {}, {}, RopeStabilization()
-    command = f"palpate reproduce {NAME} --seed {seed}{' --quick' if quick else ''}"
-    for name, switch in switches.items():
-        training = dataclasses.replace(size.training, **switch)
-        path = out / f"train-{name.replace(' ', '-')}"
-        policy, abouts[name] = trained_policy(path, task, model, training, seed, command)
+    for name, switch in {FULL_TRAINING: None, **LEFT_OUT}.items():
+        without = dataclasses.replace(full, **({switch: False} if switch else {}))
+        folder = f"train-{name.replace(' ', '-')}"
+        policy, abouts[name] = trained_policy(experiment, folder, task, model, without)
         controllers[name] = LearnedController(policy, task)
-        spent += abouts[name]["wall_time_s"]
-    trials = evaluation_trials(BASE, size.ropes, EVALUATION_SEEDS + seed)
+    first = experiment.uses(EVALUATION_SEEDS)
+    trials = evaluation_trials(BASE, ropes, first)
     configuration = {"stage": "evaluate", "seed": seed, "trials": len(trials), "policies": abouts}
-    with Run.open(out / "evaluate", configuration) as run:
-        evaluated = evaluate(controllers, trials, run)
-        if not run.finished:
-            write_trial_evidence(run, trials, evaluated, (FULL_TRAINING,))
-            draw(run.path / FIGURE, trials, evaluated)
-            finish(run, NAME, "evaluate", {})
-        spent += wall_time(run)
-        print(f"figure: {run.path / FIGURE}")
+    with experiment.stage("evaluate", configuration) as stage:
+        evaluated = evaluate(controllers, trials, stage.run)
+        if not stage.finished:
+            write_trial_evidence(stage.run, trials, evaluated, (FULL_TRAINING,))
+            draw(stage.path / FIGURE, trials, evaluated)
+        print(f"figure: {stage.path / FIGURE}")
     print("\n".join(table(trials, evaluated)))
-    rows = []
-    for name, episodes in evaluated.items():
-        rows += figures(summarise(trials, episodes), f".{name.replace(' ', '_')}")
-    return Result(
-        NAME,
-        rows,
+    return experiment.result(
+        [
+            row
+            for name, episodes in evaluated.items()
+            for row in figures(summarise(trials, episodes), f".{suffix(name)}")
+        ],
         {
-            "quick": quick,
-            "training": dataclasses.asdict(size.training),
+            "training": dataclasses.asdict(full),
             "switched_off": LEFT_OUT,
-            "ropes": size.ropes,
+            "ropes": ropes,
             "training_seconds": {name: about["wall_time_s"] for name, about in abouts.items()},
         },
-        [seed],
         {
-            "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
-            "evaluated": f"{size.ropes} sampled ropes, seed {EVALUATION_SEEDS + seed}",
+            "identified": identified_split(size, seed),
+            "evaluated": f"{ropes} sampled ropes, seed {first}",
         },
-        spent,
     )
 
 
@@ -129,11 +107,9 @@ def draw(path: Path, trials: list[Trial], evaluated: dict[str, Episodes]) -> Non
 
     Energies are medians over all trials with the band in which nine in ten lie, on a log scale.
     """
-    from matplotlib.figure import Figure as Canvas
-
     period = trials[0].configuration.control_period
     names = [name for name in evaluated if name != FULL_TRAINING]
-    canvas = Canvas(figsize=(11, 7), layout="constrained")
+    canvas = canvas_of(11, 7)
     grid = canvas.add_gridspec(2, len(names), height_ratios=(1.3, 1))
     for place, name in enumerate(names):
         axis = canvas.add_subplot(grid[0, place])
@@ -141,7 +117,7 @@ def draw(path: Path, trials: list[Trial], evaluated: dict[str, Episodes]) -> Non
             share = evaluated[shown].energy / evaluated[shown].energy[:, :1]
             low, middle, high = np.nanquantile(share, (0.05, 0.5, 0.95), axis=0)
             time = np.arange(share.shape[1]) * period
-            axis.fill_between(time, low, high, color=style.light, alpha=0.2, linewidth=0)
+            band(axis, time, low, high, style)
             axis.semilogy(time, middle, line, color=style.light, label=shown)
         axis.axhline(STABILISED, color="black", linewidth=0.8, linestyle=":")
         axis.set(title=name, xlabel="time (s)", ylim=(1e-5, 2))
@@ -155,18 +131,17 @@ def draw(path: Path, trials: list[Trial], evaluated: dict[str, Episodes]) -> Non
     rates, times = canvas.add_subplot(grid[1, :half]), canvas.add_subplot(grid[1, half:])
     for place, (name, summary) in enumerate(summaries.items()):
         colour = STYLES[1 if name == FULL_TRAINING else 2].light
+        look = {"color": colour, "ecolor": "black", "capsize": 3}
         rate, (low, high) = summary.success_rate, summary.interval
-        error = [[max(0.0, rate - low)], [max(0.0, high - rate)]]  # rounded, a limit may be past 1
-        rates.barh(place, rate, xerr=error, color=colour, ecolor="black", capsize=3)
+        # Rounded, a limit of the interval may lie on the other side of a rate of 0 or 1.
+        error = [[max(0.0, rate - low)], [max(0.0, high - rate)]]
+        rates.barh(place, rate, xerr=error, **look)
         if summary.periods is not None:
-            margin = summary.margin or 0.0
-            times.barh(place, summary.periods, xerr=margin, color=colour, ecolor="black", capsize=3)
+            times.barh(place, summary.periods, xerr=summary.margin or 0.0, **look)
     rates.set(xlabel="success rate, 95 % interval", xlim=(0, 1.02))
     times.set(xlabel="mean time to 1 % energy (periods), 95 % interval")
     for axis in (rates, times):
         axis.set_yticks(range(len(summaries)), list(summaries))
         axis.invert_yaxis()
     times.tick_params(labelleft=False)
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=150)
-    write_bytes(path, buffer.getvalue())
+    save_picture(path, canvas)

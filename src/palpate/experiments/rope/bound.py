@@ -16,15 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.experiments.rope.stabilization import (
+from palpate.experiments.experiment import Experiment, ratio, resumable
+from palpate.experiments.rope.nominal import (
     BASE,
     FULL,
     QUICK,
-    announce,
-    finish,
+    SHIPPED_SPLIT,
     identified_rope,
+    identified_split,
     shipped_policy,
-    wall_time,
 )
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
@@ -32,7 +32,6 @@ from palpate.networks import CommandPolicy
 from palpate.planning.open_loop import POPULATION, CommandSequence, Found, cma_package, search
 from palpate.report.evidence import write_evidence
 from palpate.runs import Figure, Result, Run
-from palpate.runs.progress import interruptible, progress
 from palpate.tasks.rope import RopeStabilization
 from palpate.tasks.rope.stabilization import STABILISED, STAY
 from palpate.tasks.task import Start
@@ -116,28 +115,25 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     Raises `PalpateError` when `out` holds the stages of another run, without the package `cma`, or
     when this installation has no shipped weights.
     """
-    size = QUICK if quick else FULL
-    minutes = {name: size.minutes[name] for name in ("recording", "identification")}
-    announce(NAME, minutes | {"search": 2 if quick else 4})
+    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    minutes = size.part("recording", "identification")
+    experiment.announce(minutes | {"search": 2 if quick else 4})
     cma_package()  # before minutes of work that would be in vain
     policy, about = shipped_policy()
-    model, spent = identified_rope(out, size, seed)
-    trials = [Trial(BASE, start, SEEDS + seed) for start in START_POSES]
+    model = identified_rope(experiment, size)
+    first = experiment.uses(SEEDS)
+    trials = [Trial(BASE, start, first) for start in START_POSES]
     rollouts = ROLLOUTS // 20 if quick else ROLLOUTS
     configuration = {"stage": "search", "seed": seed, "policy": about, "rollouts": rollouts}
-    with Run.open(out / "search", configuration) as run:
-        done = bounded(model, policy, trials, rollouts, seed, run)
-        if not run.finished:
-            write_evidence(run.path, _evidence(done))
-            finish(run, NAME, "search", {})
-        spent += wall_time(run)
+    with experiment.stage("search", configuration) as stage:
+        done = bounded(model, policy, trials, rollouts, seed, stage.run)
+        if not stage.finished:
+            write_evidence(stage.path, _evidence(done))
     outcome = Outcome.of(done)
     print("\n".join(_table(outcome)))
-    return Result(
-        NAME,
+    return experiment.result(
         _figures(outcome, trials[0].period),
         {
-            "quick": quick,
             "weights": "shipped",
             "policy": about,
             "restarts": [dataclasses.asdict(restart) for restart in RESTARTS],
@@ -147,13 +143,11 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "knots_spread_over_s": SHAPED,
             "at_rest_within_s": SEARCHED,
         },
-        [seed],
         {
-            "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
-            "policy trained": "shipped weights, see the policy's manifest in the settings",
-            "start states": f"nominal rope, four poses, seed {SEEDS + seed}: used by nothing else",
+            "identified": identified_split(size, seed),
+            "policy trained": SHIPPED_SPLIT,
+            "start states": f"nominal rope, four poses, seed {first}: used by nothing else",
         },
-        spent,
     )
 
 
@@ -186,40 +180,33 @@ def bounded(
         "replayed_energy": np.full(replays, np.nan, np.float32),
         "replayed_speed": np.full(replays, np.nan, np.float32),
     }
-    step, done = run.restore(done) or (0, done)
-    if step == 0:
-        noted = Noted(LearnedController(policy, task))
-        own = run_trials(trials, noted, length)
-        done["commands"][:] = np.stack(noted.commands, axis=1)
-        done["energy"][:], done["speed"][:] = own.energy, own.gripper_speed
     shares = _energy_shares(model, sequence)
-    bar = progress(range(step, count), "searching", done=step)
-    with interruptible() as stop:
-        for place in bar:
-            trial = trials[place]
-            reference = np.zeros((len(RESTARTS), length, 3), np.float32)
-            reference[[restart.warm for restart in RESTARTS]] = done["commands"][place]
-            start = start_state(trial, model.nodes)
-            found = search(
-                lambda knots, start=start, reference=reference: (
-                    shares(start, reference, knots) / _ALLOWED[:, None, None]
-                ),
-                (KNOTS, 3),
-                deadlines=[round(restart.deadline / period) for restart in RESTARTS],
-                deviations=[restart.deviation for restart in RESTARTS],
-                rollouts=rollouts,
-                seed=1000 * seed + 10 * place,
-            )
-            for restart, each in enumerate(found):
-                if len(each.times):
-                    done["in_model"][place, restart] = period * each.times[-1]
-            _replay(found, reference, sequence, trial, done, place)
-            fastest = np.nanmin(np.append(done["in_model"][place], np.inf))
-            bar.show(in_model=fastest if np.isfinite(fastest) else None)
-            run.log(place + 1, start=trial.start)
-            run.save(place + 1, done)
-            if stop:
-                break
+    for place, note in resumable(run, range(count), done, "searching"):
+        if place == 0:
+            noted = Noted(LearnedController(policy, task))
+            own = run_trials(trials, noted, length)
+            done["commands"][:] = np.stack(noted.commands, axis=1)
+            done["energy"][:], done["speed"][:] = own.energy, own.gripper_speed
+        trial = trials[place]
+        reference = np.zeros((len(RESTARTS), length, 3), np.float32)
+        reference[[restart.warm for restart in RESTARTS]] = done["commands"][place]
+        start = start_state(trial, model.nodes)
+        found = search(
+            lambda knots, start=start, reference=reference: (
+                shares(start, reference, knots) / _ALLOWED[:, None, None]
+            ),
+            (KNOTS, 3),
+            deadlines=[round(restart.deadline / period) for restart in RESTARTS],
+            deviations=[restart.deviation for restart in RESTARTS],
+            rollouts=rollouts,
+            seed=1000 * seed + 10 * place,
+        )
+        for restart, each in enumerate(found):
+            if len(each.times):
+                done["in_model"][place, restart] = period * each.times[-1]
+        _replay(found, reference, sequence, trial, done, place)
+        fastest = _least(done["in_model"][place]).item()
+        note(start=trial.start, in_model=fastest if math.isfinite(fastest) else None)
     return done
 
 
@@ -362,30 +349,22 @@ def _figures(outcome: Outcome, period: float) -> list[Figure]:
     ours, bound, found = outcome.ours, outcome.bound, outcome.found
     in_model = _least(outcome.in_model)
     rows = [
-        Figure("time_ratio_to_bound", _ratio(ours, bound), "", bar=RATIO_BAR),
+        Figure("time_ratio_to_bound", ratio(_mean(ours), _mean(bound)), "", bar=RATIO_BAR),
         # Below one where the searches alone, without the controller's own motion, are slower.
-        Figure("time_ratio_to_search", _ratio(ours, found), ""),
+        Figure("time_ratio_to_search", ratio(_mean(ours), _mean(found)), ""),
         Figure("poses_where_search_is_faster", int(np.sum(found < ours)), "", better="higher"),
         Figure("time_to_1pct_s", _mean(ours), "s"),
         Figure("bound_s", _mean(bound), "s"),
         Figure("bound_periods", _mean(bound / period), "periods"),
         Figure("bound_in_model_s", _mean(in_model), "s"),
     ]
+    every = {"time_to_1pct_s": ours, "bound_s": bound, "found_s": found}
+    every["bound_in_model_s"] = in_model
     for place, pose in enumerate(START_POSES):
-        for name, times in (
-            ("time_to_1pct_s", ours),
-            ("bound_s", bound),
-            ("found_s", found),
-            ("bound_in_model_s", in_model),
-        ):
-            rows.append(Figure(f"{name}.{pose}", _mean(times[[place]]), "s"))
+        rows += [
+            Figure(f"{name}.{pose}", _mean(times[[place]]), "s") for name, times in every.items()
+        ]
     return rows
-
-
-def _ratio(ours: np.ndarray, other: np.ndarray) -> float | None:
-    """Of the means; None where a pose has no time."""
-    mine, its = _mean(ours), _mean(other)
-    return None if mine is None or its is None else mine / its
 
 
 def _mean(times: np.ndarray) -> float | None:

@@ -6,7 +6,7 @@ between its second and third way of turning as a whole (3.7 sqrt(g / L); the way
 Self-supervised DAgger notices, collects what it sees, and trains on through a model of the nominal
 rope that is identified here. Beside it the same extra training without what was collected.
 
-Each stage is a run in a folder below `out`, and resumes there. The constants were chosen on ropes
+The constants were chosen on ropes
 and seeds that no figure is measured on.
 """
 
@@ -20,15 +20,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from palpate.experiments.experiment import Experiment, resumable
 from palpate.experiments.rope.dagger_figure import draw
-from palpate.experiments.rope.stabilization import (
+from palpate.experiments.rope.nominal import (
     BASE,
     FULL,
     QUICK,
+    SHIPPED_SPLIT,
     Size,
-    announce,
-    finish,
     identified_rope,
+    identified_split,
     shipped_policy,
 )
 from palpate.families.rope.recording import constants
@@ -38,8 +39,7 @@ from palpate.learning.loss_monitor import Observed
 from palpate.models.rope import RopeState
 from palpate.networks import CommandPolicy
 from palpate.parameters import describe
-from palpate.runs import Figure, Result, Run
-from palpate.runs.progress import interruptible, progress
+from palpate.runs import Figure, Result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json
 from palpate.tasks.rope import RopeStabilization
@@ -86,33 +86,22 @@ class Work:
     minutes: dict[str, int]
 
 
-def _further(iterations: int) -> Training:
-    """Training of a policy that is trained already: whole episodes, all perturbations."""
-    return Training(
-        iterations=iterations,
-        horizon_curriculum=False,
-        noise_curriculum=False,
-        learning_rate=3e-4,
-        observation_noise=BASE.observation_noise,
-    )
-
-
+# Of a policy that is trained already: whole episodes, all perturbations.
+_TRAINING = Training(
+    iterations=200,
+    horizon_curriculum=False,
+    noise_curriculum=False,
+    learning_rate=3e-4,
+    observation_noise=BASE.observation_noise,
+)
 FULL_WORK = Work(
-    FULL,
-    _further(200),
-    10,
-    20,
-    40,
+    FULL, _TRAINING, 10, 20, 40,
     {"identification": 2, "watching": 4, "training": 4, "evaluation": 8},
-)
+)  # fmt: skip
 QUICK_WORK = Work(
-    QUICK,
-    _further(40),
-    1,
-    4,
-    4,
+    QUICK, dataclasses.replace(_TRAINING, iterations=40), 1, 4, 4,
     {"identification": 1, "watching": 1, "training": 1, "evaluation": 1},
-)
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -256,11 +245,11 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     Raises `PalpateError` when `out` holds another run's stages, or when this installation has no
     shipped weights.
     """
-    work = QUICK_WORK if quick else FULL_WORK
-    announce(NAME, work.minutes)
+    experiment, work = Experiment(NAME, out, quick, seed), QUICK_WORK if quick else FULL_WORK
+    experiment.announce(work.minutes)
     policy, manifest = shipped_policy()
-    model, _ = identified_rope(out, work.size, seed)
-    task = RopeStabilization()
+    model = identified_rope(experiment, work.size)
+    task, training = RopeStabilization(), work.training
     about = {
         "policy": manifest,
         "model": {row["name"]: row["value"] for row in describe(model)},
@@ -275,21 +264,23 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         policy,
         lambda policy, seed: watched(policy, nominal(work.nominal, NOMINAL_SEEDS + seed)),
         lambda policy, seed: watched(policy, whirled(work.watched, WATCHED_SEEDS + seed)),
-        work.training,
+        training,
         out,
         seed=seed,
         rounds=ROUNDS,
         about=about,
     )
+    calibrated = experiment.uses(NOMINAL_SEEDS)
+    seen_from = experiment.uses(WATCHED_SEEDS + 1, len(outcome.rounds))
     control = policy
     for number in range(1, outcome.trained_rounds + 1):
         folder = out / f"control-{number}-train"
-        control = go_on(task, model, control, work.training, folder, seed + number, about)
+        control = go_on(task, model, control, training, folder, seed + number, about)
     if outcome.rounds[0].collected.any():
         energy = "energy (J)", model.energy
-        draw(out / "collected.png", task, model, outcome, work.training.starts, seed, energy)
-    shifted = whirled(work.evaluated, EVALUATED_SEEDS + seed)
-    usual = nominal(work.nominal, EVALUATED_SEEDS + seed)
+        draw(out / "collected.png", task, model, outcome, training.starts, seed, energy)
+    first = experiment.uses(EVALUATED_SEEDS)
+    shifted, usual = whirled(work.evaluated, first), nominal(work.nominal, first)
     before, after, without = (Follower(each, task) for each in (policy, outcome.policy, control))
     tries = {
         "before": (before, shifted),
@@ -300,47 +291,48 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         "nominal_before": (before, usual),
         "nominal_after": (after, usual),
     }
+    settings = {
+        "training": dataclasses.asdict(training),
+        "swing_damper": dataclasses.asdict(TUNED),
+    }
     configuration = {
         "stage": "evaluate",
         "seed": seed,
         "about": about,
-        "training": work.training,
-        "swing_damper": dataclasses.asdict(TUNED),
         "trials": {name: len(situation.trials) for name, (_, situation) in tries.items()},
+        **settings,
     }
-    summaries = _evaluated(out / "evaluate", tries, configuration)
+    summaries = _evaluated(experiment, tries, configuration)
     print("\n".join(summary.line(name) for name, summary in summaries.items()))
-    return Result(
-        NAME,
+    # The rounds of DAgger are runs of their own.
+    every = [read_json(path)["wall_time_s"] for path in sorted(out.glob(f"*/{RESULT}"))]
+    experiment.seconds = sum(every)
+    return experiment.result(
         _figures(summaries, outcome),
         {
-            "quick": quick,
             **about,
-            "training": dataclasses.asdict(work.training),
+            **settings,
             "alarm": dataclasses.asdict(outcome.alarm),
             "collected": [_counted(one.collected) for one in outcome.rounds],
-            "swing_damper": dataclasses.asdict(TUNED),
             "trial_periods": TRIAL_PERIODS,
         },
-        [seed],
         {
-            "policy": "shipped weights, see the policy's manifest in the settings",
-            "identified": f"the nominal rope, {work.size.recorded_trials} motions, from {seed}",
-            "calibrated": f"{4 * work.nominal} nominal trials, seed {NOMINAL_SEEDS + seed}",
-            "watched": f"{work.watched} whirled ropes a round, from {WATCHED_SEEDS + seed + 1}",
+            "policy": SHIPPED_SPLIT,
+            "identified": identified_split(work.size, seed),
+            "calibrated": f"{4 * work.nominal} nominal trials, seed {calibrated}",
+            "watched": f"{work.watched} whirled ropes a round, from {seen_from}",
             "evaluated": f"{work.evaluated} whirled ropes and {4 * work.nominal} nominal trials, "
-            f"seed {EVALUATED_SEEDS + seed}",
+            f"seed {first}",
         },
-        sum(read_json(path)["wall_time_s"] for path in sorted(out.glob(f"*/{RESULT}"))),
     )
 
 
 def _evaluated(
-    path: Path,
+    experiment: Experiment,
     tries: Mapping[str, tuple[Controller, Situation]],
     configuration: Mapping[str, Any],
 ) -> dict[str, Summary]:
-    """How each controller does in its situation, in a run that resumes after every few trials."""
+    """How each controller does in its situation, in a stage that saves after every few trials."""
     work = [
         (name, np.arange(first, min(first + SIDE_BY_SIDE, len(situation.trials))))
         for name, (_, situation) in tries.items()
@@ -350,31 +342,21 @@ def _evaluated(
         name: np.full((2, len(situation.trials), situation.steps + 1), np.nan, np.float32)
         for name, (_, situation) in tries.items()
     }
-    with Run.open(path, configuration) as run:
-        step, done = run.restore(done) or (0, done)
-        done = {name: np.array(values) for name, values in done.items()}  # to be written on
-        bar = progress(work[step:], "evaluating", done=step)
-        with interruptible() as stop:
-            for name, chosen in bar:
-                controller, situation = tries[name]
-                part = situation.part(chosen)
-                episodes = tried(controller, part)
-                done[name][:, chosen] = episodes.energy, episodes.gripper_speed
-                settled = float(np.isfinite(settling_times(part.trials, episodes)).mean())
-                bar.show(settled=settled)
-                step += 1
-                run.log(step, controller=name, success_rate=settled)
-                run.save(step, done)
-                if stop:
-                    break
+    with experiment.stage("evaluate", configuration) as stage:
+        for (name, chosen), note in resumable(stage.run, work, done, "evaluating"):
+            controller, situation = tries[name]
+            part = situation.part(chosen)
+            episodes = tried(controller, part)
+            done[name][:, chosen] = episodes.energy, episodes.gripper_speed
+            settled = float(np.isfinite(settling_times(part.trials, episodes)).mean())
+            note(controller=name, success_rate=settled)
         summaries = {
             name: summarise(situation.trials, _episodes(done[name]))
             for name, (_, situation) in tries.items()
         }
-        if not run.finished:
-            rates = {name: summary.success_rate for name, summary in summaries.items()}
-            finish(run, NAME, "evaluate", {"success_rates": rates})
-        return summaries
+        rates = {name: summary.success_rate for name, summary in summaries.items()}
+        stage.content = {"success_rates": rates}
+    return summaries
 
 
 def _episodes(values: np.ndarray) -> Episodes:

@@ -1,6 +1,5 @@
 """What self-supervised DAgger collected, and why, in one picture."""
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from palpate.experiments.picture import canvas_of, curve, save_picture
 from palpate.learning.dagger import Outcome, Round
 from palpate.models.model import Model
 from palpate.report.style import STYLES
-from palpate.runs.storage import write_bytes
 from palpate.tasks.task import Start, Task
 
 SHOWN = 1000  # states of each kind, at most
@@ -36,10 +35,8 @@ def draw(
     nearest start (features in standard deviations of the pool) by a `quantity` of a state, its name
     with unit and its value.
     """
-    from matplotlib.figure import Figure as Canvas
-
     first = outcome.rounds[0]
-    canvas = Canvas(figsize=(11, 7.5), layout="constrained")
+    canvas = canvas_of(11, 7.5)
     axes = canvas.subplots(2, 2)
     _loss_over_time(axes[0, 0], model.control_period, first)
     _scores(axes[0, 1], model.control_period, outcome)
@@ -54,9 +51,7 @@ def draw(
         "collected": first.seen.starts(task, jnp.asarray(trials), jnp.asarray(steps)),
     }
     _where(axes[1], task, starts, quantity)
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())
+    save_picture(path, canvas)
 
 
 def _loss_over_time(axis: Any, period: float, one: Round) -> None:
@@ -65,14 +60,13 @@ def _loss_over_time(axis: Any, period: float, one: Round) -> None:
     loss = comparison.loss[trial]
     axis.plot(np.arange(len(loss)) * period, loss, color=STYLES[0].light, lw=3, label="observed")
     time = comparison.steps * period
-    for index, (label, values) in enumerate({
+    values = {
         "observed, mean over the horizon": comparison.observed,
         "predicted by the model": comparison.predicted,
         "promised by training": comparison.promised,
-    }.items(), start=1):  # fmt: skip
-        style = STYLES[index]
-        look = {"color": style.light, "marker": style.marker, "ms": 3, "lw": 1.2}
-        axis.plot(time, values[trial], label=label, **look)
+    }
+    for style, (label, each) in zip(STYLES[1:], values.items(), strict=False):
+        curve(axis, time, each[trial], style, label, ms=3, lw=1.2)
     marked = one.collected[trial]
     axis.plot(time[marked], comparison.observed[trial, marked], "k|", ms=11, label="collected")
     axis.set(title=f"trial {trial}", xlabel="time (s)", ylabel="loss (as minimised)")

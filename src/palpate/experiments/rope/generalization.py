@@ -6,8 +6,6 @@ while they settle and once they are at rest; and ropes whose markers are noisy, 
 times a second and late. Nothing is identified or trained anew: the length is measured when a trial
 starts, by which rope and time are scaled (Froude's similarity), and between measurements the model
 predicts. Beside it, in a part of the same trials, the policy as it is used otherwise.
-
-Each row is a run in a folder below `out`, and resumes there.
 """
 
 import dataclasses
@@ -19,22 +17,21 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.experiments.rope.stabilization import (
+from palpate.experiments.experiment import Experiment, ratio, share_of
+from palpate.experiments.rope.nominal import (
     BASE,
     FULL,
     QUICK,
-    Size,
-    announce,
-    finish,
+    SHIPPED_SPLIT,
     identified_rope,
+    identified_split,
     shipped_policy,
-    wall_time,
 )
 from palpate.families.rope.recording import constants
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
 from palpate.perception.rope.marker_observer import MarkerObserver
-from palpate.runs import Figure, Result, Run
+from palpate.runs import Figure, Result
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope.evaluation import (
     TRIAL_PERIODS,
@@ -139,27 +136,23 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     Raises `PalpateError` when `out` holds another run's stages, or when this installation has no
     shipped policy.
     """
-    size: Size = QUICK if quick else FULL
-    announce(
-        NAME, {"recording": 1, "identification": 1 if quick else 2, "rows": 2 if quick else 20}
-    )
+    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    minutes = {"identification": 1, "rows": 2} if quick else {"identification": 2, "rows": 20}
+    experiment.announce({"recording": 1} | minutes)
     policy, about = shipped_policy()
-    model, spent = identified_rope(out, size, seed)
-    ropes = ROPES["quick" if quick else "full"]
+    model = identified_rope(experiment, size)
+    ropes, first = ROPES["quick" if quick else "full"], experiment.uses(SEEDS)
     summaries, plain = {}, {}
     for name, row in ROWS.items():
-        trials = _trials(row, ropes, SEEDS + seed)
-        summaries[name], plain[name], took = _evaluated(
-            out / name.replace(" ", "-"), name, row, trials, policy, about, model, seed
+        trials = _trials(row, ropes, first)
+        summaries[name], plain[name] = _evaluated(
+            experiment, name, row, trials, (policy, about), model
         )
-        spent += took
         print(summaries[name].line(name), flush=True)
         print(plain[name].line(f"  {PLAIN}"), flush=True)
-    return Result(
-        NAME,
+    return experiment.result(
         _figures(summaries, plain),
         {
-            "quick": quick,
             "weights": "shipped",
             "policy": about,
             "rows": {name: _changed(row) for name, row in ROWS.items()},
@@ -168,14 +161,12 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "ropes": ropes,
             "trial_periods": TRIAL_PERIODS,
         },
-        [seed],
         {
-            "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
-            "trained": "shipped weights, see the policy's manifest in the settings",
+            "identified": identified_split(size, seed),
+            "trained": SHIPPED_SPLIT,
             "evaluated": f"{ropes} ropes drawn around each row's from each start pose, "
-            f"seed {SEEDS + seed}",
+            f"seed {first}",
         },
-        spent,
     )
 
 
@@ -204,43 +195,39 @@ def _trials(row: Row, ropes: int, seed: int) -> list[Trial]:
 
 
 def _evaluated(
-    path: Path,
+    experiment: Experiment,
     name: str,
     row: Row,
     trials: list[Trial],
-    policy: CommandPolicy,
-    about: dict[str, Any],
+    shipped: tuple[CommandPolicy, dict[str, Any]],
     model: Rope,
-    seed: int,
-) -> tuple[Summary, Summary, float]:
+) -> tuple[Summary, Summary]:
     """The row's trials, and a part of them with the policy as it is used otherwise."""
-    task = RopeStabilization()
-    noise = row.base.observation_noise
+    (policy, about), task = shipped, RopeStabilization()
     poses = [[trial for trial in trials if trial.start == start] for start in START_POSES]
     some = [trial for of_pose in poses for trial in of_pose[:PLAIN_ROPES]]
-    summaries, spent = [], 0.0
+    observed = ObservedController(policy, task, model, row.base.observation_noise)
+    summaries = []
     for who, controller, chosen in (
-        (CONTROLLED, ObservedController(policy, task, model, noise), trials),
+        (CONTROLLED, observed, trials),
         (PLAIN, LearnedController(policy, task), some),
     ):
-        folder = path / who.replace(" ", "-")
         configuration = {
             "stage": name,
             "controller": who,
             "row": _changed(row),
             "world": constants(row.base),
             "trials": len(chosen),
-            "seed": seed,
+            "seed": experiment.seed,
             "policy": about,
         }
-        with Run.open(folder, configuration) as run:
-            episodes = evaluate({who: controller}, chosen, run)[who]
-            if not run.finished:
-                write_trial_evidence(run, chosen, {who: episodes}, (who,))
-                finish(run, NAME, name, {})
-            spent += wall_time(run)
+        folder = f"{name}/{who}".replace(" ", "-")
+        with experiment.stage(folder, configuration) as stage:
+            episodes = evaluate({who: controller}, chosen, stage.run)[who]
+            if not stage.finished:
+                write_trial_evidence(stage.run, chosen, {who: episodes}, (who,))
         summaries.append(summarise(chosen, _after_push(row, episodes)))
-    return summaries[0], summaries[1], spent
+    return summaries[0], summaries[1]
 
 
 def _after_push(row: Row, episodes: Episodes) -> Episodes:
@@ -257,34 +244,24 @@ def _after_push(row: Row, episodes: Episodes) -> Episodes:
 
 def _figures(summaries: dict[str, Summary], plain: dict[str, Summary]) -> list[Figure]:
     nominal = summaries["nominal"]
-    ratios = [_ratio(summary.periods, nominal.periods) for summary in summaries.values()]
-    seconds = [_ratio(summary.time, nominal.time) for summary in summaries.values()]
+    ratios = [ratio(summary.periods, nominal.periods) for summary in summaries.values()]
+    seconds = [ratio(summary.time, nominal.time) for summary in summaries.values()]
     least = min(summaries.values(), key=lambda summary: summary.success_rate)
-    low, high = least.interval
     rows = [
-        Figure(
-            "success_rate_worst",
-            least.success_rate,
-            "",
-            bar=SUCCESS_BAR,
-            better="higher",
+        share_of(
+            "success_rate_worst", least.successes, least.trials, bar=SUCCESS_BAR,
             seed_document="succeeds on three ropes",
             rival=min(summary.success_rate for summary in plain.values()),
-            spread=max(least.success_rate - low, high - least.success_rate),
         ),
         Figure("time_ratio_worst", _worst(ratios), "", bar=TIME_BAR),
         Figure("time_ratio_worst.seconds", _worst(seconds), ""),
-    ]
-    for (name, summary), ratio in zip(summaries.items(), ratios, strict=True):
-        suffix = f".{name.replace(' ', '_')}"
-        rows += figures(summary, suffix)
-        rows.append(Figure(f"time_ratio{suffix}", ratio, ""))
-        rows += figures(plain[name], f"{suffix}.as_shipped")[:2]
+    ]  # fmt: skip
+    for (name, summary), slower in zip(summaries.items(), ratios, strict=True):
+        end = name.replace(" ", "_")  # Hz stays Hz
+        rows += figures(summary, f".{end}")
+        rows.append(Figure(f"time_ratio.{end}", slower, ""))
+        rows += figures(plain[name], f".{end}.as_shipped")[:2]
     return rows
-
-
-def _ratio(own: float | None, nominal: float | None) -> float | None:
-    return None if own is None or nominal is None else own / nominal
 
 
 def _worst(ratios: Sequence[float | None]) -> float | None:

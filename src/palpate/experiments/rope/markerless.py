@@ -9,23 +9,21 @@ one, through the camera, beside the same policy with markers and a gripper held 
 import dataclasses
 import functools
 import math
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from palpate.experiments.rope.stabilization import (
+from palpate.experiments.experiment import Experiment, resumable, share_of, suffix
+from palpate.experiments.rope.nominal import (
     BASE,
     FULL,
     QUICK,
-    Size,
-    announce,
-    finish,
+    SHIPPED_SPLIT,
     identified_rope,
+    identified_split,
     shipped_policy,
-    wall_time,
 )
 from palpate.families.rope.recording import constants
 from palpate.models.rope import Rope
@@ -33,7 +31,6 @@ from palpate.networks import CommandPolicy
 from palpate.numerics import devices
 from palpate.report.evidence import write_evidence
 from palpate.runs import Figure, Result, Run
-from palpate.runs.progress import interruptible, progress
 from palpate.runs.result import two_standard_errors
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope.baselines import HeldStill
@@ -83,15 +80,15 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     `quick` is the same work at a smaller size. Every row is a run below `out` and resumes there.
     Raises `PalpateError` when this installation has no shipped policy.
     """
+    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
     policy, about = shipped_policy()
     counts = TRIALS["quick" if quick else "full"]
-    size: Size = QUICK if quick else FULL
     filming = {"swinging": 1, "stabilising": 1} if quick else {"swinging": 8, "stabilising": 12}
-    announce(NAME, {"identification": 1 if quick else 4} | filming)
-    model, spent = identified_rope(out, size, seed)
+    experiment.announce({"identification": 1 if quick else 4} | filming)
+    model, first = identified_rope(experiment, size), experiment.uses(SEEDS)
     filmed: dict[str, dict[str, np.ndarray]] = {}
     for name, row in ROWS.items():
-        trials = _trials(row, counts, SEEDS + seed)
+        trials = _trials(row, counts, first)
         configuration = {
             "stage": name,
             "row": dataclasses.asdict(row),
@@ -101,25 +98,21 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "policy": about,
             "world": constants(BASE),
         }
-        with Run.open(out / name.replace(", ", "-").replace(" ", "-"), configuration) as run:
-            filmed[name] = _filmed(run, name, row, trials, model, policy)
-            if not run.finished:
-                write_evidence(run.path, _evidence(filmed[name]))
-                finish(run, NAME, name, {})
-            spent += wall_time(run)
-    controlled = _trials(ROWS["stabilised"], counts, SEEDS + seed)
-    began = time.monotonic()
-    rivals = {
-        "markers": run_trials(
-            controlled, LearnedController(policy, RopeStabilization()), _steps(controlled)
-        ),
-        "held still": run_trials(controlled, HeldStill(), _steps(controlled)),
-    }
-    return Result(
-        NAME,
-        _figures(filmed, rivals, counts, SEEDS + seed, frame_times(model)),
+        folder = name.replace(", ", "-").replace(" ", "-")
+        with experiment.stage(folder, configuration) as stage:
+            filmed[name] = _filmed(stage.run, name, row, trials, model, policy)
+            if not stage.finished:
+                write_evidence(stage.path, _evidence(filmed[name]))
+    controlled = _trials(ROWS["stabilised"], counts, first)
+    marked = LearnedController(policy, RopeStabilization())
+    with experiment.counted():
+        rivals = {
+            "markers": run_trials(controlled, marked, _steps(controlled)),
+            "held still": run_trials(controlled, HeldStill(), _steps(controlled)),
+        }
+    return experiment.result(
+        _figures(filmed, rivals, counts, first, frame_times(model)),
         {
-            "quick": quick,
             "weights": "shipped",
             "policy": about,
             "world": constants(BASE),
@@ -129,15 +122,12 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "trials": counts,
             "trial_periods": TRIAL_PERIODS,
         },
-        [seed],
         {
-            "identified": f"the nominal rope with markers, seeds from {seed}",
-            "trained": "shipped weights, see the policy's manifest in the settings",
-            "filmed": f"the nominal rope, seeds from {SEEDS + seed}; for stabilising "
-            f"{counts['ropes']} sampled ropes, {counts['ropes_without_depth']} without depth, "
-            f"seed {SEEDS + seed}",
+            "identified": f"{identified_split(size, seed)}, with markers",
+            "trained": SHIPPED_SPLIT,
+            "filmed": f"the nominal rope, seeds from {first}; for stabilising {counts['ropes']} "
+            f"sampled ropes, {counts['ropes_without_depth']} without depth, seed {first}",
         },
-        spent + time.monotonic() - began,
     )
 
 
@@ -165,29 +155,19 @@ def _filmed(
     """What happened in the trials of a row: arrays as in `Filming`, (trials, ...)."""
     steps = _steps(trials) if row.controlled else round(SWINGING / BASE.control_period)
     arrays = Filming.empty(len(trials), steps, model.nodes)
-    restored = run.restore(arrays)
-    done = 0
-    if restored is not None:
-        done, arrays = restored
-    work = [range(first, min(first + devices.cores(), len(trials)))
-            for first in range(0, len(trials), devices.cores())]  # fmt: skip
+    cores = devices.cores()
+    work = [range(first, min(first + cores, len(trials))) for first in range(0, len(trials), cores)]
     one = functools.partial(
         film, model=model, policy=policy if row.controlled else None, steps=steps,
         background=row.background, sensor=Sensor(has_depth=row.depth), shaken=row.shaken,
     )  # fmt: skip
-    bar = progress(work[done:], f"filming: {name}", done=done)
-    with interruptible() as stop, ThreadPoolExecutor(devices.cores()) as threads:
-        for step, chosen in enumerate(bar, done + 1):
-            for place, filming in zip(chosen, threads.map(one, [trials[i] for i in chosen]),
-                                      strict=True):  # fmt: skip
+    with ThreadPoolExecutor(cores) as threads:
+        for chosen, note in resumable(run, work, arrays, f"filming: {name}"):
+            films = threads.map(one, [trials[place] for place in chosen])
+            for place, filming in zip(chosen, films, strict=True):
                 for part in arrays:
                     arrays[part][place] = getattr(filming, part)
-            tracked = _missed(arrays)[: chosen[-1] + 1]
-            bar.show(rmse_cm=_rmse(tracked))
-            run.log(step, rmse_cm=_finite(_rmse(tracked)))
-            run.save(step, arrays)
-            if stop:
-                break
+            note(rmse_cm=_finite(_rmse(_missed(arrays)[: chosen[-1] + 1])))
     return arrays
 
 
@@ -226,34 +206,32 @@ def _figures(
     }
     controlled = _trials(ROWS["stabilised"], counts, seed)
     rates |= {name: summarise(controlled, episodes) for name, episodes in rivals.items()}
-    low, high = rates["stabilised"].interval
+    own = rates["stabilised"]
     rows = [
         Figure(
             "node_rmse_cm", _finite(_rmse(missed)), "cm", bar=RMSE_BAR,
             rival=_finite(_rmse(swinging[:, 1])), spread=spread,
         ),
-        Figure(
-            "success_rate", rates["stabilised"].success_rate, "", bar=SUCCESS_BAR, better="higher",
-            seed_document="succeeds", rival=rates["markers"].success_rate,
-            spread=0.5 * (high - low),
+        share_of(
+            "success_rate", own.successes, own.trials, bar=SUCCESS_BAR, seed_document="succeeds",
+            rival=rates["markers"].success_rate,
         ),
     ]  # fmt: skip
     for place, kind in enumerate(KINDS[1:], 1):
-        name = f"node_rmse_cm.{kind.replace(' ', '_')}"
-        rows.append(Figure(name, _finite(_rmse(swinging[:, place])), "cm"))
+        value = _finite(_rmse(swinging[:, place]))
+        rows.append(Figure(f"node_rmse_cm.{suffix(kind)}", value, "cm"))
     for name, arrays in filmed.items():
-        suffix = name.replace(", ", ".").replace(" ", "_")
-        rows.append(Figure(f"node_rmse_cm.{suffix}", _finite(_rmse(_missed(arrays))), "cm"))
+        value = _finite(_rmse(_missed(arrays)))
+        rows.append(Figure(f"node_rmse_cm.{suffix(name)}", value, "cm"))
         if not ROWS[name].controlled:
-            rows.append(Figure(f"hidden_share.{suffix}", float(np.nanmean(arrays["hidden"])), ""))
+            hidden = float(np.nanmean(arrays["hidden"]))
+            rows.append(Figure(f"hidden_share.{suffix(name)}", hidden, ""))
     for name, summary in rates.items():
         if name != "stabilised":
-            suffix = name.removeprefix("stabilised, ").replace(" ", "_")
-            rate = summary.success_rate
-            rows.append(Figure(f"success_rate.{suffix}", rate, "", better="higher"))
+            end = suffix(name.removeprefix("stabilised, "))
+            rows.append(Figure(f"success_rate.{end}", summary.success_rate, "", better="higher"))
     for name, summary in rates.items():
-        suffix = name.replace(", ", ".").replace(" ", "_")
-        rows.append(Figure(f"time_to_1pct_periods.{suffix}", summary.periods, "periods"))
+        rows.append(Figure(f"time_to_1pct_periods.{suffix(name)}", summary.periods, "periods"))
     for percent in (50, 99):
         value = 1e3 * float(np.percentile(took, percent))
         rows.append(Figure(f"frame_cpu_ms.p{percent}", value, "ms"))

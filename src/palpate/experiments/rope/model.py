@@ -8,7 +8,6 @@ The constants below were written down before the first kept fit.
 """
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from palpate.commands.folders import fingerprint
 from palpate.errors import PalpateError
+from palpate.experiments.experiment import Experiment
 from palpate.experiments.rope.swing import swing_half_life
 from palpate.families.rope.recording import GRIPPER, MARKERS, constants, record_rope, starting_rope
 from palpate.identification.data.prediction import PredictionError, prediction_error
@@ -28,10 +28,11 @@ from palpate.recordings import Aligned
 from palpate.recordings.files import read_recording
 from palpate.recordings.markers import repair_markers, with_driven
 from palpate.report import write_evidence
-from palpate.runs import Figure, Result, Run
+from palpate.runs import Figure, Result
 from palpate.runs.result import two_standard_errors
 from palpate.worlds.rope.rope import RopeConfiguration
 
+NAME = "rope-model"
 WORLDS = {
     "sim1": RopeConfiguration(),
     "sim2": RopeConfiguration(
@@ -55,6 +56,7 @@ UNSEEN_SEEDS = 310_000  # the unseen motions' seeds start this far after the fit
 DAMPING = ("stretch_damping", "bend_damping", "grip_damping", "air_drag", "quadratic_drag")
 SEED_TABLE = {"sim1": (0.0704, 0.1510), "sim2": (0.0442, 0.1347), "real": (0.0591, 0.0810)}
 DEFORM_L1 = {"dlo1": 1.01, "dlo3": 0.77}  # cm
+CAPTURES = "dlo1_train.npz", "dlo1_eval.npz"
 GRIPPED, RATE = (0, 1, -2, -1), 100.0  # of the motion capture
 
 
@@ -66,27 +68,26 @@ def reproduce(
     With `mocap` (a folder with dlo1_train.npz and dlo1_eval.npz) the real rope too. Raises
     `PalpateError` when those files are missing. Every fit is a run below `out` and resumes there.
     """
-    began = time.monotonic()
+    experiment = Experiment(NAME, out, quick, seed)
     settings = Settings(iterations=(20, 20, 60) if quick else Settings().iterations, seed=seed)
-    minutes = (2 if quick else 5) + (0 if mocap is None else 1 if quick else 2)
-    print(f"rope-model: two simulated ropes{' and a real one' if mocap else ''}, ~{minutes} min")
+    minutes = {"two simulated ropes": 2 if quick else 5}
+    experiment.announce(minutes | ({} if mocap is None else {"a real one": 1 if quick else 2}))
     print(f"excitation: {EXCITATION}")
-    earlier = 0.0  # s of work in processes that were cut off
     figures: list[Figure] = []
     evidence: dict[str, np.ndarray] = {}
     split: dict[str, Any] = {}
     for name, world in WORLDS.items():
-        fitted, unseen = _simulated(world, seed, quick)
+        with experiment.counted():
+            fitted, unseen = _simulated(experiment, world)
+            half_life = swing_half_life(world)
         rope = starting_rope(fitted, mass=world.mass)
         source = {"world": constants(world), "trials": [len(fitted.length), len(unseen.length)]}
         print(f"{name}: {', '.join(f'{k} {v}' for k, v in source['world'].items())}")
-        half_life = swing_half_life(world)
         print(
             f"{name}: a small free swing halves its amplitude in {half_life:.2f} periods "
             f"(a rope's: {ROPE_HALF_LIFE[0]} to {ROPE_HALF_LIFE[1]})"
         )
-        errors, before = _compare(out / name, name, rope, fitted, unseen, settings, source)
-        earlier += before
+        errors = _compare(experiment, name, rope, fitted, unseen, settings, source)
         figures += _simulated_figures(name, world, errors, unseen)
         figures.append(Figure(f"{name}.swing_half_life_periods", half_life, "periods"))
         evidence |= _evidence(name, errors)
@@ -97,22 +98,17 @@ def reproduce(
     if mocap is None:
         print("real.*: left out; give --mocap DIR with dlo1_train.npz and dlo1_eval.npz")
     else:
-        found, before = _real(out, mocap, settings, split)
-        figures += found
-        earlier += before
+        figures += _real(experiment, mocap, settings)
+        split["real"] = dict(zip(("fitted", "unseen"), CAPTURES, strict=True))
     write_evidence(out, evidence)
-    return Result(
-        "rope-model",
+    return experiment.result(
         figures,
         {
-            "quick": quick,
             "identification": dataclasses.asdict(settings),
             "worlds": {name: constants(world) for name, world in WORLDS.items()},
             "excitation": EXCITATION,
         },
-        [seed],
         split,
-        earlier + time.monotonic() - began,
     )
 
 
@@ -122,47 +118,41 @@ def undamped(rope: Rope) -> Rope:
     return declare(still, **{name: {"fixed": True} for name in DAMPING})
 
 
-def _simulated(world: RopeConfiguration, seed: int, quick: bool) -> tuple[Aligned, Aligned]:
-    counts = (4, 3) if quick else (FITTED_TRIALS, UNSEEN_TRIALS)
+def _simulated(experiment: Experiment, world: RopeConfiguration) -> tuple[Aligned, Aligned]:
+    counts = (4, 3) if experiment.quick else (FITTED_TRIALS, UNSEEN_TRIALS)
+    firsts = (experiment.uses(0, counts[0]), experiment.uses(UNSEEN_SEEDS, counts[1]))
     fitted, unseen = (
         record_rope(world, range(first, first + count), DURATION).align(
             world.control_period, MARKERS, GRIPPER
         )
-        for first, count in zip((seed, seed + UNSEEN_SEEDS), counts, strict=True)
+        for first, count in zip(firsts, counts, strict=True)
     )
     return fitted, unseen
 
 
 def _compare(
-    out: Path,
+    experiment: Experiment,
     name: str,
     rope: Rope,
     fitted: Aligned,
     unseen: Aligned,
     settings: Settings,
     source: dict[str, Any],
-) -> tuple[dict[str, PredictionError], float]:
-    """Errors on unseen trials of the fit, the undamped fit, and the model before fitting.
-
-    And the seconds that earlier processes spent on these fits.
-    """
-    earlier = 0.0
+) -> dict[str, PredictionError]:
+    """Errors on unseen trials of the fit, the undamped fit, and the model before fitting."""
     errors = {"before fitting": prediction_error(rope, unseen)}
     for label, start in (("damped", rope), ("undamped", undamped(rope))):
         configuration = {"data": name, "model": label, **source, **dataclasses.asdict(settings)}
-        with Run.open(out / label, configuration) as run:
-            began = time.monotonic()
-            model = identify(start, fitted, settings, run)
-            earlier += max(0.0, run.elapsed - (time.monotonic() - began))
+        with experiment.stage(f"{name}/{label}", configuration) as stage:
+            model = identify(start, fitted, settings, stage.run)
             errors[label] = prediction_error(model, unseen)
-            save_model(run.path / "model.json", model)
-            if not run.finished:
-                run.finish({"parameters": describe(model)})
+            save_model(stage.path / "model.json", model)
+            stage.content = {"parameters": describe(model)}
         if label == "damped":
             print(f"{name}: identified")
             for row in describe(model):
                 print(f"  {row['name']:18} {format_value(row['value'], row['unit'])}")
-    return errors, earlier
+    return errors
 
 
 def tip_errors(error: PredictionError) -> np.ndarray:
@@ -186,21 +176,14 @@ def _simulated_figures(
     still = np.linalg.norm(target[:, :, -1] - hanging, axis=-1) / world.length
     ours, theirs = _pooled(tips["damped"]), _pooled(tips["undamped"])
     table = SEED_TABLE[name]
+    spread = two_standard_errors(tips["damped"])
     return [
         Figure(
-            f"{name}.tip_rmse_per_length",
-            ours,
-            "m/m",
-            bar=0.03,
-            seed_document=table[0],
-            rival=theirs,
-            spread=two_standard_errors(tips["damped"]),
+            f"{name}.tip_rmse_per_length", ours, "m/m", bar=0.03,
+            seed_document=table[0], rival=theirs, spread=spread,
         ),
         Figure(
-            f"{name}.ratio_to_undamped",
-            ours / theirs,
-            "",
-            bar=0.3,
+            f"{name}.ratio_to_undamped", ours / theirs, "", bar=0.3,
             seed_document=table[0] / table[1],
         ),
         Figure(f"{name}.undamped.tip_rmse_per_length", theirs, "m/m", seed_document=table[1]),
@@ -208,48 +191,52 @@ def _simulated_figures(
             f"{name}.before_fitting.tip_rmse_per_length", _pooled(tips["before fitting"]), "m/m"
         ),
         Figure(f"{name}.hanging.tip_rmse_per_length", _pooled(still), "m/m"),
-    ]
+    ]  # fmt: skip
 
 
-def _real(
-    out: Path, mocap: Path, settings: Settings, split: dict[str, Any]
-) -> tuple[list[Figure], float]:
-    """L1 on a real rope gripped at both ends, in centimetres; and seconds as of `_compare`."""
-    paths = [mocap / "dlo1_train.npz", mocap / "dlo1_eval.npz"]
-    for path in paths:
-        if not path.exists():
-            raise PalpateError(f"there is no {path}: --mocap needs the folder with {path.name}")
-    fitted, unseen = (read_recording(path, rate=RATE) for path in paths)
-    recordings = [with_driven(recording, GRIPPED) for recording in (repair_markers(fitted), unseen)]
-    for recording in recordings:
-        for note in recording.notes:
-            print(f"note: {note}")
-    fitted, unseen = (recording.align(1.0 / RATE, "markers") for recording in recordings)
+def captures(mocap: Path) -> list[Path]:
+    """The recordings of a real rope below a folder: to fit to, and to score on.
+
+    Raises `PalpateError` for one that is not there.
+    """
+    for name in CAPTURES:
+        if not (mocap / name).exists():
+            raise PalpateError(f"there is no {mocap / name}: --mocap needs the folder with {name}")
+    return [mocap / name for name in CAPTURES]
+
+
+def seen_capture(path: Path, mend: bool = False) -> Aligned:
+    """A recording of a real rope; with `mend` without markers that jump, as for fitting."""
+    recording = read_recording(path, rate=RATE)
+    recording = with_driven(repair_markers(recording) if mend else recording, GRIPPED)
+    for note in recording.notes:
+        print(f"note: {note}")
+    return recording.align(1.0 / RATE, "markers")
+
+
+def _real(experiment: Experiment, mocap: Path, settings: Settings) -> list[Figure]:
+    """L1 on a real rope gripped at both ends, in centimetres."""
+    paths = captures(mocap)
+    fitted, unseen = seen_capture(paths[0], mend=True), seen_capture(paths[1])
     driven = np.array(GRIPPED) % fitted.observation.shape[2]
     rope = starting_rope(fitted, driven.tolist())
     source = {"files": [fingerprint(path) for path in paths]}
-    errors, earlier = _compare(out / "real", "real", rope, fitted, unseen, settings, source)
+    errors = _compare(experiment, "real", rope, fitted, unseen, settings, source)
     l1 = {label: 100.0 * error.mean_absolute for label, error in errors.items()}
-    split["real"] = {"fitted": paths[0].name, "unseen": paths[1].name}
-    by_trial = 100.0 * errors["damped"].by_trial
+    by_trial, table = 100.0 * errors["damped"].by_trial, SEED_TABLE["real"]
     return [
         Figure(
-            "real.l1_cm",
-            l1["damped"],
-            "cm",
-            bar=0.90,
-            rival=DEFORM_L1["dlo1"],
+            "real.l1_cm", l1["damped"], "cm", bar=0.90, rival=DEFORM_L1["dlo1"],
             spread=two_standard_errors(by_trial),
         ),
         Figure(
-            "real.ratio_to_undamped",
-            l1["damped"] / l1["undamped"],
-            "",
-            seed_document=SEED_TABLE["real"][0] / SEED_TABLE["real"][1],
+            "real.ratio_to_undamped", l1["damped"] / l1["undamped"], "",
+            seed_document=table[0] / table[1],
         ),
+        Figure("real.median_trial_l1_cm", float(np.median(by_trial)), "cm"),
         Figure("real.worst_trial_l1_cm", float(by_trial.max()), "cm"),
         Figure("real.before_fitting.l1_cm", l1["before fitting"], "cm"),
-    ], earlier
+    ]  # fmt: skip
 
 
 def _evidence(name: str, errors: dict[str, PredictionError]) -> dict[str, np.ndarray]:

@@ -7,18 +7,23 @@ There the physics alone, in the same run, is the control; DEFORM's own gain is t
 How the network is fitted was chosen on trials held out of the real rope's training recording.
 """
 
+import functools
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from palpate.commands import identify
-from palpate.errors import PalpateError
-from palpate.experiments.rope.model import GRIPPED, RATE
+from palpate.experiments.experiment import Experiment
+from palpate.experiments.rope.model import GRIPPED, RATE, captures, seen_capture
 from palpate.families.rope.options import NOISE, IdentifyRope
 from palpate.families.rope.recording import GRIPPER, MARKERS
+from palpate.identification.data.prediction import prediction_error
+from palpate.models.files import load_model
 from palpate.models.model import rollout
+from palpate.models.residual import Residual
 from palpate.models.rope import Rope
 from palpate.recordings import Channel, Recording, Role, Trial
 from palpate.recordings.files import write_recording
@@ -27,6 +32,7 @@ from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.worlds.excitation import excitation
 
+NAME = "rope-residual"
 LENGTH, MASS, NODES = 0.6, 0.05, 7  # m and kg, of the simulated rope
 STIFFNESS = {"bend_stiffness": 2e-3, "bend_damping": 2e-4, "air_drag": 2e-3}
 TRIALS, DURATION = 12, 4.0  # of the simulated rope; s of each
@@ -43,50 +49,38 @@ def reproduce(
     `mocap` is a folder with dlo1_train.npz and dlo1_eval.npz. Raises `PalpateError` when those
     files are missing. Both are runs below `out` and resume there.
     """
-    for name in ("dlo1_train.npz", "dlo1_eval.npz"):
-        if mocap is not None and not (mocap / name).exists():
-            raise PalpateError(f"there is no {mocap / name}: --mocap needs the folder with {name}")
-    minutes = (2 if quick else 3) + (0 if mocap is None else 3 if quick else 6)
-    print(f"rope-residual: a simulated rope{' and a real one' if mocap else ''}, ~{minutes} min")
-    iterations = QUICK if quick else ()
+    experiment = Experiment(NAME, out, quick, seed)
+    real = None if mocap is None else captures(mocap)
+    minutes = {"a simulated rope": 2 if quick else 3}
+    experiment.announce(minutes | ({} if real is None else {"a real one": 3 if quick else 6}))
+    options = functools.partial(
+        IdentifyRope, residual=True, iterations=QUICK if quick else (), seed=seed
+    )
     recording = out / "simulated.npz"
-    write_recording(recording, simulated(seed))
-    results = {
-        "simulated": _identified(
-            IdentifyRope(
-                recordings=(recording,), residual=True, mass=MASS,
-                iterations=iterations, seed=seed, out=out / "simulated",
-            )
-        )
-    }  # fmt: skip
-    if mocap is None:
+    write_recording(recording, simulated(experiment.uses(0, TRIALS)))
+    simulated_rope = options(recordings=(recording,), mass=MASS, out=out / "simulated")
+    results = {"simulated": _identified(experiment, simulated_rope)}
+    figures: list[Figure] = []
+    if real is None:
         print("real: left out; give --mocap DIR with dlo1_train.npz and dlo1_eval.npz")
     else:
-        fitted, unseen = (mocap / name for name in ("dlo1_train.npz", "dlo1_eval.npz"))
-        results["real"] = _identified(
-            IdentifyRope(
-                recordings=(fitted,), validate=(unseen,), driven=GRIPPED, rate=RATE, residual=True,
-                iterations=iterations, seed=seed, out=out / "real",
-            )
+        fitted, unseen = real
+        captured = options(
+            recordings=(fitted,), validate=(unseen,), driven=GRIPPED, rate=RATE,
+            out=out / "real",
         )  # fmt: skip
-    return Result(
-        "rope-residual",
-        [
-            figure
-            for name in reversed(results)
-            for figure in _figures(name, results[name], name == "real")
-        ],
+        results["real"] = _identified(experiment, captured)
+        figures = _real_figures(results["real"], out / "real", unseen)
+    return experiment.result(
+        figures + _simulated_figures(results["simulated"]),
         {
-            "quick": quick,
             "simulated": constants(),
             **{
                 f"{name}.residual": found.settings[identify.CORRECTION]
                 for name, found in results.items()
             },
         },
-        [seed],
         {name: found.split for name, found in results.items()},
-        sum(found.wall_time_s for found in results.values()),
     )
 
 
@@ -128,20 +122,52 @@ def simulated(seed: int) -> Recording:
     return Recording(tuple(trials), {"source": "the rope model itself"})
 
 
-def _identified(options: IdentifyRope) -> Result:
-    return read_result(identify.run(options) / RESULT)
+def _identified(experiment: Experiment, options: IdentifyRope) -> Result:
+    found = read_result(identify.run(options) / RESULT)
+    experiment.seconds += found.wall_time_s
+    return found
 
 
-def _figures(name: str, found: Result, headline: bool) -> list[Figure]:
-    """What the correction did; of the real rope, the ratio that the bar is for."""
-    values = {figure.name: figure.value for figure in found.figures}
-    ratio, kept = values["l1_ratio_to_physics"], bool(found.settings[identify.CORRECTION]["kept"])
-    if headline:
-        figures = [Figure("l1_ratio_to_physics", ratio, "", bar=0.90, rival=DEFORM)]
-    else:
-        figures = [Figure(f"{name}.dropped", int(not kept), "", bar=1, better="higher")]
+def _real_figures(found: Result, folder: Path, unseen: Path) -> list[Figure]:
+    """The ratio that the bar is for, and how the gain is spread over the trials."""
+    value = _values(found)["l1_ratio_to_physics"]
+    figures = [Figure("l1_ratio_to_physics", value, "", bar=0.90, rival=DEFORM)]
+    model, _ = load_model(folder / "model.json")
+    if isinstance(model, Residual):
+        aligned = seen_capture(unseen)
+        ours, alone = (prediction_error(of, aligned).by_trial for of in (model, model.physics))
+        figures += gain_figures(ours, alone)
+    return figures + _figures("real", found)
+
+
+def gain_figures(ours: np.ndarray, alone: np.ndarray) -> list[Figure]:
+    """What a ratio of mean errors hides, of the errors (trials,) with and without the correction.
+
+    The median and the worst of the trials' own ratios, how many trials gain, and which part of the
+    gain of all is that of the one which gains most.
+    """
+    gain = alone - ours
     return [
-        *figures,
+        Figure("l1_ratio_to_physics.median_trial", float(np.median(ours / alone)), ""),
+        Figure("l1_ratio_to_physics.worst_trial", float(np.max(ours / alone)), ""),
+        Figure("share_of_trials_that_gain", float(np.mean(gain > 0)), "", better="higher"),
+        Figure("share_of_gain_in_one_trial", float(gain.max() / gain.sum()), ""),
+    ]
+
+
+def _simulated_figures(found: Result) -> list[Figure]:
+    dropped = int(not found.settings[identify.CORRECTION]["kept"])
+    head = Figure("simulated.dropped", dropped, "", bar=1, better="higher")
+    return [head, *_figures("simulated", found)]
+
+
+def _values(found: Result) -> dict[str, Any]:
+    return {figure.name: figure.value for figure in found.figures}
+
+
+def _figures(name: str, found: Result) -> list[Figure]:
+    values = _values(found)
+    return [
         Figure(f"{name}.l1_cm", values["l1_cm"], "cm"),
         Figure(f"{name}.physics.l1_cm", values["l1_physics_cm"], "cm"),
         Figure(f"{name}.correction_size", values["correction_size"], ""),

@@ -8,8 +8,6 @@ differentiate it; the tuned swing damper; a gripper held still. There is no bar:
 what is to be found out.
 
 SAC needs the extra `sac`, and is not run without it.
-
-Each stage is a run in a folder below `out`, and resumes there.
 """
 
 import dataclasses
@@ -19,31 +17,27 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import PalpateError
-from palpate.experiments.experiment import suffix
+from palpate.experiments.experiment import Experiment, decision_figures, suffix
 from palpate.experiments.rope.model import undamped
-from palpate.experiments.rope.stabilization import (
+from palpate.experiments.rope.nominal import (
     BASE,
     FULL,
     QUICK,
     Size,
-    announce,
-    finish,
+    fitted_rope,
     identified_rope,
+    identified_split,
+    recorded_markers,
     shipped_policy,
     trained_policy,
-    wall_time,
 )
-from palpate.families.rope.recording import GRIPPER, MARKERS, constants
-from palpate.identification.gradient.descent import Settings, identify
+from palpate.families.rope.recording import constants
+from palpate.identification.gradient.descent import Settings
 from palpate.learning import Training
-from palpate.models.files import load_model, save_model
 from palpate.models.rope import Rope
-from palpate.networks import CommandPolicy
-from palpate.parameters import describe
 from palpate.planning.gradient import iterations_within
 from palpate.planning.sampling import samples_within
-from palpate.recordings.files import read_recording
-from palpate.runs import Figure, Result, Run
+from palpate.runs import Figure, Result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json, write_json
 from palpate.tasks.rope import RopeStabilization
@@ -95,26 +89,25 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     `quick` is the same work at a smaller size. Raises `PalpateError` when `out` holds the stages of
     another run, or when this installation has no shipped weights.
     """
-    size = SMALL if quick else SIZE
+    experiment, size = Experiment(NAME, out, quick, seed), SMALL if quick else SIZE
     installed = sac_installed()
-    announce(NAME, {name: time for name, time in size.minutes.items() if installed or name != SAC})
+    stages = [stage for stage in size.minutes if installed or stage != SAC]
+    experiment.announce(size.part(*stages))
     if not installed:
         print(f"{SAC}: {NOT_RUN}", flush=True)
     policy, about = shipped_policy()
-    model, spent = identified_rope(out, size, seed)
-    lively, took = _identified_undamped(out, model, size, seed)
-    command = f"palpate reproduce {NAME} --seed {seed}{' --quick' if quick else ''}"
-    rival, rival_about = trained_policy(
-        out / "train-undamped", RopeStabilization(), lively, size.training, seed, command
-    )
-    sizes, measured = _sizes_within(out / "planners", model, seed)
-    spent += took + rival_about["wall_time_s"] + measured
+    model, task = identified_rope(experiment, size), RopeStabilization()
+    lively = _identified_undamped(experiment, model, size)
+    rival, rival_about = trained_policy(experiment, "train-undamped", task, lively, size.training)
+    sizes = _sizes_within(experiment, model)
     hurried = _planned(model, sizes, "10 ms", seed)
     more = {method: -(-most // (LESS if quick else 1)) for method, most in UNHURRIED.items()}
     unhurried = _planned(model, more, "unhurried", seed)
-    trials = evaluation_trials(BASE, size.ropes, EVALUATION_SEEDS + seed)
+    first = experiment.uses(EVALUATION_SEEDS)
+    trials = evaluation_trials(BASE, size.ropes, first)
     trials = [trials[index] for index in one_of_each_pose(trials)[:POSES]] if quick else trials
     chosen = one_of_each_pose(trials)[: SLOW_POSES if quick else None]
+    some = [trials[index] for index in chosen]
     settings = {
         "quick": quick,
         "policies": {SHIPPED: about, UNDAMPED: rival_about},
@@ -125,45 +118,42 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         "world": constants(BASE),
         "ropes": size.ropes,
     }
-    others = _learned(policy, rival) | {
+    others = {
+        SHIPPED: LearnedController(policy, task),
+        UNDAMPED: LearnedController(rival, task),
         "swing damper": SwingDamper(BASE),
         "held still": HeldStill(),
     }
     work = settings | {"seed": seed, "trials": len(trials)}
-    whole, times, took = _evaluated(out / "evaluate", work, others | hurried, trials)
-    some = [trials[index] for index in chosen]
-    slow, slow_times, took_more = _evaluated(out / "evaluate-unhurried", work, unhurried, some)
+    whole, times = _evaluated(experiment, "evaluate", work, others | hurried, trials)
+    slow, slow_times = _evaluated(experiment, "evaluate-unhurried", work, unhurried, some)
     free, free_about = {}, None
     if installed:
         rounds = FEW_ROUNDS if quick else ROUNDS
-        free[SAC], free_about, more_time = _model_free(out, model, size, rounds, trials, seed)
-        spent += more_time
+        free[SAC], free_about = _model_free(experiment, model, size, rounds, trials)
     unknown = [] if installed else [f"{SAC:28s} {NOT_RUN}"]
     print("\n".join([*table(trials, whole | free), *unknown, *table(some, slow)]))
     same = {name: _part(whole[name], chosen) for name in (SHIPPED, *hurried)}
-    return Result(
-        NAME,
+    return experiment.result(
         [
             *(row for name in whole for row in _rows(trials, whole[name], name)),
             *(row for name in slow for row in _rows(some, slow[name], name)),
             *(row for name in same for row in _rows(some, same[name], f"{name} same trials")),
-            *_times(times | slow_times),
+            *decision_figures(times | slow_times),
             *_model_free_rows(trials, free.get(SAC)),
             *_effort(size.training, rival_about, free_about),
         ],
         settings | {SAC: free_about or NOT_RUN},
-        [seed],
         {
-            "identified": f"the nominal rope, {size.recorded_trials} motions, seeds from {seed}",
+            "identified": identified_split(size, seed),
             "trained": f"{UNDAMPED}: through the undamped model of the same recording alone",
             f"{SAC} trained": "in the damped model alone, drawn as in our own training",
             "planners tuned": "ropes of seed 7100, see `rope_planners`",
             "evaluated": (
-                f"{len(trials)} trials of {size.ropes} sampled ropes, seed "
-                f"{EVALUATION_SEEDS + seed}; planners unhurried in the first of each pose"
+                f"{len(trials)} trials of {size.ropes} sampled ropes, seed {first}; "
+                "planners unhurried in the first of each pose"
             ),
         },
-        spent + took + took_more,
     )
 
 
@@ -172,38 +162,27 @@ def sac_installed() -> bool:
     return importlib.util.find_spec("stable_baselines3") is not None
 
 
-def _identified_undamped(out: Path, model: Rope, size: Size, seed: int) -> tuple[Rope, float]:
-    """The rope without damping that suits the same recording best, and the seconds that took.
+def _identified_undamped(experiment: Experiment, model: Rope, size: Size) -> Rope:
+    """The rope without damping that suits the same recording best.
 
     It starts from what was identified with damping.
     """
-    settings = Settings(iterations=size.identification, seed=seed)
+    settings = Settings(iterations=size.identification, seed=experiment.seed)
     configuration = {"stage": "identify undamped", **dataclasses.asdict(settings)}
-    with Run.open(out / "identify-undamped", configuration) as run:
-        path = run.path / "model.json"
-        if not run.finished:
-            recording = read_recording(out / "record" / "recording.npz")
-            aligned = recording.align(BASE.control_period, MARKERS, GRIPPER)
-            every = (aligned.observation.shape[2] - 1) // (model.nodes - 1)
-            seen = dataclasses.replace(aligned, observation=aligned.observation[:, :, ::every])
-            start = dataclasses.replace(undamped(model), drive="position").constrain()
-            lively = identify(start, seen, settings, run)
-            save_model(path, lively)
-            finish(run, NAME, "identify undamped", {"parameters": describe(lively)})
-        lively, _ = load_model(path)
-        if not isinstance(lively, Rope):
-            raise PalpateError(f"{path} is no rope but {type(lively).__name__}: give another --out")
-        return dataclasses.replace(lively, drive="velocity"), wall_time(run)
+    start = dataclasses.replace(undamped(model), drive="position").constrain()
+    seen = recorded_markers(experiment.out)
+    return fitted_rope(experiment, "identify-undamped", configuration, start, seen, settings)
 
 
-def _sizes_within(path: Path, model: Rope, seed: int) -> tuple[dict[str, int], float]:
+def _sizes_within(experiment: Experiment, model: Rope) -> dict[str, int]:
     """How many samples or iterations each planner has within the budget on this machine.
 
-    Zero where not even the least fits. Kept in `path`; with the seconds it took to find out.
+    Zero where not even the least fits.
     """
-    with Run.open(path, {"stage": "planners", "seed": seed, "budget_s": BUDGET}) as run:
-        file = run.path / "sizes.json"
-        if not run.finished:
+    configuration = {"stage": "planners", "seed": experiment.seed, "budget_s": BUDGET}
+    with experiment.stage("planners", configuration) as stage:
+        file = stage.path / "sizes.json"
+        if not stage.finished:
             sizes = {}
             for method, within in METHODS.items():
                 try:
@@ -217,21 +196,25 @@ def _sizes_within(path: Path, model: Rope, seed: int) -> tuple[dict[str, int], f
                     print(f"{method} has no place within {BUDGET:g} s: {error}", flush=True)
                     sizes[method] = 0
             write_json(file, sizes)
-            finish(run, NAME, "planners", {"sizes": sizes})
-        return read_json(file), wall_time(run)
+            stage.content = {"sizes": sizes}
+        return read_json(file)
 
 
 def _model_free(
-    out: Path, model: Rope, size: Size, rounds: int, trials: Sequence[Trial], seed: int
-) -> tuple[Episodes, dict[str, Any], float]:
-    """What SAC does after so many rounds of training, how it was trained, and the seconds spent."""
+    experiment: Experiment, model: Rope, size: Size, rounds: int, trials: Sequence[Trial]
+) -> tuple[Episodes, dict[str, Any]]:
+    """What SAC does after so many rounds of training, and how it was trained."""
     from palpate.experiments.rivals.soft_actor_critic import Sac, trained_actor
 
-    actor, about = trained_actor(out / "train-sac", model, size.training, Sac(rounds), seed)
+    seed = experiment.seed
+    actor, about = trained_actor(
+        experiment.out / "train-sac", model, size.training, Sac(rounds), seed
+    )
+    experiment.seconds += about["wall_time_s"]
     work = {"stage": "evaluate SAC", "seed": seed, "trials": len(trials), "policy": about}
     controllers = {SAC: LearnedController(actor, RopeStabilization())}
-    evaluated, _, took = _evaluated(out / "evaluate-sac", work, controllers, trials)
-    return evaluated[SAC], about, about["wall_time_s"] + took
+    evaluated, _ = _evaluated(experiment, "evaluate-sac", work, controllers, trials)
+    return evaluated[SAC], about
 
 
 def _model_free_rows(trials: Sequence[Trial], episodes: Episodes | None) -> list[Figure]:
@@ -256,11 +239,6 @@ def _effort(
     return rows
 
 
-def _learned(policy: CommandPolicy, rival: CommandPolicy) -> dict[str, Controller]:
-    task = RopeStabilization()
-    return {SHIPPED: LearnedController(policy, task), UNDAMPED: LearnedController(rival, task)}
-
-
 def _planned(
     model: Rope, sizes: Mapping[str, int], when: str, seed: int
 ) -> dict[str, PlannedStabiliser]:
@@ -273,19 +251,21 @@ def _planned(
 
 
 def _evaluated(
-    path: Path,
+    experiment: Experiment,
+    folder: str,
     configuration: dict[str, Any],
     controllers: Mapping[str, Controller],
     trials: Sequence[Trial],
-) -> tuple[dict[str, Episodes], dict[str, list[float]], float]:
-    """What each controller does, how long planners take to decide (ms), and the seconds spent."""
-    with Run.open(path, configuration | {"controllers": list(controllers)}) as run:
-        evaluated = evaluate(controllers, trials, run)
-        if not run.finished:
-            write_trial_evidence(run, trials, evaluated, tuple(controllers))
+) -> tuple[dict[str, Episodes], dict[str, list[float]]]:
+    """What each controller does in a stage, and how long planners take to decide, ms."""
+    configuration = configuration | {"controllers": list(controllers)}
+    with experiment.stage(folder, configuration) as stage:
+        evaluated = evaluate(controllers, trials, stage.run)
+        if not stage.finished:
+            write_trial_evidence(stage.run, trials, evaluated, tuple(controllers))
             planned = {n: [c] for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
-            finish(run, NAME, path.name, {"decision_ms": decision_times(planned)})
-        return evaluated, read_json(run.path / RESULT)["decision_ms"], wall_time(run)
+            stage.content = {"decision_ms": decision_times(planned)}
+    return evaluated, read_json(stage.path / RESULT)["decision_ms"]
 
 
 def _part(episodes: Episodes, chosen: Sequence[int]) -> Episodes:
@@ -303,11 +283,3 @@ def _part(episodes: Episodes, chosen: Sequence[int]) -> Episodes:
 
 def _rows(trials: Sequence[Trial], episodes: Episodes, name: str) -> list[Figure]:
     return figures(summarise(trials, episodes), f".{suffix(name)}")
-
-
-def _times(times: Mapping[str, Sequence[float]]) -> list[Figure]:
-    rows = []
-    for name, (median, late) in times.items():
-        rows.append(Figure(f"decision_ms_median.{suffix(name)}", median, "ms"))
-        rows.append(Figure(f"decision_ms_p99.{suffix(name)}", late, "ms"))
-    return rows

@@ -31,29 +31,19 @@ class Aligned:
     `action` (trials, frames - 1, *shape) acts from frame t to t + 1; past a trial's end the last
     one is repeated. `length` (trials,) counts the frames of each trial.
 
-    Of several channels, the numbers of a frame stand side by side, (trials, frames, numbers), and
-    `observations` and `actions` are views of each by its name, in its own shape. `observed` and
-    `acted` are these shapes. `events` (trials, frames) by name is the index of the newest event at
-    each frame: -1 before the first one and past a trial's end.
+    Of several channels the numbers of a frame stand side by side, (trials, frames, numbers), while
+    `observations` and `actions` have each by its name and in its own shape. `events` (trials,
+    frames) by name is the index of the newest event at each frame: -1 before the first one and past
+    a trial's end.
     """
 
     period: float
     observation: np.ndarray
     action: np.ndarray
     length: np.ndarray
-    observed: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    acted: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    observations: Mapping[str, np.ndarray] = field(default_factory=dict)
+    actions: Mapping[str, np.ndarray] = field(default_factory=dict)
     events: Mapping[str, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def observations(self) -> dict[str, np.ndarray]:
-        """Each observation by its name, (trials, frames, *shape)."""
-        return _by_name(self.observation, self.observed)
-
-    @property
-    def actions(self) -> dict[str, np.ndarray]:
-        """Each action by its name, (trials, frames - 1, *shape)."""
-        return _by_name(self.action, self.acted)
 
 
 def align(
@@ -65,45 +55,45 @@ def align(
             f"the period has to be a positive number of seconds, not {period}: a channel of a "
             "single stamp has none"
         )
-    seen = _pick(trials, observation, "observation", (Role.OBSERVATION,))
-    acted = _pick(trials, action, "action", (Role.DRIVEN, Role.COMMAND))
-    if not seen[0]:
+    observed = _pick(trials, observation, "observation", (Role.OBSERVATION,))
+    acting = _pick(trials, action, "action", (Role.DRIVEN, Role.COMMAND))
+    if not observed:
         raise PalpateError("no observation is named: expected at least one")
-    spans = [_span(*of, period) for of in zip(trials, seen, acted, strict=True)]
+    spans = [_span(period, *each) for each in zip(trials, *observed, *acting, strict=True)]
     count, frames = len(trials), max(length for _, length in spans)
-    sizes = [sum(channel.values[0].size for channel in of[0]) for of in (seen, acted)]
-    if 8 * count * frames * sum(sizes) > LARGEST:
-        longest = max(zip(spans, trials, strict=True), key=lambda pair: pair[0][1])[1]
+    numbers = sum(channels[0].values[0].size for channels in (*observed, *acting))
+    if 8 * count * frames * numbers > LARGEST:
+        longest = next(t for t, (_, length) in zip(trials, spans, strict=True) if length == frames)
         raise PalpateError(
             f"{count} trials of up to {frames} frames of {period:.4g} s do not fit in memory: "
             f"trial '{longest.name}' is {longest.duration:.6g} s long, so check its time "
             "stamps or take a longer period"
         )
-    observations = np.full((count, frames, sizes[0]), np.nan, _dtype(seen))
-    actions = np.empty((count, frames - 1, sizes[1]), _dtype(acted))
+    observations = {of[0].name: _filled(of, frames, np.nan) for of in observed}
+    actions = {of[0].name: _filled(of, frames - 1, 0.0) for of in acting}
     newest = {name: np.full((count, frames), -1) for name in events}
+    slack = ON_STAMP * period
     for i, (trial, (start, length)) in enumerate(zip(trials, spans, strict=True)):
         grid = start + period * np.arange(length)
-        slack = ON_STAMP * period
-        columns = [_interpolated(channel, grid, OBSERVATION_GAP, slack) for channel in seen[i]]
-        observations[i, :length] = _side_by_side(columns, length)
-        columns = [_actions(channel, grid, trial, slack) for channel in acted[i]]
-        actions[i, : length - 1] = _side_by_side(columns, length - 1)
-        actions[i, length - 1 :] = actions[i, length - 2]
+        for of, values in zip(observed, observations.values(), strict=True):
+            values[i, :length] = _interpolated(of[i], grid, OBSERVATION_GAP, slack)
+        for of, values in zip(acting, actions.values(), strict=True):
+            values[i, : length - 1] = _actions(of[i], grid, trial, slack)
+            values[i, length - 1 :] = values[i, length - 2]
         for name, index in newest.items():
             time = trial.event(name).time
             index[i, :length] = np.searchsorted(time, grid + slack, side="right") - 1
-    observed, acting = ({c.name: c.values.shape[1:] for c in of[0]} for of in (seen, acted))
     aligned = Aligned(
         period=float(period),
-        observation=_shaped(observations, observed),
-        action=_shaped(actions, acting),
+        observation=_side_by_side(observations, np.empty((count, frames, 0))),
+        action=_side_by_side(actions, np.empty((count, frames - 1, 0), np.float32)),
         length=np.array([length for _, length in spans]),
-        observed=observed,
-        acted=acting,
+        observations=observations,
+        actions=actions,
         events=newest,
     )
-    for array in (aligned.observation, aligned.action, aligned.length, *newest.values()):
+    by_name = (*observations.values(), *actions.values(), *newest.values())
+    for array in (aligned.observation, aligned.action, aligned.length, *by_name):
         array.setflags(write=False)
     return aligned
 
@@ -111,25 +101,26 @@ def align(
 def _pick(
     trials: Sequence[Trial], names: Names, what: str, roles: tuple[Role, ...]
 ) -> list[list[Channel]]:
-    """The channels to align in each trial: those called `names`, or the only one there is."""
+    """Of each channel to align, that of each trial: those called `names`, or the only one."""
     wanted = [names] if names is None or isinstance(names, str) else list(names)
     if len(set(wanted)) < len(wanted):
         raise PalpateError(f"a channel is named twice as {what}: {', '.join(map(str, wanted))}")
-    picked = [[_one(trial, name, what, roles) for name in wanted] for trial in trials]
-    for trial, channels in zip(trials, picked, strict=True):
-        for first, channel in zip(picked[0], channels, strict=True):
-            for kind, there, here in (
-                ("shape", first.values.shape[1:], channel.values.shape[1:]),
-                ("role", first.role.value, channel.role.value),
-                ("unit", first.unit, channel.unit),
-                ("frame", first.frame, channel.frame),
-                ("axes", first.axes, channel.axes),
-            ):
-                if there != here:
-                    raise PalpateError(
-                        f"'{channel.name}' has the {kind} {here} in trial '{trial.name}' but "
-                        f"{there} in trial '{trials[0].name}': trials have to agree"
-                    )
+    picked = [[_one(trial, name, what, roles) for trial in trials] for name in wanted]
+    for first, trial, channel in (
+        (of[0], *each) for of in picked for each in zip(trials, of, strict=True)
+    ):
+        for kind, there, here in (
+            ("shape", first.values.shape[1:], channel.values.shape[1:]),
+            ("role", first.role.value, channel.role.value),
+            ("unit", first.unit, channel.unit),
+            ("frame", first.frame, channel.frame),
+            ("axes", first.axes, channel.axes),
+        ):
+            if there != here:
+                raise PalpateError(
+                    f"'{channel.name}' has the {kind} {here} in trial '{trial.name}' but {there} "
+                    f"in trial '{trials[0].name}': trials have to agree"
+                )
     return picked
 
 
@@ -149,11 +140,8 @@ def _one(trial: Trial, name: str | None, what: str, roles: tuple[Role, ...]) -> 
     return fitting[0]
 
 
-def _span(
-    trial: Trial, sensors: list[Channel], sources: list[Channel], period: float
-) -> tuple[float, int]:
+def _span(period: float, trial: Trial, *channels: Channel) -> tuple[float, int]:
     """The time of the first frame and the number of frames that all channels cover."""
-    channels = [*sensors, *sources]
     start = max(float(channel.time[0]) for channel in channels)
     # An order outlives its stamp, a measured state does not.
     end = min(float(c.time[-1]) for c in channels if c.role is not Role.COMMAND)
@@ -188,29 +176,18 @@ def _actions(channel: Channel, grid: np.ndarray, trial: Trial, slack: float) -> 
     return actions
 
 
-def _dtype(channels: list[list[Channel]]) -> np.dtype:
-    return np.result_type(np.float32, *(channel.values for of in channels for channel in of))
+def _filled(channels: list[Channel], frames: int, value: float) -> np.ndarray:
+    """(trials, frames, *shape) of `value`, for the values of one channel in each trial."""
+    dtype = np.result_type(*(channel.values for channel in channels))
+    return np.full((len(channels), frames, *channels[0].values.shape[1:]), value, dtype)
 
 
-def _side_by_side(parts: list[np.ndarray], frames: int) -> np.ndarray:
-    """Values (frames, *shape) of several channels as (frames, numbers)."""
-    return np.concatenate([np.empty((frames, 0)), *(p.reshape(frames, -1) for p in parts)], axis=1)
-
-
-def _shaped(array: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> np.ndarray:
-    """The numbers of a single channel in its own shape; those of several stay side by side."""
-    shape = next(iter(shapes.values())) if len(shapes) == 1 else array.shape[2:]
-    return array.reshape(*array.shape[:2], *shape)
-
-
-def _by_name(array: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    flat = array.reshape(*array.shape[:2], -1) if array.size else array
-    ends = np.cumsum([math.prod(shape) for shape in shapes.values()], dtype=int)
-    parts = np.split(flat, ends[:-1], axis=2)
-    return {
-        name: part.reshape(*part.shape[:2], *shape)
-        for (name, shape), part in zip(shapes.items(), parts, strict=False)
-    }
+def _side_by_side(arrays: Mapping[str, np.ndarray], none: np.ndarray) -> np.ndarray:
+    """The only array as it is, or the numbers of each frame of several; `none` without any."""
+    if len(arrays) == 1:
+        return next(iter(arrays.values()))
+    flat = [array.reshape(*array.shape[:2], -1) for array in arrays.values()]
+    return np.concatenate(flat, axis=2) if flat else none
 
 
 def interpolate(

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.recordings.alignment import Aligned
-from palpate.recordings.channel import Channel, Role
+from palpate.recordings.channel import Role
 from palpate.recordings.recording import Recording
 from palpate.runs.storage import write_json
 
@@ -53,30 +54,36 @@ class Feature:
 def write_lerobot(folder: str | Path, recording: Recording, *, fps: int | None = None) -> None:
     """Write `recording` as a LeRobotDataset v3.0 into a new `folder`, each trial an episode.
 
-    `observation.state` is the observation, flattened to names such as "markers_0.x"; `action` is
-    the command, or else the driven state at the next frame (the last is repeated at an episode's
-    end); both float32 in the channels' own units, which `meta/palpate.json` tells. Frames are
-    evenly spaced, `fps` to the second, by default those of the sensor. The format has no value for
-    what was not seen: it is interpolated from the frames around it, and a column `seen` says which
-    points really were.
+    `observation.state` is what was observed, flattened to names such as "markers_0.x"; `action` is
+    what was ordered, or else the driven states at the next frame (the last is repeated at an
+    episode's end); both float32 in the channels' own units, which `meta/palpate.json` tells. Frames
+    are evenly spaced, `fps` to the second, by default those of the first sensor. The format has no
+    value for what was not seen: it is interpolated from the frames around it, and a column `seen`
+    says which points really were. Events are left out.
 
-    Raises `PalpateError` when the folder exists, when pyarrow is missing, when there are several
-    observations, when something is never seen in an episode, or when `fps` is less than 1.
+    Raises `PalpateError` when the folder exists, when pyarrow is missing, when there is no
+    observation, when something is never seen in an episode, or when `fps` is less than 1.
     """
-    _needed()
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError as error:
+        raise PalpateError(
+            "LeRobot datasets are written by the package pyarrow, which is not installed: "
+            "pip install 'palpate[io]'"
+        ) from error
     folder = Path(folder)
     if folder.exists():
         raise PalpateError(f"{folder} exists: expected the name of a new folder")
-    observed = _only_observation(recording)
+    names = {role: _names_of(recording, role) for role in Role}
     if fps is None:
-        periods = [trial[observed.name].nominal_period for trial in recording.trials]
+        sensor = (names[Role.OBSERVATION] or list(recording.trials[0].channels))[0]
+        periods = [trial[sensor].nominal_period for trial in recording.trials]
         fps = max(1, round(1 / float(np.nanmedian(periods))))
     if fps < 1:
         raise PalpateError(f"a dataset has at least 1 frame per second, not {fps}")
-    acted = _action(recording)
-    with_action = recording if acted else _with_no_action(recording)
-    aligned = with_action.align(1 / fps, observed.name, acted.name if acted else None)
-    features = _features(recording, observed, acted, aligned, fps)
+    acting = names[Role.COMMAND] or names[Role.DRIVEN]
+    aligned = recording.align(1 / fps, names[Role.OBSERVATION], acting)
+    features = _features(recording, aligned, fps)
     part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
         _write(part, features, aligned.length, recording, fps)
@@ -87,83 +94,37 @@ def write_lerobot(folder: str | Path, recording: Recording, *, fps: int | None =
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _needed() -> None:
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError as error:
-        raise PalpateError(
-            "LeRobot datasets are written by the package pyarrow, which is not installed: "
-            "pip install 'palpate[io]'"
-        ) from error
-
-
-# --- which channels ---------------------------------------------------------------------------
-
-
-def _only_observation(recording: Recording) -> Channel:
-    seen = [c for c in recording.trials[0].channels.values() if c.role is Role.OBSERVATION]
-    if len(seen) != 1:
-        there = ", ".join(channel.name for channel in seen) or "none"
-        raise PalpateError(f"LeRobot's '{STATE}' is one observation, the recording has: {there}")
-    return seen[0]
-
-
-def _action(recording: Recording) -> Channel | None:
-    """What was ordered, or else where it was driven; None if nobody acted."""
+def _names_of(recording: Recording, role: Role) -> list[str]:
     channels = recording.trials[0].channels.values()
-    for role in (Role.COMMAND, Role.DRIVEN):
-        acting = [channel for channel in channels if channel.role is role]
-        if len(acting) > 1:
-            raise PalpateError(
-                f"LeRobot's '{ACTION}' is one {role.value} channel, the recording has: "
-                + ", ".join(channel.name for channel in acting)
-            )
-        if acting:
-            return acting[0]
-    return None
-
-
-def _with_no_action(recording: Recording) -> Recording:
-    """With a command that orders nothing, for `Recording.align`, which wants one."""
-    trials = []
-    for trial in recording.trials:
-        first = min(channel.time[0] for channel in trial.channels.values())
-        nothing = Channel("nothing", Role.COMMAND, np.array([first]), np.zeros((1, 1)), "1")
-        trials.append(replace(trial, channels={**trial.channels, nothing.name: nothing}))
-    return replace(recording, trials=tuple(trials))
+    return [channel.name for channel in channels if channel.role is role]
 
 
 # --- columns ----------------------------------------------------------------------------------
 
 
-def _features(
-    recording: Recording, observed: Channel, acted: Channel | None, aligned: Aligned, fps: int
-) -> dict[str, Feature]:
+def _features(recording: Recording, aligned: Aligned, fps: int) -> dict[str, Feature]:
     """The columns by name, in the order in which LeRobot has them."""
-    episodes = [aligned.observation[i, :n] for i, n in enumerate(aligned.length)]
-    names = _names(observed.name, observed.values.shape[1:])
-    filled = [
-        _filled(episode.reshape(len(episode), -1), trial.name, names)
-        for episode, trial in zip(episodes, recording.trials, strict=True)
-    ]
-    features = {STATE: Feature("float32", names, np.concatenate(filled))}
-    if acted is not None:
+    trial, frame = np.nonzero(np.arange(aligned.length.max()) < aligned.length[:, None])
+    names, observed = _columns(aligned.observations, trial, frame)
+    state = np.concatenate([
+        _filled(observed[trial == number], each.name, names)
+        for number, each in enumerate(recording.trials)
+    ])  # fmt: skip
+    features = {STATE: Feature("float32", names, state)}
+    if aligned.actions:
         # The last frame has no action of its own: nobody knows what came after it.
-        acts = [
-            aligned.action[i, np.append(np.arange(n - 1), n - 2)]
-            for i, n in enumerate(aligned.length)
-        ]
-        flat = np.concatenate([act.reshape(len(act), -1) for act in acts])
-        features[ACTION] = Feature("float32", _names(acted.name, acted.values.shape[1:]), flat)
-    seen = np.concatenate([_seen(episode) for episode in episodes])
-    if not seen.all():
-        points = tuple(dict.fromkeys(name.partition(".")[0] for name in names))
-        features[SEEN] = Feature("bool", points, seen)
-    frame = np.concatenate([np.arange(n) for n in aligned.length])
+        before_end = np.minimum(frame, aligned.length[trial] - 2)
+        features[ACTION] = Feature("float32", *_columns(aligned.actions, trial, before_end))
+    if not np.isfinite(observed).all():
+        points = [name.partition(".")[0] for name in names]
+        first = np.unique(points, return_index=True)[1]
+        first.sort()
+        unseen = np.logical_or.reduceat(np.isnan(observed), first, axis=1)
+        features[SEEN] = Feature("bool", tuple(points[index] for index in first), ~unseen)
     counters = {
         "timestamp": frame / fps,
         "frame_index": frame,
-        "episode_index": np.repeat(np.arange(len(aligned.length)), aligned.length),
+        "episode_index": trial,
         "index": np.arange(len(frame)),
         "task_index": np.zeros(len(frame)),
     }
@@ -175,20 +136,21 @@ def _features(
     }
 
 
+def _columns(
+    channels: Mapping[str, np.ndarray], trial: np.ndarray, frame: np.ndarray
+) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names of all numbers, and their values (frames, numbers) at `frame` of `trial`."""
+    names = [name for key, array in channels.items() for name in _names(key, array.shape[2:])]
+    values = [array[trial, frame].reshape(len(trial), -1) for array in channels.values()]
+    return tuple(names), np.concatenate(values, axis=1)
+
+
 def _names(channel: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     """One name for each number of a frame: "markers_0.x" of a point, "force_2" of others."""
     if shape and shape[-1] == 3:
         points = ["_".join([channel, *map(str, index)]) for index in np.ndindex(shape[:-1])]
         return tuple(f"{point}.{axis}" for point in points for axis in "xyz")
     return tuple("_".join([channel, *map(str, index)]) for index in np.ndindex(shape))
-
-
-def _seen(episode: np.ndarray) -> np.ndarray:
-    """(frames, points): which points were seen whole; for other observations, which numbers."""
-    known = ~np.isnan(episode)
-    if episode.ndim > 1 and episode.shape[-1] == 3:
-        known = known.all(axis=-1)
-    return known.reshape(len(episode), -1)
 
 
 def _filled(values: np.ndarray, trial: str, names: tuple[str, ...]) -> np.ndarray:

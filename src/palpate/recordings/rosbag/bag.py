@@ -43,7 +43,7 @@ def read_bag(path: str | Path, topics: Sequence[str] = ()) -> list[tuple[str, Ma
     path = Path(path)
     bag = open_bag(path)
     tracks = tracks_of(bag, topics)
-    return _trials(path, bag, choose(tracks, bag.contents, topics))
+    return _trials(path, bag, choose(tracks, bag, topics))
 
 
 def _trials(path: Path, bag: Bag, chosen: Chosen) -> list[tuple[str, MarkerTable]]:

@@ -1,4 +1,4 @@
-"""Bytes of a message into a tree of named fields: ROS 1, ROS 2 (CDR) and JSON.
+"""Bytes of a ROS message into a tree of named fields: ROS 1, and CDR as in ROS 2.
 
 `rosbags`, which knows the formats of ROS, turns the definition of a message type into Python code
 and runs it. A definition out of a foreign file is therefore checked here before: nothing but plain
@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from palpate.errors import PalpateError
-from palpate.runs.storage import parse_json
 
 LONGEST_ARRAY = 4096  # elements of an array of fixed length, for each of which code is made
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(?:/[A-Za-z]\w*)+", re.ASCII)
@@ -20,11 +19,6 @@ _FIELD_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _IDL_RULE = "=" * 80 + "\n"
 
 Decode = Callable[[bytes], Any]
-
-
-def json_decoder() -> Decode:
-    """Decodes JSON into dictionaries, lists, texts and numbers."""
-    return parse_json
 
 
 def ros_decoder(kind: str, definition: str, encoding: str) -> Decode:

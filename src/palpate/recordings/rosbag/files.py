@@ -6,7 +6,6 @@ what they unpack to is checked before memory is taken.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,26 +14,12 @@ from typing import Any, NamedTuple
 
 from palpate.errors import PalpateError
 from palpate.recordings.alignment import LARGEST
-from palpate.recordings.rosbag.decoding import Decode, json_decoder, ros_decoder
-from palpate.runs.storage import DamagedFileError
+from palpate.recordings.rosbag.decoding import Decode, ros_decoder
+from palpate.runs.storage import DamagedFileError, parse_json
 
 CHUNK = 2**30  # bytes of one record or one unpacked chunk; writers make them a thousandth of this
 _LZ4_RATIO = 255  # nothing that LZ4 packs is smaller by more than that
-_SUFFIXES = (".mcap", ".bag", ".db3")
-
-
-@dataclass
-class Contents:
-    """What a log says of itself: message types by topic, and how many messages its index promises.
-
-    `read` counts those that came out, and `unreadable` says of a topic why others did not. All of
-    it is complete once all messages were read.
-    """
-
-    types: dict[str, str] = field(default_factory=dict)
-    counts: Counter[str] = field(default_factory=Counter)
-    read: Counter[str] = field(default_factory=Counter)
-    unreadable: dict[str, str] = field(default_factory=dict)
+_FORMATS = {".mcap": "MCAP", ".bag": "ROS 1 bag", ".db3": "rosbag2 database"}
 
 
 class Packed(NamedTuple):
@@ -46,24 +31,43 @@ class Packed(NamedTuple):
     data: bytes
 
 
-class Bag(ABC):
-    """A log that can be read once; `format` is what a person calls its kind."""
+@dataclass
+class Bag:
+    """A log: `format` is what a person calls its kind, `paths` are files that follow one another.
 
-    def __init__(self, format: str):
-        self.format = format
-        self.contents = Contents()
+    It says of itself what the types of messages are, by topic, and how many its index promises
+    (`counts`). `read` counts those that came out, and `unreadable` says of a topic why others did
+    not. All of it is complete once all messages were read.
+    """
 
-    @abstractmethod
+    format: str
+    paths: Sequence[Path]
+    types: dict[str, str] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    read: Counter[str] = field(default_factory=Counter)
+    unreadable: dict[str, str] = field(default_factory=dict)
+
     def messages(self, skipped: Collection[str]) -> Iterator[Packed]:
         """All messages but those of `skipped` topics, which may grow meanwhile.
 
         What damaged files make the libraries raise comes out as it is.
         """
+        for path in self.paths:
+            read = _mcap_messages if path.suffix.lower() == ".mcap" else _ros_messages
+            yield from read(self, path, skipped)
+
+    def decoder(self, topic: str, kind: str, definition: str, encoding: str) -> Decode | None:
+        """How to read the messages of a topic; None, with the reason kept, if nobody can."""
+        try:
+            return ros_decoder(kind, definition, encoding)
+        except PalpateError as error:
+            self.unreadable[topic] = str(error)
+            return None
 
 
 def is_bag(path: Path) -> bool:
     """Whether `path` is called like a log, or is a folder, such as `ros2 bag record` writes."""
-    return path.suffix.lower() in _SUFFIXES or path.is_dir()
+    return path.suffix.lower() in _FORMATS or path.is_dir()
 
 
 def open_bag(path: Path) -> Bag:
@@ -86,33 +90,36 @@ def open_bag(path: Path) -> Bag:
                 "the folder has no metadata.yaml: expected one that `ros2 bag record` has written "
                 "(`ros2 bag reindex` writes a lost one again)"
             )
-        files = sorted(path.glob("*.mcap"))
-        return McapBag(files, "rosbag2 folder") if files else RosBag(path, "rosbag2 folder")
+        return Bag("rosbag2 folder", sorted(path.glob("*.mcap")) or [path])
     if path.stat().st_size == 0:
         raise DamagedFileError("the file is empty")
-    if path.suffix.lower() == ".mcap":
-        return McapBag([path], "MCAP")
-    return RosBag(path, "ROS 1 bag" if path.suffix.lower() == ".bag" else "rosbag2 database")
+    return Bag(_FORMATS[path.suffix.lower()], [path])
 
 
-class McapBag(Bag):
-    """MCAP files that follow one another, as `ros2 bag record` splits long recordings."""
+def _mcap_messages(bag: Bag, path: Path, skipped: Collection[str]) -> Iterator[Packed]:
+    from mcap.exceptions import EndOfFile, InvalidMagic
+    from mcap.reader import SeekingReader
+    from mcap.records import Channel, Message, Schema
 
-    def __init__(self, paths: Sequence[Path], format: str):
-        super().__init__(format)
-        self._paths = paths
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
+    decoders: dict[int, Decode | None] = {}
 
-    def messages(self, skipped: Collection[str]) -> Iterator[Packed]:
-        """See `Bag.messages`."""
-        for path in self._paths:
-            with path.open("rb") as file:
-                yield from self._of_file(file, skipped)
+    def add(channel: Any) -> None:
+        schema = schemas.get(channel.schema_id)
+        channels[channel.id] = channel
+        bag.types[channel.topic] = schema.name if schema else channel.message_encoding
 
-    def _of_file(self, file: Any, skipped: Collection[str]) -> Iterator[Packed]:
-        from mcap.exceptions import EndOfFile, InvalidMagic
-        from mcap.reader import SeekingReader
-        from mcap.records import Channel, Message, Schema
+    def decoder(channel: Any) -> Decode | None:
+        schema = schemas.get(channel.schema_id)
+        if channel.message_encoding == "json":
+            return parse_json
+        if channel.message_encoding in ("cdr", "ros1") and schema is not None:
+            return bag.decoder(channel.topic, schema.name, schema.data.decode(), schema.encoding)
+        bag.unreadable[channel.topic] = f"its messages are encoded as '{channel.message_encoding}'"
+        return None
 
+    with path.open("rb") as file:
         try:
             summary = SeekingReader(file, record_size_limit=CHUNK).get_summary()
         except (EndOfFile, InvalidMagic, OSError) as error:
@@ -120,45 +127,27 @@ class McapBag(Bag):
                 "the file has no end: it was cut off, or its recording was never finished "
                 "(`mcap recover` saves what is there)"
             ) from error
-        schemas: dict[int, Any] = dict(summary.schemas) if summary else {}
-        channels: dict[int, Any] = dict(summary.channels) if summary else {}
-        for channel in channels.values():
-            self._add(channel, schemas)
-        decoders: dict[int, Decode | None] = {}
+        if summary:
+            schemas |= summary.schemas
+            for channel in summary.channels.values():
+                add(channel)
         for record in _records(file, summary, skipped):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
-                channels[record.id] = record
-                self._add(record, schemas)
+                add(record)
             elif isinstance(record, Message):
                 channel = channels[record.channel_id]
                 if channel.topic in skipped:
                     continue
                 if channel.id not in decoders:
-                    decoders[channel.id] = self._decoder(channel, schemas.get(channel.schema_id))
+                    decoders[channel.id] = decoder(channel)
                 if decode := decoders[channel.id]:
                     yield Packed(channel.topic, record.log_time, decode, record.data)
-        if summary and summary.statistics:
-            for identity, count in summary.statistics.channel_message_counts.items():
-                if identity in channels:
-                    self.contents.counts[channels[identity].topic] += count
-
-    def _add(self, channel: Any, schemas: dict[int, Any]) -> None:
-        schema = schemas.get(channel.schema_id)
-        self.contents.types[channel.topic] = schema.name if schema else channel.message_encoding
-
-    def _decoder(self, channel: Any, schema: Any) -> Decode | None:
-        """How to read the messages of a channel; None, with the reason kept, if nobody can."""
-        try:
-            if channel.message_encoding == "json":
-                return json_decoder()
-            if channel.message_encoding in ("cdr", "ros1") and schema is not None:
-                return ros_decoder(schema.name, schema.data.decode(), schema.encoding)
-            raise PalpateError(f"its messages are encoded as '{channel.message_encoding}'")
-        except PalpateError as error:
-            self.contents.unreadable[channel.topic] = str(error)
-            return None
+    if summary and summary.statistics:
+        for identity, count in summary.statistics.channel_message_counts.items():
+            if identity in channels:
+                bag.counts[channels[identity].topic] += count
 
 
 def _records(file: Any, summary: Any, skipped: Collection[str]) -> Iterator[Any]:
@@ -213,43 +202,28 @@ def _unpacked(chunk: Any) -> list[Any]:
     return breakup_chunk(chunk, validate_crc=True)
 
 
-class RosBag(Bag):
-    """A rosbag2 folder or database, or a ROS 1 bag."""
+def _ros_messages(bag: Bag, path: Path, skipped: Collection[str]) -> Iterator[Packed]:
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
 
-    def __init__(self, path: Path, format: str):
-        super().__init__(format)
-        self._path = path
-
-    def messages(self, skipped: Collection[str]) -> Iterator[Packed]:
-        """See `Bag.messages`."""
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-
-        for packed in self._path.glob("*.zstd") if self._path.is_dir() else ():
-            _check_packed(packed)
-        with (Reader1 if self._path.suffix == ".bag" else Reader2)(self._path) as reader:
-            decoders = {}
-            for connection in reader.connections:
-                self.contents.types[connection.topic] = connection.msgtype
-                self.contents.counts[connection.topic] += connection.msgcount
-                decoders[connection.id] = self._decoder(connection)
-            for connection, received, data in reader.messages():
-                decode = decoders[connection.id]
-                if decode is not None and connection.topic not in skipped:
-                    yield Packed(connection.topic, received, decode, data)
-
-    def _decoder(self, connection: Any) -> Decode | None:
-        from rosbags.interfaces import MessageDefinitionFormat
-
-        definition = connection.msgdef
-        encoding = "ros1msg" if self._path.suffix == ".bag" else "ros2msg"
-        if definition.format == MessageDefinitionFormat.IDL:
-            encoding = "ros2idl"
-        try:
-            return ros_decoder(connection.msgtype, definition.data, encoding)
-        except PalpateError as error:
-            self.contents.unreadable[connection.topic] = str(error)
-            return None
+    for packed in path.glob("*.zstd") if path.is_dir() else ():
+        _check_packed(packed)
+    plain, reader_of = ("ros1msg", Reader1) if path.suffix == ".bag" else ("ros2msg", Reader2)
+    with reader_of(path) as reader:
+        decoders = {}
+        for connection in reader.connections:
+            topic, definition = connection.topic, connection.msgdef
+            encoding = "ros2idl" if definition.format == MessageDefinitionFormat.IDL else plain
+            bag.types[topic] = connection.msgtype
+            bag.counts[topic] += connection.msgcount
+            decoders[connection.id] = bag.decoder(
+                topic, connection.msgtype, definition.data, encoding
+            )
+        for connection, received, data in reader.messages():
+            decode = decoders[connection.id]
+            if decode is not None and connection.topic not in skipped:
+                yield Packed(connection.topic, received, decode, data)
 
 
 def _check_packed(path: Path) -> None:

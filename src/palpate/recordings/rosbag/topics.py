@@ -11,7 +11,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.recordings.alignment import LARGEST
 from palpate.recordings.csv import in_natural_order, some
-from palpate.recordings.rosbag.files import Bag, Contents
+from palpate.recordings.rosbag.files import Bag
 from palpate.recordings.rosbag.messages import LATEST, MOST, Kind, Sight, sights
 from palpate.runs.storage import DamagedFileError
 
@@ -89,23 +89,22 @@ def tracks_of(bag: Bag, named: Sequence[str]) -> dict[str, Track]:
     worth = {name.partition(":")[0] for name in named}
     skipped: set[str] = set()
     size = 0
-    contents = bag.contents
     try:
         for topic, received, decode, data in bag.messages(skipped):
-            contents.read[topic] += 1
+            bag.read[topic] += 1
             if not 0 <= received < LATEST:
                 raise DamagedFileError(f"a message was received {received} ns after 1970")
             try:
                 found = sights(decode(data))
             except Exception as error:  # a message can be anything, and a topic be of no interest
-                contents.unreadable[topic] = f"a message of it is damaged ({_reason(error)})"
+                bag.unreadable[topic] = f"a message of it is damaged ({_reason(error)})"
                 skipped.add(topic)
                 continue
             for sight in found:
                 name = f"{topic}:{sight.child}" if sight.child else topic
                 track = tracks.setdefault(name, Track(name, sight.kind))
                 if track.kind is not sight.kind:
-                    contents.unreadable[topic] = (
+                    bag.unreadable[topic] = (
                         f"some messages of it hold {track.kind.value}, others {sight.kind.value}"
                     )
                     skipped.add(topic)
@@ -114,7 +113,7 @@ def tracks_of(bag: Bag, named: Sequence[str]) -> dict[str, Track]:
                 size += sight.points.nbytes
             if found:
                 worth.add(topic)
-            elif topic not in worth and contents.read[topic] >= TRIED:
+            elif topic not in worth and bag.read[topic] >= TRIED:
                 skipped.add(topic)
             if size > LARGEST:
                 raise PalpateError(
@@ -134,7 +133,7 @@ def _reason(error: Exception) -> str:
     return str(error).partition("\n")[0] or type(error).__name__
 
 
-def choose(tracks: dict[str, Track], contents: Contents, topics: Sequence[str]) -> Chosen:
+def choose(tracks: dict[str, Track], bag: Bag, topics: Sequence[str]) -> Chosen:
     """The topics to make a recording of: those named in `topics`, or else what is plain.
 
     See `palpate.recordings.rosbag.bag.read_bag`. Raises `PalpateError` for topics that are missing,
@@ -142,15 +141,15 @@ def choose(tracks: dict[str, Track], contents: Contents, topics: Sequence[str]) 
     """
     for topic in topics:
         if topic not in tracks:
-            raise PalpateError(_unusable(topic, tracks, contents))
+            raise PalpateError(_unusable(topic, tracks, bag))
     named = {topic: tracks[topic] for topic in topics}
     markers = _one(Kind.MARKERS, named) or _one(Kind.MARKERS, tracks)
     if markers is None:
         raise PalpateError(
             "no topic holds markers, which are lists of places such as geometry_msgs/PoseArray or "
-            f"visualization_msgs/MarkerArray; {_listed(contents)}"
+            f"visualization_msgs/MarkerArray; {_listed(bag)}"
         )
-    _check_whole(markers, contents)
+    _check_whole(markers, bag)
     positions, names, notes = _positions(markers)
     gripper, command = _one(Kind.POSE, named), _one(Kind.VELOCITY, named)
     if not topics:
@@ -167,7 +166,7 @@ def choose(tracks: dict[str, Track], contents: Contents, topics: Sequence[str]) 
     for track in (gripper, command):
         if track is None:
             continue
-        _check_whole(track, contents)
+        _check_whole(track, bag)
         if track.frame and markers.frame and track.frame != markers.frame:
             raise PalpateError(
                 f"'{track.topic}' is in the frame '{track.frame}' and '{markers.topic}' in "
@@ -188,25 +187,25 @@ def _one(kind: Kind, tracks: dict[str, Track]) -> Track | None:
     return found[0] if found else None
 
 
-def _unusable(topic: str, tracks: dict[str, Track], contents: Contents) -> str:
+def _unusable(topic: str, tracks: dict[str, Track], bag: Bag) -> str:
     """Why a topic that was named cannot be taken."""
-    if topic in contents.unreadable:
-        return f"topic '{topic}' cannot be read: {contents.unreadable[topic]}"
+    if topic in bag.unreadable:
+        return f"topic '{topic}' cannot be read: {bag.unreadable[topic]}"
     children = [name for name in tracks if name.startswith(f"{topic}:")]
     if children:
         return f"topic '{topic}' holds transforms: name one of them, {some(children)}"
-    if topic in contents.types:
+    if topic in bag.types:
         return (
-            f"topic '{topic}' of type {contents.types[topic]} has no messages that show markers, a "
+            f"topic '{topic}' of type {bag.types[topic]} has no messages that show markers, a "
             "pose or a velocity"
         )
-    return f"there is no topic '{topic}'; {_listed(contents)}"
+    return f"there is no topic '{topic}'; {_listed(bag)}"
 
 
-def _listed(contents: Contents) -> str:
+def _listed(bag: Bag) -> str:
     there = []
-    for topic, kind in contents.types.items():
-        why = contents.unreadable.get(topic)
+    for topic, kind in bag.types.items():
+        why = bag.unreadable.get(topic)
         there.append(f"{topic} ({kind}{f', not read: {why}' if why else ''})")
     return f"there are: {some(there)}" if there else "there are no topics"
 
@@ -227,15 +226,15 @@ def _holds_the_first(pose: Track, markers: Track, positions: np.ndarray) -> bool
     return bool(known.any() and np.median(away[known]) <= np.median(segment[known]))
 
 
-def _check_whole(track: Track, contents: Contents) -> None:
+def _check_whole(track: Track, bag: Bag) -> None:
     """Refuse a topic that is damaged, not all there, or changes its frame."""
     topic = track.topic.partition(":")[0]
-    if topic in contents.unreadable:
-        raise DamagedFileError(f"topic '{topic}' cannot be read: {contents.unreadable[topic]}")
-    if contents.read[topic] < contents.counts[topic]:
+    if topic in bag.unreadable:
+        raise DamagedFileError(f"topic '{topic}' cannot be read: {bag.unreadable[topic]}")
+    if bag.read[topic] < bag.counts[topic]:
         raise DamagedFileError(
-            f"topic '{topic}' has {contents.read[topic]} messages, but the index of the file "
-            f"promises {contents.counts[topic]}"
+            f"topic '{topic}' has {bag.read[topic]} messages, but the index of the file "
+            f"promises {bag.counts[topic]}"
         )
     if len(track.sights) < 2:
         raise PalpateError(f"topic '{track.topic}' has only one message that can be used")

@@ -8,7 +8,8 @@ import pytest
 from bags import MARKERS, POSE, Ros, chain, nanoseconds, write_mcap, write_ros2
 from palpate.cli import main
 from palpate.commands import folders
-from palpate.recordings.files import read_recording
+from palpate.recordings import Channel, Events, Recording, Role, Trial
+from palpate.recordings.files import read_recording, write_recording
 
 pytest.importorskip("rosbags")
 TIME, CHAIN = chain()
@@ -57,6 +58,20 @@ def test_a_log_becomes_a_dataset(log, tmp_path, capsys):
     error = refused(capsys, log, "--out", tmp_path / "mine", "--lerobot", "--fresh")
     assert "is something else, which --fresh would remove" in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log.mcap", "mine", "set"]
+
+
+def test_events_are_no_part_of_a_dataset_and_that_is_said(tmp_path, capsys):
+    pytest.importorskip("pyarrow")
+    angle = Channel("angle", Role.OBSERVATION, TIME, CHAIN[:, 0, 0], "rad")
+    picture = Events("picture", TIME[:1], [np.zeros((4, 4, 3), np.uint8)], "1")
+    trial = Trial("a", {"angle": angle}, {"picture": picture})
+    write_recording(tmp_path / "R.npz", Recording((trial,), {}))
+    words = ["convert", str(tmp_path / "R.npz"), "--out", str(tmp_path / "set"), "--lerobot"]
+    assert main(words) == 0
+    assert "note: 'picture' holds events, which are left out" in capsys.readouterr().out
+    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    assert features["observation.state"]["names"] == ["angle"]
+    assert "picture" not in features
 
 
 def test_a_log_becomes_a_file_to_look_at(log, tmp_path):

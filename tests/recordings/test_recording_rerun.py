@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Channel, Events, Recording, Role, Trial
 from palpate.recordings.rerun import PAUSE, write_rerun
 
 pytest.importorskip("rerun")
@@ -55,6 +55,28 @@ def test_other_channels_are_plots_and_trials_are_told(tmp_path):
     ] * 2
     (told,) = chunks(tmp_path / "r.rrd", "/trial")
     assert told["TextLog:text"] == [["first"], ["second"]]
+
+
+def test_clouds_and_images_are_drawn_when_they_were_taken(tmp_path):
+    clouds = [CHAIN[0], CHAIN[3]]
+    image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    events = (
+        Events("cloud", np.array([5.1, 5.5]), clouds, "m"),
+        Events("picture", np.array([5.2]), [image], "1"),
+        Events("depth", np.array([5.3]), [np.full((2, 4), 900, np.uint16)], "mm"),
+    )
+    trial = Trial("a", sample().trials[0].channels, {part.name: part for part in events})
+    write_rerun(tmp_path / "r.rrd", Recording((trial,), {}))
+    found = [
+        batch for batch in chunks(tmp_path / "r.rrd", "/cloud") if "Points3D:positions" in batch
+    ]
+    drawn = [np.array(cloud) for batch in found for cloud in batch["Points3D:positions"]]
+    np.testing.assert_allclose(np.concatenate([batch["time"] for batch in found]), [0.1, 0.5])
+    np.testing.assert_array_equal(drawn[0].reshape(-1, 3), CHAIN[0])
+    np.testing.assert_array_equal(drawn[1].reshape(-1, 3), CHAIN[3][[0, 2, 3]])  # one not seen
+    (picture,) = (b for b in chunks(tmp_path / "r.rrd", "/picture") if "Image:buffer" in b)
+    assert np.ravel(picture["Image:buffer"]).tolist() == image.ravel().tolist()
+    assert any("DepthImage:buffer" in batch for batch in chunks(tmp_path / "r.rrd", "/depth"))
 
 
 def test_a_file_that_cannot_be_written(tmp_path):

@@ -31,6 +31,8 @@ def run(options: Convert) -> Path:
     for note in recording.notes:
         print(f"note: {note}")
     if options.lerobot:
+        for name in dict.fromkeys(name for trial in recording.trials for name in trial.events):
+            print(f"note: '{name}' holds events, which are left out of a LeRobot dataset")
         _write_dataset(out, recording, options.fps)
     else:
         FILES[out.suffix](out, recording)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.recordings.channel import Channel
+from palpate.recordings.channel import Channel, Events
 from palpate.recordings.recording import Recording
+from palpate.recordings.trial import Trial
 from palpate.runs.storage import write_bytes
 
 PAUSE = 0.5  # s between trials
@@ -22,7 +23,8 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
 
     Trials follow one another on the timeline "time", half a second apart. A channel of points, in
     metres, is an entity of 3D points that has its name; what was not seen is not drawn. Any other
-    channel is a plot. The entity "trial" tells which trial runs.
+    channel is a plot. Events are clouds of points, if (points, 3) in metres, or images. The entity
+    "trial" says which trial runs.
 
     Raises `PalpateError` when rerun-sdk is missing or the file cannot be written.
     """
@@ -37,32 +39,52 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
     memory = stream.memory_recording()
     stream.set_log_time_enabled(False)  # when the file was written is of no interest
     stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for channel in recording.trials[0].channels.values():
-        if _is_points(channel):
-            stream.log(_entity(channel), rerun.Points3D.from_fields(radii=RADIUS), static=True)
+    for part in _parts(recording.trials[0]):
+        if _is_points(part):
+            stream.log(_entity(part), rerun.Points3D.from_fields(radii=RADIUS), static=True)
     begin = 0.0
     for trial in recording.trials:
-        first = min(channel.time[0] for channel in trial.channels.values())
         stream.set_time(TIMELINE, duration=begin)
         stream.log("trial", rerun.TextLog(trial.name))
         for channel in trial.channels.values():
-            _send(stream, channel, channel.time - first + begin)
+            _send(stream, channel, channel.time - trial.start + begin)
+        for events in trial.events.values():
+            for time, array in zip(events.time - trial.start + begin, events.values, strict=True):
+                stream.set_time(TIMELINE, duration=time)
+                stream.log(_entity(events), _drawn(events, array))
         begin += trial.duration
         stream.set_time(TIMELINE, duration=begin)
-        for channel in trial.channels.values():
-            stream.log(_entity(channel), rerun.Clear(recursive=False))
+        for part in _parts(trial):
+            stream.log(_entity(part), rerun.Clear(recursive=False))
         begin += PAUSE
     write_bytes(path, memory.drain_as_bytes())
 
 
-def _entity(channel: Channel) -> str:
+def _parts(trial: Trial) -> list[Channel | Events]:
+    return [*trial.channels.values(), *trial.events.values()]
+
+
+def _entity(part: Channel | Events) -> str:
     from rerun import escape_entity_path_part
 
-    return escape_entity_path_part(channel.name)
+    return escape_entity_path_part(part.name)
 
 
-def _is_points(channel: Channel) -> bool:
-    return channel.unit == "m" and channel.values.shape[-1] == 3
+def _is_points(part: Channel | Events) -> bool:
+    return part.unit == "m" and part.values[0].shape[-1:] == (3,)
+
+
+def _drawn(events: Events, array: np.ndarray) -> Any:
+    import rerun
+
+    if _is_points(events):
+        points = array.reshape(-1, 3)
+        return rerun.Points3D(points[np.isfinite(points).all(axis=-1)])
+    if array.ndim == 2:
+        return rerun.DepthImage(array)
+    if array.ndim == 3 and array.shape[2] in (3, 4):
+        return rerun.Image(array)
+    return rerun.Tensor(array)
 
 
 def _send(stream: Any, channel: Channel, time: np.ndarray) -> None:

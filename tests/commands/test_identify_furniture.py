@@ -14,9 +14,9 @@ from palpate.families.furniture.recording import (
     POSE,
     WRENCH,
     check_alike,
-    checked,
-    meeting,
     names_of,
+    prepare,
+    prune_contacts,
     record_pieces,
     starting_furniture,
 )
@@ -45,7 +45,7 @@ def still(bodies: int = 1, frames: int = 20) -> tuple[np.ndarray, np.ndarray]:
 
 def test_one_body_may_come_without_an_axis_of_its_own():
     pose, wrench = still()
-    found = checked(recording(pose[:, 0], wrench[:, 0]))
+    found = prepare(recording(pose[:, 0], wrench[:, 0]))
     assert found.trials[0][POSE].values.shape == (20, 1, 3)
     assert names_of(found) == ("body 1",)
 
@@ -53,19 +53,19 @@ def test_one_body_may_come_without_an_axis_of_its_own():
 def test_channels_of_another_shape_are_refused():
     pose, wrench = still(2)
     with pytest.raises(PalpateError, match="expected \\(frames, bodies, 3\\)"):
-        checked(recording(pose[..., :2], wrench))
+        prepare(recording(pose[..., :2], wrench))
     with pytest.raises(PalpateError, match="the same bodies"):
-        checked(recording(pose, wrench[:, :1]))
+        prepare(recording(pose, wrench[:, :1]))
 
 
 def test_outlines_come_from_the_recording_or_from_a_size():
     pose, wrench = still()
     corners = [[-0.6, -0.3], [0.6, -0.3], [0.6, 0.3], [-0.6, 0.3]]
     outlines = Polygons((np.array(corners),), ("table",), "body")
-    whole = checked(recording(pose, wrench, bodies=Labels(("table",)), outlines=outlines))
+    whole = prepare(recording(pose, wrench, bodies=Labels(("table",)), outlines=outlines))
     half_extent = np.asarray(starting_furniture(whole, 0.02).half_extent)
     np.testing.assert_allclose(half_extent, [[0.6, 0.3]], rtol=1e-6)
-    bare = checked(recording(pose, wrench))
+    bare = prepare(recording(pose, wrench))
     with pytest.raises(PalpateError, match="--size LENGTH WIDTH"):
         starting_furniture(bare, 0.02)
     sized = starting_furniture(bare, 0.02, (1.2, 0.6))
@@ -77,20 +77,20 @@ def test_outlines_come_from_the_recording_or_from_a_size():
 def test_names_are_those_of_the_bodies_in_the_channels():
     pose, wrench = still()
     with pytest.raises(PalpateError, match="expected names of its 1 bodies"):
-        names_of(checked(recording(pose, wrench, bodies=Labels(("a", "b")))))
+        names_of(prepare(recording(pose, wrench, bodies=Labels(("a", "b")))))
     with pytest.raises(PalpateError, match='"bodies" are Quantity: expected Labels'):
-        names_of(checked(recording(pose, wrench, bodies=Quantity(np.array(2.0), "1"))))
+        names_of(prepare(recording(pose, wrench, bodies=Quantity(np.array(2.0), "1"))))
 
 
 def test_a_body_that_is_never_seen_is_refused():
     pose, wrench = still()
     with pytest.raises(PalpateError, match="never seen"):
-        starting_furniture(checked(recording(np.full_like(pose, np.nan), wrench)), 0.02, (1.0, 1.0))
+        starting_furniture(prepare(recording(np.full_like(pose, np.nan), wrench)), 0.02, (1.0, 1.0))
 
 
 def test_only_the_hinged_hypothesis_has_a_link():
     pose, wrench = still()
-    models = structures(checked(recording(pose, wrench)), 0.02, (1.0, 0.5))
+    models = structures(prepare(recording(pose, wrench)), 0.02, (1.0, 0.5))
     assert set(models) == {"wheels", "feet", "hinge", "bolted"}
     alike = [jax.tree.map(jnp.shape, models[name]) for name in ("wheels", "feet", "bolted")]
     assert alike[0] == alike[1] == alike[2]
@@ -106,7 +106,7 @@ def test_angles_may_be_wrapped():
     wrapped = pose.copy()
     wrapped[..., 2] = (wrapped[..., 2] + np.pi) % (2 * np.pi) - np.pi
     assert np.nanmax(np.abs(np.diff(wrapped[..., 2], axis=0))) > 6
-    found = checked(recording(wrapped, wrench))
+    found = prepare(recording(wrapped, wrench))
     turned = (found.trials[0][POSE].values - pose)[..., 2]
     np.testing.assert_allclose(np.nanmax(turned, axis=0), np.nanmin(turned, axis=0), atol=1e-9)
     assert not joints(found)  # nothing has moved
@@ -122,12 +122,12 @@ def test_what_may_be_is_asked_of_recordings_of_the_same_bodies():
     assert len(options.sufficient(model, [far]).pairs) == 0
     assert len(options.sufficient(model, [far, near]).pairs) == 1
     with pytest.raises(PalpateError, match="expected the same bodies"):
-        options.reference([far, checked(recording(*still()))], 1 / RATE)
+        options.reference([far, prepare(recording(*still()))], 1 / RATE)
 
 
 def test_rest_is_told_from_motion():
     pose, wrench = still()
-    model = starting_furniture(checked(recording(pose, wrench)), 0.02, (1.0, 0.5))
+    model = starting_furniture(prepare(recording(pose, wrench)), 0.02, (1.0, 0.5))
     aligned = recording(pose, wrench).align(0.02)
     assert begins_at_rest(aligned, model)
     moving = pose + 0.5 * np.arange(len(pose))[:, None, None] / RATE
@@ -152,7 +152,7 @@ def test_only_what_comes_near_may_touch(nearest, touch):
     found = two_boxes(nearest + 0.1 * np.abs(np.arange(20.0) - 10.0))
     model = starting_furniture(found, 1 / RATE)
     assert len(model.pairs) == 3  # each with the other and with the wall
-    assert meeting(model, found).pairs.tolist() == ([[0, 0, 1, 0]] if touch else [])
+    assert prune_contacts(model, found).pairs.tolist() == ([[0, 0, 1, 0]] if touch else [])
 
 
 def test_between_frames_a_body_is_on_a_straight_way():
@@ -160,27 +160,27 @@ def test_between_frames_a_body_is_on_a_straight_way():
     passing = two_boxes(np.linspace(-4.0, 2.0, 20), (frames < 3) | (frames > 16))
     back = two_boxes(np.linspace(-4.0, 2.0, 20), frames < 3)
     model = starting_furniture(passing, 1 / RATE)
-    assert len(meeting(model, passing).pairs) == 1
-    assert len(meeting(model, back).pairs) == 0
+    assert len(prune_contacts(model, passing).pairs) == 1
+    assert len(prune_contacts(model, back).pairs) == 0
 
 
 def test_what_meets_in_any_recording_may_touch():
     far, near = two_boxes(np.full(20, 2.0)), two_boxes(np.full(20, 0.1))
     model = starting_furniture(far, 1 / RATE)
-    assert len(meeting(model, far).pairs) == 0
-    assert len(meeting(model, far, near).pairs) == 1
+    assert len(prune_contacts(model, far).pairs) == 0
+    assert len(prune_contacts(model, far, near).pairs) == 1
     nowhere = two_boxes(np.full(20, 2.0), False)
-    assert len(meeting(model, far, nowhere).pairs) == 3
+    assert len(prune_contacts(model, far, nowhere).pairs) == 3
 
 
 def test_recordings_of_other_bodies_are_not_scored():
     pose, wrench = still(2)
-    two = checked(recording(pose, wrench, bodies=Labels(("a", "b"))))
-    check_alike(two, checked(recording(pose, wrench)))
+    two = prepare(recording(pose, wrench, bodies=Labels(("a", "b"))))
+    check_alike(two, prepare(recording(pose, wrench)))
     with pytest.raises(PalpateError, match="of a, b and of body 1: expected the same bodies"):
-        check_alike(two, checked(recording(pose[:, :1], wrench[:, :1])))
+        check_alike(two, prepare(recording(pose[:, :1], wrench[:, :1])))
     with pytest.raises(PalpateError, match="of a, b and of b, a"):
-        check_alike(two, checked(recording(pose, wrench, bodies=Labels(("b", "a")))))
+        check_alike(two, prepare(recording(pose, wrench, bodies=Labels(("b", "a")))))
 
 
 def test_recorded_pieces_bring_what_identification_needs():
@@ -191,7 +191,7 @@ def test_recorded_pieces_bring_what_identification_needs():
         "handling table 2",
         "handling chair 2",
     ]
-    model = starting_furniture(checked(found), 0.02)
+    model = starting_furniture(prepare(found), 0.02)
     assert model.bodies == 2
     pushed = record_pieces(("box",), 3, 2, 0.2, pushes=True)
     assert len(pushed.trials) == 2

@@ -15,7 +15,7 @@ from palpate.experiments.furniture.one_shot_regression import (
     transitions,
 )
 from palpate.experiments.furniture.one_shot_sampling import OURS as SAMPLER
-from palpate.families.furniture.recording import POSE, WRENCH, alone, starting_furniture
+from palpate.families.furniture.recording import POSE, WRENCH, one_body, starting_furniture
 from palpate.families.furniture.structures import structures
 from palpate.identification.posterior.comparison import posterior_of
 from palpate.identification.posterior.laplace import settle
@@ -121,7 +121,7 @@ def test_a_scene_is_handled_all_at_once_and_can_be_taken_apart():
     assert len(wrench) == 75
     assert np.abs(wrench[10:50]).max(axis=(0, 2)).min() > 1.0
     assert np.abs(wrench[50:, 1]).max() > 1.0 > np.abs(wrench[51:, 0]).max()
-    second = alone(handled, 1)
+    second = one_body(handled, 1)
     np.testing.assert_array_equal(
         second.trials[0][POSE].values[:, 0], handled.trials[0][POSE].values[:, 1]
     )
@@ -151,7 +151,7 @@ def test_samples_count_from_where_the_piece_is_seen_to_have_moved(pushes):
 
 
 def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatch, pushes):
-    first = alone(pushes, 0)
+    first = one_body(pushes, 0)
     aligned = first.align(PERIOD, POSE, WRENCH)
     call, given = one_shot_regression.cut, []
 

@@ -14,7 +14,7 @@ from palpate.families.furniture.recording import (
     UNITS,
     WRENCH,
     check_alike,
-    checked,
+    prepare,
     starting_furniture,
 )
 from palpate.families.furniture.wheels import wheel_rows
@@ -53,34 +53,38 @@ def made(period=0.02, outline=SQUARE, **keys):
 )
 def test_what_is_said_to_mean_something_else_is_refused(keys, says):
     with pytest.raises(PalpateError, match=says):
-        checked(made(**keys))
+        prepare(made(**keys))
 
 
 def test_a_frame_that_is_not_said_is_that_of_the_poses():
-    assert checked(made(**{WRENCH: {"frame": ""}})).trials
+    assert prepare(made(**{WRENCH: {"frame": ""}})).trials
 
 
 @pytest.mark.parametrize("unit", ["", "N,N,N m", "N, N, Nm", "(N, N, N⋅m)", "N, N m"])
 def test_units_may_be_written_otherwise_or_not_at_all(unit):
-    assert checked(made(**{WRENCH: {"unit": unit}})).trials[0][WRENCH].values.shape == (50, 1, 3)
+    assert prepare(made(**{WRENCH: {"unit": unit}})).trials[0][WRENCH].values.shape == (
+        50,
+        1,
+        3,
+    )
 
 
 def test_an_outline_in_millimetres_is_refused():
     large = (1000 * np.array(SQUARE)).tolist()
     with pytest.raises(PalpateError, match="is 1000 m long: expected at most 50 m"):
-        starting_furniture(checked(made(outline=large)), 0.02)
+        starting_furniture(prepare(made(outline=large)), 0.02)
 
 
 def test_recordings_of_one_body_are_of_one_outline():
     alike = join([made(), made()])
-    assert starting_furniture(checked(alike), 0.02).bodies == 1
+    assert starting_furniture(prepare(alike), 0.02).bodies == 1
     other = made(outline=[[-0.6, -0.5], [0.6, -0.5], [0.6, 0.5], [-0.6, 0.5]])
     with pytest.raises(PalpateError, match='say different things of "outlines"'):
-        starting_furniture(checked(join([made(), other])), 0.02)
+        starting_furniture(prepare(join([made(), other])), 0.02)
     with pytest.raises(PalpateError, match="'box' has another outline in what is scored"):
         check_alike(made(), other)
     check_alike(made(), other, sized=True)
-    assert starting_furniture(checked(join([made(), other])), 0.02, (1.0, 1.0)).bodies == 1
+    assert starting_furniture(prepare(join([made(), other])), 0.02, (1.0, 1.0)).bodies == 1
     begun_elsewhere = [*np.roll(SQUARE, 1, axis=0).tolist(), SQUARE[3]]
     check_alike(made(), made(outline=begun_elsewhere))
 
@@ -95,8 +99,8 @@ def test_files_with_outlines_as_json_in_their_provenance_mean_the_same(tmp_path)
     old = read_recording(tmp_path / "old.npz")
     assert old.provenance == {"world": "furniture"}
     assert old.fact("outlines", Polygons) == new.fact("outlines", Polygons)
-    check_alike(checked(old), checked(new))
-    models = [starting_furniture(checked(each), 0.02) for each in (old, new)]
+    check_alike(prepare(old), prepare(new))
+    models = [starting_furniture(prepare(each), 0.02) for each in (old, new)]
     np.testing.assert_array_equal(models[0].outline, models[1].outline)
     assert models[0].half_extent[0].tolist() == pytest.approx([0.6, 0.4])
 
@@ -117,7 +121,7 @@ def test_damaged_json_in_provenance_is_refused(tmp_path, text, says):
 
 def test_what_was_put_right_in_a_channel_is_still_told():
     time = 0.02 * np.arange(50)[::-1]
-    notes = checked(made(**{POSE: {"time": time}})).notes
+    notes = prepare(made(**{POSE: {"time": time}})).notes
     assert len(notes) == 1
     assert "49 of 50 rows were out of order" in notes[0]
 
@@ -169,7 +173,7 @@ def test_the_page_on_furniture_shows_how_a_recording_of_ones_own_is_made(tmp_pat
     given = {"seen": seen, "poses": np.zeros((151, 1, 3)), "felt": felt}
     monkeypatch.chdir(tmp_path)
     exec(example, given | {"wrenches": np.ones((1501, 1, 3))})
-    ours = checked(read_recording(tmp_path / "R.npz"))
+    ours = prepare(read_recording(tmp_path / "R.npz"))
     model = starting_furniture(ours, 0.02)
     np.testing.assert_allclose(model.half_extent, [[0.6, 0.35]], rtol=1e-6)
     aligned = ours.align(0.02, POSE, WRENCH)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.families.furniture import structures as furniture_structures
-from palpate.families.furniture.recording import POSE, WRENCH, alone
+from palpate.families.furniture.recording import POSE, WRENCH, one_body
 from palpate.families.furniture.structures import hypotheses, joints, structures
 from palpate.identification.posterior.comparison import posterior_of
 from palpate.identification.posterior.laplace import CLIMBING, Modes, climb
@@ -79,7 +79,7 @@ def turned(point, angle):
 
 def test_what_moves_apart_or_not_at_all_is_no_candidate(joined):
     assert not joints(pulled(False))
-    one = alone(joined, 0).trials[0]
+    one = one_body(joined, 0).trials[0]
     still = np.concatenate([one[POSE].values, 0.0 * one[POSE].values], axis=1)
     channels = {POSE: Channel(POSE, Role.OBSERVATION, one[POSE].time, still, "m, m, rad")}
     assert not joints(Recording((Trial("one", channels),), {}))
@@ -166,7 +166,7 @@ def test_a_hinge_is_where_the_body_stays_in_all_frames(joined):
     poses = np.asarray(rollout(model, state, jnp.asarray(wrench)).pose)
     poses = poses + NOISE * np.random.default_rng(1).standard_normal(poses.shape)
     poses[0] += (0.005, -0.005, 0.0)
-    one = alone(joined, 0)
+    one = one_body(joined, 0)
     pose = dataclasses.replace(one.trials[0][POSE], time=PERIOD * np.arange(200), values=poses)
     still = dataclasses.replace(pose, values=np.repeat(poses[1:2], 200, axis=0))
     links = []

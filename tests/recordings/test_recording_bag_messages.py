@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.recordings.rosbag.messages import MOST, Kind, sights
+from palpate.recordings.rosbag.messages import MAX_POINTS, Kind, sights
 
 POINTS = np.arange(12.0).reshape(4, 3)
 
@@ -83,7 +83,7 @@ def test_velocities_and_transforms():
         {"x": "1", "y": 2, "z": 3},
         {"names": ["a", "b"], "position": [1.0, 2.0]},
         {"colors": [{"r": 1, "g": 1, "b": 1, "a": 1}]},
-        {"points": [xyz((0, 0, 0))] * (MOST + 1)},
+        {"points": [xyz((0, 0, 0))] * (MAX_POINTS + 1)},
         {"fields": [], "data": "", "point_stride": 4},
     ],
 )

@@ -164,6 +164,7 @@ def test_names_are_those_of_channels_or_of_events():
     [
         (lambda: Labels(("a", "a")), "expected a name for each"),
         (lambda: Labels(("a", "")), "expected texts"),
+        (lambda: Labels("ab"), "expected texts"),
         (lambda: Quantity([1.0, np.nan], "m"), "expected finite numbers"),
         (lambda: Quantity("heavy", "kg"), "expected numbers"),
         (lambda: Polygons(([[0, 0], [1, 1]],)), "polygon 0 has 2 distinct corners"),

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from palpate.errors import PalpateError
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Channel, Driven, Recording, Role, Trial
 from palpate.recordings.files import read_recording
 from palpate.recordings.markers import repair_markers, with_driven
 
@@ -52,6 +52,7 @@ def test_driven_markers_become_an_input():
     assert list(driven.channels) == ["markers", "grip"]
     assert driven["grip"].role is Role.DRIVEN
     assert driven["grip"].unit == "m"
+    assert driven.facts["grip"] == Driven("markers", (0, 1, 4, 5))
     np.testing.assert_array_equal(driven["grip"].values, values[:, [0, 1, 4, 5]])
     np.testing.assert_array_equal(driven["markers"].values, values)
     aligned = with_driven(recorded(values), [-1]).align(0.01)

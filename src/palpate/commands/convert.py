@@ -1,12 +1,9 @@
 """`palpate convert`: a recording out of one format into another."""
 
-import os
-import shutil
 from pathlib import Path
 
 from palpate.commands.options import Convert
 from palpate.errors import PalpateError
-from palpate.recordings import Recording
 from palpate.recordings.files import read_recording, write_recording
 from palpate.recordings.lerobot import INFO, write_lerobot
 from palpate.recordings.rerun import write_rerun
@@ -33,7 +30,7 @@ def run(options: Convert) -> Path:
     if options.lerobot:
         for name in dict.fromkeys(name for trial in recording.trials for name in trial.events):
             print(f"note: '{name}' holds events, which are left out of a LeRobot dataset")
-        _write_dataset(out, recording, options.fps)
+        write_lerobot(out, recording, fps=options.fps, fresh=options.fresh)
     else:
         FILES[out.suffix](out, recording)
     trials = len(recording.trials)
@@ -65,12 +62,3 @@ def _checked(options: Convert) -> Path:
             f"{out} is something else, which --fresh would remove: give another --out"
         )
     return out
-
-
-def _write_dataset(folder: Path, recording: Recording, fps: int | None) -> None:
-    """A dataset that is there already goes when the new one is whole."""
-    new = folder.with_name(f".{folder.name}.{os.getpid()}.new")
-    write_lerobot(new, recording, fps=fps)
-    if folder.exists():
-        shutil.rmtree(folder)
-    os.replace(new, folder)

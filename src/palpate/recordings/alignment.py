@@ -18,7 +18,7 @@ from palpate.recordings.trial import Trial
 OBSERVATION_GAP = 3  # nominal periods over which an observation may be interpolated
 DRIVEN_GAP = 10  # nominal periods over which a driven state may be interpolated
 ON_STAMP = 1e-3  # control periods by which a frame may miss a stamp and still stand on it
-LARGEST = 4 * 2**30  # bytes; more is a mistake in a clock, a period or a file, not a recording
+MAX_BYTES = 4 * 2**30  # bytes; more is a mistake in a clock, a period or a file, not a recording
 
 Names = str | Sequence[str] | None
 
@@ -62,7 +62,7 @@ def align(
     spans = [_span(period, *each) for each in zip(trials, *observed, *acting, strict=True)]
     count, frames = len(trials), max(length for _, length in spans)
     numbers = sum(channels[0].values[0].size for channels in (*observed, *acting))
-    if 8 * count * frames * numbers > LARGEST:
+    if 8 * count * frames * numbers > MAX_BYTES:
         longest = next(t for t, (_, length) in zip(trials, spans, strict=True) if length == frames)
         raise PalpateError(
             f"{count} trials of up to {frames} frames of {period:.4g} s do not fit in memory: "
@@ -145,7 +145,7 @@ def _span(period: float, trial: Trial, *channels: Channel) -> tuple[float, int]:
     start = max(float(channel.time[0]) for channel in channels)
     # An order outlives its stamp, a measured state does not.
     end = min(float(c.time[-1]) for c in channels if c.role is not Role.COMMAND)
-    length = math.floor(min((end - start) / period + ON_STAMP, LARGEST)) + 1
+    length = math.floor(min((end - start) / period + ON_STAMP, MAX_BYTES)) + 1
     if length < 2:
         names = " and ".join(f"'{channel.name}'" for channel in channels)
         raise PalpateError(

@@ -114,7 +114,7 @@ class Events:
                 f"but time is {time.shape} and there are {len(arrays)} arrays"
             )
         kinds = {(array.dtype, ("any", *array.shape[1:])) for array in arrays}
-        if len(kinds) > 1 or arrays[0].dtype.kind not in "fiub" or not all(map(np.ndim, arrays)):
+        if len(kinds) > 1 or arrays[0].dtype.kind not in "fiu" or not all(map(np.ndim, arrays)):
             raise PalpateError(
                 f"{label} has arrays of {' and '.join(sorted(f'{d} {s}' for d, s in kinds))}: "
                 "expected numbers of one dtype and one shape but for the first axis"

@@ -34,14 +34,13 @@ class Labels(Fact):
     labels: Sequence[str]
 
     def __post_init__(self) -> None:
-        names = tuple(self.labels)
-        if not all(isinstance(name, str) and name for name in names):
+        texts = not isinstance(self.labels, str) and all(
+            isinstance(label, str) and label for label in self.labels
+        )
+        if not texts or len(set(self.labels)) < len(self.labels):
             raise PalpateError(
-                f"labels are {shown(self.labels)}: expected texts that are not empty"
+                f"labels are {shown(self.labels)}: expected texts, none empty, a name for each"
             )
-        if len(set(names)) < len(names):
-            raise PalpateError(f"labels are {shown(self.labels)}: expected a name for each")
-        object.__setattr__(self, "labels", names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,6 @@ class Polygons(Fact):
             raise PalpateError(f"{len(self.polygons)} polygons have {len(names)} names")
         for number, polygon in enumerate(self.polygons):
             checked_polygon(polygon, f"polygon '{names[number]}'" if names else f"polygon {number}")
-        object.__setattr__(self, "names", names)
         corners = tuple(np.array(polygon, np.float64) for polygon in self.polygons)
         object.__setattr__(self, "polygons", corners)
 
@@ -108,8 +106,6 @@ class Intrinsics(Fact):
                 f"a camera has {self.width} x {self.height} pixels and focal lengths {focal}: "
                 "expected at least 1 x 1, and positive focal lengths"
             )
-        object.__setattr__(self, "focal", focal)
-        object.__setattr__(self, "centre", centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +116,8 @@ class Driven(Fact):
     indices: Sequence[int]
 
     def __post_init__(self) -> None:
-        indices = tuple(self.indices)
-        if not all(type(index) is int and index >= 0 for index in indices):
+        if not all(type(index) is int and index >= 0 for index in self.indices):
             raise PalpateError(f"driven are {shown(self.indices)}: expected integers from 0 on")
-        object.__setattr__(self, "indices", indices)
 
 
 KINDS: dict[str, type[Fact]] = {

@@ -15,7 +15,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.recordings import npz
-from palpate.recordings.alignment import LARGEST
+from palpate.recordings.alignment import MAX_BYTES
 from palpate.recordings.channel import Role
 from palpate.recordings.csv import read_csv
 from palpate.recordings.npz import write_recording
@@ -90,9 +90,9 @@ def _read_npz(path: Path) -> Recording | list[tuple[str, MarkerTable]]:
         with zipfile.ZipFile(path) as archive:
             keys = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
             size = sum(entry.file_size for entry in archive.infolist())
-            if size > LARGEST:
+            if size > MAX_BYTES:
                 raise PalpateError(
-                    f"the file unpacks to {size / 2**30:.3g} GiB; at most {LARGEST / 2**30:.0f} "
+                    f"the file unpacks to {size / 2**30:.3g} GiB; at most {MAX_BYTES / 2**30:.0f} "
                     "GiB are read: split it into several recordings"
                 )
             if npz.ENTRY in keys:

@@ -33,13 +33,6 @@ DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 INFO = "meta/info.json"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-_COUNTERS = {
-    "timestamp": "float32",
-    "frame_index": "int64",
-    "episode_index": "int64",
-    "index": "int64",
-    "task_index": "int64",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +44,9 @@ class Feature:
     values: np.ndarray
 
 
-def write_lerobot(folder: str | Path, recording: Recording, *, fps: int | None = None) -> None:
+def write_lerobot(
+    folder: str | Path, recording: Recording, *, fps: int | None = None, fresh: bool = False
+) -> None:
     """Write `recording` as a LeRobotDataset v3.0 into a new `folder`, each trial an episode.
 
     `observation.state` is what was observed, flattened to names such as "markers_0.x"; `action` is
@@ -59,7 +54,8 @@ def write_lerobot(folder: str | Path, recording: Recording, *, fps: int | None =
     episode's end); both float32 in the channels' own units, which `meta/palpate.json` tells. Frames
     are evenly spaced, `fps` to the second, by default those of the first sensor. The format has no
     value for what was not seen: it is interpolated from the frames around it, and a column `seen`
-    says which points really were. Events are left out.
+    says which points really were. Events are left out. With `fresh`, a folder that is there goes
+    when the new one is whole.
 
     Raises `PalpateError` when the folder exists, when pyarrow is missing, when there is no
     observation, when something is never seen in an episode, or when `fps` is less than 1.
@@ -72,7 +68,7 @@ def write_lerobot(folder: str | Path, recording: Recording, *, fps: int | None =
             "pip install 'palpate[io]'"
         ) from error
     folder = Path(folder)
-    if folder.exists():
+    if folder.exists() and not fresh:
         raise PalpateError(f"{folder} exists: expected the name of a new folder")
     names = {role: _names_of(recording, role) for role in Role}
     if fps is None:
@@ -87,6 +83,7 @@ def write_lerobot(folder: str | Path, recording: Recording, *, fps: int | None =
     part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
         _write(part, features, aligned.length, recording, fps)
+        shutil.rmtree(folder, ignore_errors=True)
         os.replace(part, folder)
     except OSError as error:
         raise PalpateError(f"cannot write {folder}: {error.strerror or error}") from error
@@ -121,15 +118,14 @@ def _features(recording: Recording, aligned: Aligned, fps: int) -> dict[str, Fea
         first.sort()
         unseen = np.logical_or.reduceat(np.isnan(observed), first, axis=1)
         features[SEEN] = Feature("bool", tuple(points[index] for index in first), ~unseen)
-    counters = {
-        "timestamp": frame / fps,
-        "frame_index": frame,
-        "episode_index": trial,
-        "index": np.arange(len(frame)),
-        "task_index": np.zeros(len(frame)),
-    }
-    for name, values in counters.items():
-        features[name] = Feature(_COUNTERS[name], (), values[:, None])
+    for name, dtype, values in (
+        ("timestamp", "float32", frame / fps),
+        ("frame_index", "int64", frame),
+        ("episode_index", "int64", trial),
+        ("index", "int64", np.arange(len(frame))),
+        ("task_index", "int64", np.zeros(len(frame))),
+    ):
+        features[name] = Feature(dtype, (), values[:, None])
     return {
         name: replace(feature, values=feature.values.astype(feature.dtype))
         for name, feature in features.items()
@@ -259,24 +255,13 @@ def _write_tasks(folder: Path) -> None:
     import pyarrow
     from pyarrow import parquet
 
-    def column(name: str, kind: str, storage: str) -> dict[str, Any]:
-        return {
-            "name": name,
-            "field_name": name,
-            "pandas_type": kind,
-            "numpy_type": storage,
-            "metadata": None,
-        }
-
-    pandas = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [
-            column("task_index", "int64", "int64"),
-            column("task", "unicode", "object"),
-        ],
-        "pandas_version": "2.0.0",
-    }
+    kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    columns = [
+        dict(name=name, field_name=name, pandas_type=kind, numpy_type=storage, metadata=None)
+        for name, kind, storage in kinds
+    ]
+    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns}
+    pandas["pandas_version"] = "2.0.0"
     table = pyarrow.table({"task_index": pyarrow.array([0], pyarrow.int64()), "task": [TASK]})
     table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
     parquet.write_table(table, folder / "meta/tasks.parquet")

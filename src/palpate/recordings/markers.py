@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from palpate.errors import PalpateError
 from palpate.recordings.alignment import DRIVEN_GAP, ON_STAMP
 from palpate.recordings.channel import Channel, Role
+from palpate.recordings.facts import Driven
 from palpate.recordings.recording import Recording, resolve_indices
 from palpate.recordings.trial import Trial
 
@@ -34,8 +35,8 @@ def with_driven(
     """Add a driven channel `name`, values (frames, len(markers), ...), made of gripped markers.
 
     `markers` are indices into the second axis of `channel`; negative ones count from the end.
-    Gaps of up to 10 nominal periods are filled linearly, and rows at either end at which a driven
-    marker was not seen are left out; both are noted.
+    Which they are is kept as the fact `name`. Gaps of up to 10 nominal periods are filled linearly,
+    and rows at either end at which a driven marker was not seen are left out; both are noted.
 
     Raises `PalpateError` for a marker that does not exist or is named twice, a longer gap, or a
     channel `name` that is there already.
@@ -45,7 +46,10 @@ def with_driven(
         if name in trial.channels:
             raise PalpateError(f"trial '{trial.name}' already has a channel '{name}'")
         driven = _driven(trial, markers, channel, name)
-        trials.append(replace(trial, channels={**trial.channels, name: driven}))
+        count = trial[channel].values.shape[1]
+        fact = Driven(channel, resolve_indices(markers, count, "marker"))
+        channels, facts = {**trial.channels, name: driven}, {**trial.facts, name: fact}
+        trials.append(replace(trial, channels=channels, facts=facts))
     return replace(recording, trials=tuple(trials))
 
 
@@ -100,10 +104,9 @@ def _driven(trial: Trial, markers: Sequence[int], channel: str, name: str) -> Ch
                 f"driven marker {marker} of trial '{trial.name}' is not seen for {gap.max():.4g} s "
                 f"after {at:.4f} s, more than {DRIVEN_GAP} frames: cut the trial there"
             )
-        track = values[:, k].reshape(len(time), -1)
-        for axis in range(track.shape[1]):
-            track[:, axis] = np.interp(time, time[rows], track[rows, axis])
-        values[:, k] = track.reshape(values[:, k].shape)
+        for axis in np.ndindex(values.shape[2:]):
+            track = values[(slice(None), k, *axis)]
+            track[:] = np.interp(time, time[rows], track[rows])
     notes = []
     if unseen := int((~seen).sum()):
         notes.append(f"{unseen} unseen positions of driven markers were interpolated")

@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 
 from palpate.commands.identify_bayesian import LEVEL
-from palpate.families.furniture.recording import POSE, WRENCH, meeting, starting_furniture
+from palpate.families.furniture.recording import (
+    POSE,
+    WRENCH,
+    prune_contacts,
+    starting_furniture,
+)
 from palpate.families.furniture.structures import structures
 from palpate.identification.data.segments import Segments, cut, difference
 from palpate.identification.posterior.comparison import PIECE, Comparison, compare, posterior_of
@@ -87,7 +92,7 @@ def fit(handled: Recording, draws: int, seed: int) -> tuple[Comparison, float]:
 
 def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
     """The posterior of all pieces of a scene."""
-    model = meeting(starting_furniture(handled, PERIOD), handled)
+    model = prune_contacts(starting_furniture(handled, PERIOD), handled)
     target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
     return sample(target, draws=draws, seed=seed)
 

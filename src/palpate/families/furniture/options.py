@@ -86,9 +86,9 @@ class IdentifyFurniture(IdentifyBayesian):
 
     def prepare(self, recording: Recording) -> Recording:
         """The recording with a channel of poses and one of wrenches."""
-        from palpate.families.furniture.recording import checked
+        from palpate.families.furniture.recording import prepare
 
-        return checked(recording)
+        return prepare(recording)
 
     def reference(self, recordings: Sequence[Recording], period: float) -> Model:
         """Bodies on wheels, every parameter at its prior's centre."""
@@ -112,11 +112,11 @@ class IdentifyFurniture(IdentifyBayesian):
 
     def sufficient(self, model: Model, recordings: Sequence[Recording]) -> Model:
         """The model without contacts of what never meets."""
-        from palpate.families.furniture.recording import meeting
+        from palpate.families.furniture.recording import prune_contacts
         from palpate.models.planar import Planar
 
         assert isinstance(model, Planar)  # by `hypotheses`
-        return meeting(model, *recordings)
+        return prune_contacts(model, *recordings)
 
     def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:
         """See `IdentifyBayesian.meanings`."""

@@ -23,15 +23,15 @@ from palpate.worlds.furniture.pieces import Piece
 
 POSE, WRENCH = "pose", "wrench"
 FRAMES = 256  # looked at together
-NEAR = 0.3  # m between outlines, beyond which nothing touches before it is seen again
-APART = 2.5  # m between pieces that are handled, so that they do not meet
+CONTACT_RANGE = 0.3  # m between outlines, beyond which nothing touches before it is seen again
+SPACING = 2.5  # m between pieces that are handled, so that they do not meet
 UNITS = {POSE: "m, m, rad", WRENCH: "N, N, N m"}
-SLOWEST = 0.25  # s between frames: of less nothing can be told from a push
-LARGEST = 50.0  # m of an outline
-SAME = 1e-3  # m between corners of the same outline
+MAX_PERIOD = 0.25  # s between frames: of less nothing can be told from a push
+MAX_LENGTH = 50.0  # m of an outline
+MAX_DIFFERENCE = 1e-3  # m between corners of the same outline
 
 
-def checked(recording: Recording) -> Recording:
+def prepare(recording: Recording) -> Recording:
     """The recording, with both channels of the shape that `Planar` needs; one body gets an axis.
 
     Angles are unwrapped over the frames that a body is seen in, so that what lies between two
@@ -52,7 +52,7 @@ def checked(recording: Recording) -> Recording:
                     f"trial '{trial.name}' has a channel '{name}' of shape (frames, "
                     f"{', '.join(map(str, shape))}): expected (frames, bodies, 3) in {unit}"
                 )
-            _check_meant(trial.name, channel, unit, trial[POSE].frame)
+            _check_convention(trial.name, channel, unit, trial[POSE].frame)
             bodies.add(shape[0] if len(shape) == 2 else 1)
             values = channel.values.reshape(len(channel.values), -1, 3)
             if name == POSE:
@@ -67,10 +67,10 @@ def checked(recording: Recording) -> Recording:
     return dataclasses.replace(recording, trials=tuple(trials))
 
 
-def _check_meant(trial: str, channel: Channel, unit: str, frame: str) -> None:
+def _check_convention(trial: str, channel: Channel, unit: str, frame: str) -> None:
     """Refuse what is said to be in another unit or frame, and clocks that are not in seconds."""
     each = ", ".join(dict.fromkeys(unit.split(", ")))  # "m, rad" says as much as "m, m, rad"
-    if channel.unit and _plain(channel.unit) not in (_plain(unit), _plain(each)):
+    if channel.unit and _normalised(channel.unit) not in (_normalised(unit), _normalised(each)):
         raise PalpateError(
             f"channel '{channel.name}' of trial '{trial}' is in '{channel.unit}': expected {unit}"
         )
@@ -79,16 +79,16 @@ def _check_meant(trial: str, channel: Channel, unit: str, frame: str) -> None:
             f"channel '{channel.name}' of trial '{trial}' is in the frame '{channel.frame}' and "
             f"the poses are in '{frame}': expected both in the same"
         )
-    if channel.role is Role.OBSERVATION and not channel.nominal_period <= SLOWEST:
+    if channel.role is Role.OBSERVATION and not channel.nominal_period <= MAX_PERIOD:
         count, apart = len(channel.time), f", {channel.nominal_period:.3g} s apart as a rule"
         raise PalpateError(
             f"channel '{channel.name}' of trial '{trial}' has "
             f"{f'{count} frames{apart}' if count > 1 else 'one frame'}: expected many, at most "
-            f"{SLOWEST:g} s apart, with stamps in seconds"
+            f"{MAX_PERIOD:g} s apart, with stamps in seconds"
         )
 
 
-def _plain(unit: str) -> str:
+def _normalised(unit: str) -> str:
     """Without what may be written one way or another."""
     return re.sub(r"[\s*·⋅.()\[\]-]", "", unit.replace("radians", "rad"))
 
@@ -123,7 +123,7 @@ def check_alike(*recordings: Recording, sized: bool = False) -> None:
     outlines = [] if sized else [each.fact("outlines", Polygons) for each in recordings]
     for name in names[0]:
         corners = [shapely.MultiPoint(one[name]) for one in outlines if one and name in one.names]
-        if any(corners[0].hausdorff_distance(other) > SAME for other in corners[1:]):
+        if any(corners[0].hausdorff_distance(other) > MAX_DIFFERENCE for other in corners[1:]):
             raise PalpateError(
                 f"'{name}' has another outline in what is scored than in what is fitted: expected "
                 "the same body"
@@ -155,10 +155,10 @@ def starting_furniture(
             "polygons with their names, or --size LENGTH WIDTH"
         )
     for name, outline in zip(names, outlines, strict=True):
-        if (length := np.ptp(outline, axis=0).max()) > LARGEST:
+        if (length := np.ptp(outline, axis=0).max()) > MAX_LENGTH:
             raise PalpateError(
-                f"the outline of '{name}' is {length:.4g} m long: expected at most {LARGEST:g} m, "
-                "so its corners may not be in m"
+                f"the outline of '{name}' is {length:.4g} m long: expected at most "
+                f"{MAX_LENGTH:g} m, so its corners may not be in m"
             )
     walls = recording.fact("walls", Polygons)
     return furniture(
@@ -170,13 +170,13 @@ def starting_furniture(
     )
 
 
-def meeting(model: Planar, *recordings: Recording) -> Planar:
-    """The model without contacts of what never comes within `NEAR` of each other.
+def prune_contacts(model: Planar, *recordings: Recording) -> Planar:
+    """The model without contacts of what never comes within `CONTACT_RANGE` of each other.
 
     A step with contacts takes ten times as long to differentiate as one without, whether they
     happen or not. A body counts as on a straight way between the frames that it is seen in, and as
-    where it is seen next before the first and after the last of them. Recordings are `checked`; one
-    that never shows a body leaves all contacts in.
+    where it is seen next before the first and after the last of them. Recordings come from
+    `prepare`; one that never shows a body leaves all contacts in.
     """
     near = np.zeros(len(model.pairs), bool)
     if not len(near):
@@ -197,7 +197,7 @@ def meeting(model: Planar, *recordings: Recording) -> Planar:
             of = seen[:, body]
             for axis in range(3):
                 poses[~of, body, axis] = np.interp(time[~of], time[of], poses[of, body, axis])
-        near |= (np.asarray(gaps(as_floating(poses))) < NEAR).any(axis=0)
+        near |= (np.asarray(gaps(as_floating(poses))) < CONTACT_RANGE).any(axis=0)
     return dataclasses.replace(model, pairs=model.pairs[near])
 
 
@@ -210,7 +210,7 @@ def record_pieces(
     does not exist.
     """
     reach = [Piece(kind).made_as.radius for kind in kinds]
-    across = np.concatenate([[0.0], np.cumsum(np.add(reach[1:], reach[:-1]) + APART)])
+    across = np.concatenate([[0.0], np.cumsum(np.add(reach[1:], reach[:-1]) + SPACING)])
     world = FurnitureWorld(
         [Piece(kind, (0.0, float(y), 0.0)) for kind, y in zip(kinds, across, strict=True)]
     )
@@ -227,7 +227,7 @@ def record_pieces(
     return dataclasses.replace(parts[0], trials=tuple(named))
 
 
-def alone(recording: Recording, body: int) -> Recording:
+def one_body(recording: Recording, body: int) -> Recording:
     """A recording as if one of its bodies had been alone."""
     name = Labels((names_of(recording)[body],))
     trials = [

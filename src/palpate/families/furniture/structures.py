@@ -17,9 +17,9 @@ from jaxtyping import Float
 from palpate.families.furniture.recording import (
     POSE,
     WRENCH,
-    alone,
-    meeting,
     names_of,
+    one_body,
+    prune_contacts,
     starting_furniture,
 )
 from palpate.families.options import Hypotheses
@@ -95,11 +95,14 @@ def hypotheses(
         return Hypotheses(structures(recording, period, size, wheels, law))
     kinds, pieces, by_itself = {}, [], {}
     for body, name in progress(list(enumerate(names)), "each body by itself"):
-        piece = alone(recording, body)
+        piece = one_body(recording, body)
         aligned = piece.align(period, POSE, WRENCH)
         models = structures(piece, period, size, wheels, law)
         found = explore(
-            {kind: posterior_of(meeting(model, piece), aligned) for kind, model in models.items()},
+            {
+                kind: posterior_of(prune_contacts(model, piece), aligned)
+                for kind, model in models.items()
+            },
             seed,
         )
         probability = shares({kind: settled.evidence for kind, settled in found.items()})

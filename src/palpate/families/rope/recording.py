@@ -8,7 +8,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.models.rope import Rope
 from palpate.parameters import declare
-from palpate.recordings import Aligned, Channel, Recording, Role, Trial
+from palpate.recordings import Aligned, Channel, Driven, Recording, Role, Trial
 from palpate.worlds.excitation import excitation, record
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 
@@ -23,7 +23,7 @@ def record_rope(
     """Shake a MuJoCo rope from hanging, one trial of `duration` seconds for each seed.
 
     Channels: `markers` (frames, markers, 3) as seen, `gripper` (frames, 1, 3) where the driven end
-    was, and `command` (steps, 1, 3) the velocity it was told. Raises `PalpateError` when the
+    was, and `command` (steps, 1, 3) the velocity that was ordered. Raises `PalpateError` when the
     simulation diverges.
     """
     world = RopeWorld(configuration)
@@ -38,7 +38,8 @@ def record_rope(
             Channel(GRIPPER, Role.DRIVEN, data["time"], data["gripper_position"][:, None], "m"),
             Channel(COMMAND, Role.COMMAND, data["command_time"], data["command"][:, None], "m/s"),
         )
-        trials.append(Trial(f"seed {seed}", {channel.name: channel for channel in channels}))
+        by_name = {channel.name: channel for channel in channels}
+        trials.append(Trial(f"seed {seed}", by_name, facts={GRIPPER: Driven(MARKERS, (0,))}))
     return Recording(tuple(trials), {"source": "MuJoCo rope"} | constants(configuration))
 
 

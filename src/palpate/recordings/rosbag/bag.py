@@ -18,8 +18,8 @@ from palpate.recordings.rosbag.files import Bag, open_bag
 from palpate.recordings.rosbag.topics import Chosen, Track, choose, tracks_of
 from palpate.recordings.tables import InputTable, MarkerTable
 
-CLOCKS_APART = 0.5  # s between clocks; less is what cameras and networks take
-SHORTEST = 1.0  # s of a piece between two gaps that is worth being a trial
+MAX_CLOCK_OFFSET = 0.5  # s between clocks; less is what cameras and networks take
+MIN_DURATION = 1.0  # s of a piece between two gaps that is worth being a trial
 GRIPPER, COMMAND = "gripper", "command"
 
 
@@ -49,10 +49,10 @@ def read_bag(path: str | Path, topics: Sequence[str] = ()) -> list[tuple[str, Ma
 def _trials(path: Path, bag: Bag, chosen: Chosen) -> list[tuple[str, MarkerTable]]:
     times, notes = _times(chosen)
     pieces = _pieces([time for track, time in times.items() if track is not chosen.command], chosen)
-    long = [piece for piece in pieces if piece[1] - piece[0] >= SHORTEST] or pieces
+    long = [piece for piece in pieces if piece[1] - piece[0] >= MIN_DURATION] or pieces
     if len(long) < len(pieces):
         notes.append(
-            f"{len(pieces) - len(long)} pieces of less than {SHORTEST:g} s between gaps in the "
+            f"{len(pieces) - len(long)} pieces of less than {MIN_DURATION:g} s between gaps in the "
             "stamps were left out"
         )
     trials = []
@@ -90,7 +90,7 @@ def _times(chosen: Chosen) -> tuple[dict[Track, np.ndarray], list[str]]:
     """Seconds from the first marker on, for each message of each track, and notes."""
     notes = [*chosen.notes]
     delays = [track.delay for track in chosen.tracks]
-    by_receipt = max(delays) - min(delays) > CLOCKS_APART
+    by_receipt = max(delays) - min(delays) > MAX_CLOCK_OFFSET
     if by_receipt:
         notes.append(
             f"the clocks of the topics are {max(delays) - min(delays):.4g} s apart, so time is "

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from palpate.errors import PalpateError
-from palpate.recordings.alignment import LARGEST
+from palpate.recordings.alignment import MAX_BYTES
 from palpate.recordings.rosbag.decoding import Decode, ros_decoder
 from palpate.runs.storage import DamagedFileError, parse_json
 
@@ -236,10 +236,10 @@ def _check_packed(path: Path) -> None:
             file.seek(0)
             size = 0
             stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
-            while size <= LARGEST and (part := stream.read(2**20)):
+            while size <= MAX_BYTES and (part := stream.read(2**20)):
                 size += len(part)
-    if size > LARGEST:
+    if size > MAX_BYTES:
         raise PalpateError(
-            f"{path.name} unpacks to more than {LARGEST / 2**30:.0f} GiB: convert it with "
+            f"{path.name} unpacks to more than {MAX_BYTES / 2**30:.0f} GiB: convert it with "
             "`ros2 bag convert` to one that is not packed"
         )

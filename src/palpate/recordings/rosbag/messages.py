@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-MOST = 1000  # points in a message; more are the surface that a depth camera sees, not markers
-LATEST = 2**62  # ns after 1970 that a clock may show: the year 2116
+MAX_POINTS = 1000  # points in a message; more are the surface that a depth camera sees, not markers
+MAX_STAMP = 2**62  # ns after 1970 that a clock may show: the year 2116
 _FLOATS = {7: "f4", 8: "f8"}  # of sensor_msgs/PointField, and of foxglove.PackedElementField
 _NO_POINT = {9}  # visualization_msgs/Marker: a text
 _DELETED = {2, 3}  # visualization_msgs/Marker: an order to forget earlier ones
@@ -96,13 +96,13 @@ def _markers(message: Any) -> Sight | None:
     else:
         lists = (value for value in _fields(message) if isinstance(value, list) and value)
         items = next((value for value in lists if _place(value[0]) is not None), [])
-        if not items or len(items) > MOST:
+        if not items or len(items) > MAX_POINTS:
             return None
         there = [item for item in items if _field(item, "action") not in _DELETED]
         points, names = _places(there)
         # visualization_msgs/Marker: its points lie in a frame of their own
         points = _moved(points, _field(message, "pose"))
-    if points is None or len(points) > MOST:
+    if points is None or len(points) > MAX_POINTS:
         return None
     stamp, frame = _header(message)
     if stamp is None and frame is None and items:
@@ -158,7 +158,7 @@ def _cloud(message: Any) -> np.ndarray | None:
         formats.append(order + _FLOATS[kind])
         offsets.append(_field(packed[axis], "offset"))
     height, width = _field(message, "height"), _field(message, "width")
-    if height is not None and height * width > MOST:
+    if height is not None and height * width > MAX_POINTS:
         return None
     data = _field(message, "data")
     data = base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)
@@ -253,6 +253,6 @@ def _header(message: Any) -> tuple[int | None, str | None]:
     frame = frame if isinstance(frame, str) else None
     if not isinstance(seconds, int) or not isinstance(fraction, int):
         return None, frame
-    if not 0 <= seconds * 10**9 + fraction < LATEST:
+    if not 0 <= seconds * 10**9 + fraction < MAX_STAMP:
         raise ValueError(f"a stamp of {seconds} s")
     return seconds * 10**9 + fraction or None, frame

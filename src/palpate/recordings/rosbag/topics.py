@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.recordings.alignment import LARGEST
+from palpate.recordings.alignment import MAX_BYTES
 from palpate.recordings.csv import in_natural_order, some
 from palpate.recordings.rosbag.files import Bag
-from palpate.recordings.rosbag.messages import LATEST, MOST, Kind, Sight, sights
+from palpate.recordings.rosbag.messages import MAX_POINTS, MAX_STAMP, Kind, Sight, sights
 from palpate.runs.storage import DamagedFileError
 
-TRIED = 500  # messages of a topic that show nothing before it is read no further
-USUAL = 0.5  # of the messages that have to hold as many points as most others do
+MAX_EMPTY_MESSAGES = 500  # messages of a topic that show nothing before it is read no further
+MIN_SHARE = 0.5  # of the messages that have to hold as many points as most others do
 
 
 @dataclass(eq=False)
@@ -92,7 +92,7 @@ def tracks_of(bag: Bag, named: Sequence[str]) -> dict[str, Track]:
     try:
         for topic, received, decode, data in bag.messages(skipped):
             bag.read[topic] += 1
-            if not 0 <= received < LATEST:
+            if not 0 <= received < MAX_STAMP:
                 raise DamagedFileError(f"a message was received {received} ns after 1970")
             try:
                 found = sights(decode(data))
@@ -113,12 +113,12 @@ def tracks_of(bag: Bag, named: Sequence[str]) -> dict[str, Track]:
                 size += sight.points.nbytes
             if found:
                 worth.add(topic)
-            elif topic not in worth and bag.read[topic] >= TRIED:
+            elif topic not in worth and bag.read[topic] >= MAX_EMPTY_MESSAGES:
                 skipped.add(topic)
-            if size > LARGEST:
+            if size > MAX_BYTES:
                 raise PalpateError(
-                    f"the markers and poses in it take more than {LARGEST / 2**30:.0f} GiB: split "
-                    "it into several recordings"
+                    f"the markers and poses in it take more than {MAX_BYTES / 2**30:.0f} GiB: "
+                    "split it into several recordings"
                 )
     except (PalpateError, OSError, MemoryError):
         raise
@@ -252,10 +252,10 @@ def _positions(track: Track) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
         names = in_natural_order(
             list(dict.fromkeys(name for sight in track.sights for name in sight.names or ()))
         )
-        if not 0 < len(names) <= MOST:
+        if not 0 < len(names) <= MAX_POINTS:
             raise PalpateError(
-                f"topic '{track.topic}' has {len(names)} markers of different names; 1 to {MOST} "
-                "are read"
+                f"topic '{track.topic}' has {len(names)} markers of different names; 1 to "
+                f"{MAX_POINTS} are read"
             )
         column = {name: number for number, name in enumerate(names)}
         positions = np.full((total, len(names), 3), np.nan)
@@ -264,7 +264,7 @@ def _positions(track: Track) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
         return positions, names, []
     sizes = Counter(len(sight.points) for sight in track.sights)
     count, usual = sizes.most_common(1)[0]
-    if usual <= USUAL * total or count == 0:
+    if usual <= MIN_SHARE * total or count == 0:
         raise PalpateError(
             f"topic '{track.topic}' has {min(sizes)} to {max(sizes)} markers without names in a "
             "message, so nobody can say which is which: expected always as many, with NaN for "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
@@ -16,7 +16,6 @@ from palpate.recordings.facts import Fact
 from palpate.worlds.excitation import smooth_step
 from palpate.worlds.furniture.furniture import (
     CONTROL_PERIOD,
-    FurnitureObservation,
     FurnitureTruth,
     FurnitureWorld,
 )
@@ -26,7 +25,7 @@ REACH = 0.35  # m, and
 TURN = 0.8  # rad: how far a hand wants to wiggle a piece from where it stood
 SPELL, RELEASE = 2.5, 0.5  # s: it lets go for the last half second of each spell
 AXES = "x y yaw, z up; wrenches about each body frame's origin"
-MOST_TURN = 1.0  # rad, of a push
+MAX_TURN = 1.0  # rad, of a push
 FULL_STRETCH = 0.1  # m off its way at which a hand uses its full force
 
 
@@ -150,7 +149,7 @@ class Push(Hand):
         unit = np.array([math.cos(self._direction), math.sin(self._direction)])
         share = np.array([*unit, point[0] * unit[1] - point[1] * unit[0]])
         acceleration = _mobility(truth, self.body) @ share  # per newton
-        fastest = max(share @ acceleration / self._distance, abs(acceleration[2]) / MOST_TURN)
+        fastest = max(share @ acceleration / self._distance, abs(acceleration[2]) / MAX_TURN)
         hold = self._margin * _holding_force(truth, self.body, share)
         force = hold + 1 / (self._reached * max(fastest, 1e-6))
         cosine, sine = np.cos(truth.poses[self.body, 2]), np.sin(truth.poses[self.body, 2])
@@ -255,12 +254,22 @@ def record(
 ) -> Recording:
     """Drive the world through `trials` and keep what was observed.
 
+    Each trial has the observation "pose" (frames, bodies, 3) in m, m, rad, the command "wrench"
+    (frames - 1, bodies, 3) in N, N, N m as measured, stamped when it began to act, and as facts the
+    names of the "bodies" in the order of the channels, their "outlines" and the "walls".
+
     Args:
         trials: each a hand, or wrenches (steps, bodies, 3) in N, N, N m. The i-th is episode
             `first_episode + i` of `seed`, so that all are of the same pieces.
         names: of the trials.
     """
-    recorded, facts = [], facts_of(world)
+    outlines = world.outlines
+    facts: dict[str, Fact] = {
+        "bodies": Labels(world.names),
+        "outlines": Polygons(tuple(outlines.values()), tuple(outlines), "body"),
+        "walls": Polygons(world.walls),
+    }
+    recorded = []
     for number, (name, trial) in enumerate(zip(names, trials, strict=True)):
         observations = [world.reset(seed, episode=first_episode + number)]
         if isinstance(trial, np.ndarray):
@@ -268,32 +277,11 @@ def record(
         else:
             for step in range(trial.steps):
                 observations.append(world.step(trial.wrench(step, world.truth())))
-        recorded.append(trial_of(name, observations, facts))
+        time = np.array([observation.time for observation in observations])
+        poses = np.array([observation.poses for observation in observations])
+        wrenches = np.array([observation.wrench for observation in observations[1:]])
+        pose = Channel("pose", Role.OBSERVATION, time, poses, "m, m, rad", axes=AXES)
+        wrench = Channel("wrench", Role.COMMAND, time[:-1], wrenches, "N, N, N m", axes=AXES)
+        recorded.append(Trial(name, {"pose": pose, "wrench": wrench}, facts=facts))
     provenance = {"world": "furniture", "seed": seed, "first_episode": first_episode}
     return Recording(tuple(recorded), provenance)
-
-
-def trial_of(
-    name: str, observations: Sequence[FurnitureObservation], facts: Mapping[str, Fact]
-) -> Trial:
-    """What was observed in consecutive control periods, two or more, from a reset or later on.
-
-    The observation "pose" (frames, bodies, 3) in m, m, rad and the command "wrench"
-    (frames - 1, bodies, 3) in N, N, N m as measured, each stamped when it began to act.
-    """
-    time = np.array([observation.time for observation in observations])
-    poses = np.array([observation.poses for observation in observations])
-    wrenches = np.array([observation.wrench for observation in observations[1:]])
-    pose = Channel("pose", Role.OBSERVATION, time, poses, "m, m, rad", axes=AXES)
-    wrench = Channel("wrench", Role.COMMAND, time[:-1], wrenches, "N, N, N m", axes=AXES)
-    return Trial(name, {"pose": pose, "wrench": wrench}, facts=facts)
-
-
-def facts_of(world: FurnitureWorld) -> dict[str, Fact]:
-    """What a recording says of its scene: "bodies", names in the order of the channels' bodies,
-    their "outlines" in body frames and "walls"."""
-    return {
-        "bodies": Labels(world.names),
-        "outlines": Polygons(tuple(world.outlines.values()), tuple(world.outlines), "body"),
-        "walls": Polygons(world.walls),
-    }

@@ -20,7 +20,7 @@ from palpate.identification.gradient.least_squares import Intervals
 from palpate.models.files import load_model
 from palpate.models.model import rollout
 from palpate.networks import load_policy
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Channel, Driven, Recording, Role, Trial
 from palpate.recordings.files import read_recording, write_recording
 from palpate.report import read_evidence
 from palpate.runs import Figure, Result, Run
@@ -272,6 +272,7 @@ def test_a_recording_holds_what_the_world_shows_and_how_it_was_made(tmp_path, ca
     assert recording.trials[0]["gripper"].values.shape == (51, 1, 3)
     assert recording.provenance["seed"] == 3
     assert recording.provenance["markers"] == 5
+    assert recording.fact("gripper", Driven) == Driven("markers", (0,))
     result = read_result(tmp_path / "runs" / "record-rope-001" / "result.json")
     assert result.seeds == [3]
     # the same again is no harm; another one is not written over it

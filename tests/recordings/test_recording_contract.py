@@ -162,7 +162,7 @@ def test_names_are_those_of_channels_or_of_events():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: Labels(("a", "a")), "expected a name for each"),
+        (lambda: Labels(("a", "a")), "a name for each"),
         (lambda: Labels(("a", "")), "expected texts"),
         (lambda: Labels("ab"), "expected texts"),
         (lambda: Quantity([1.0, np.nan], "m"), "expected finite numbers"),

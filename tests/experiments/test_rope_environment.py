@@ -1,13 +1,12 @@
-"""A rope at rest as a Gymnasium environment, and what an actor of it does."""
+"""Bringing a rope to rest, episodes side by side, and what an actor of them does."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
-from palpate.experiments.rivals.rope_environment import Episodes, RopeEnvironment
+from palpate.experiments.rivals.rope_environment import Episodes
 from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.parameters import parameters_of
@@ -24,30 +23,6 @@ def episodes() -> Episodes:
     model = Rope.uniform(1.0, 0.1, 4, drive="velocity", substeps=4, bend_stiffness=1e-4)
     training = Training(starts=64, observation_noise=NOISE, width=8)
     return Episodes.of(TASK, model, training, jax.random.key(1))
-
-
-@pytest.mark.filterwarnings("ignore:.*observation space (min|max)imum value is:UserWarning")
-@pytest.mark.filterwarnings("ignore:.*environment is different from the unwrapped:UserWarning")
-def test_gymnasium_finds_nothing_wrong(episodes) -> None:
-    check_env(RopeEnvironment(episodes), skip_render_check=True)
-
-
-def test_time_runs_out_and_seeds_repeat(episodes) -> None:
-    environment = RopeEnvironment(episodes)
-
-    def played(seed: int) -> tuple[np.ndarray, list[bool]]:
-        seen, ends = [environment.reset(seed=seed)[0]], []
-        for _ in range(20):
-            observation, _, terminated, truncated, _ = environment.step(np.full(3, 0.5, np.float32))
-            assert not terminated
-            seen.append(observation)
-            ends.append(truncated)
-        return np.stack(seen), ends
-
-    first, ends = played(3)
-    np.testing.assert_array_equal(first, played(3)[0])
-    assert not np.array_equal(first, played(4)[0])
-    assert ends == [False] * 19 + [True]
 
 
 def test_rewards_are_minus_the_loss_along_a_known_path(episodes) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon, box
 
+from palpate.experiments.experiment import Experiment
 from palpate.families.furniture.plan_picture import plan_picture
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot, map_of
 from palpate.planning.movable_obstacles.search.plan import Plan, timed
@@ -50,26 +51,25 @@ class Timed:
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     """Plan maps of every size; `quick` is fewer of them."""
-    kind = "quick" if quick else "full"
+    experiment, kind = Experiment(NAME, out, quick, seed), "quick" if quick else "full"
     sizes, maps = SIZES[kind], MAPS[kind]
-    print(f"{NAME}: {len(sizes)} sizes, {maps} maps each, 1-3 minutes", flush=True)
-    began = timed()
-    Planner(seed=seed).plan(generated_map(5, SEEDS - 1))  # what is loaded once is not counted
+    experiment.announce({f"{len(sizes)} sizes, {maps} maps each": 1 if quick else 3})
+    first = SEEDS + 1000 * seed
     tried: list[Timed] = []
-    for objects in sizes:
-        for index in range(maps):
-            tried.append(plan_timed(objects, SEEDS + 1000 * seed + index, seed))
-        own = [one.planning_s for one in tried if one.objects == objects]
-        print(f"{objects} objects: {statistics.median(own):.3f} s", flush=True)
+    with experiment.counted():
+        Planner(seed=seed).plan(generated_map(5, SEEDS - 1))  # what is loaded once is not counted
+        for objects in sizes:
+            own = [plan_timed(objects, first + index, seed) for index in range(maps)]
+            median = statistics.median(one.planning_s for one in own)
+            print(f"{objects} objects: {median:.3f} s", flush=True)
+            tried += own
     largest = [one for one in tried if one.objects == sizes[-1] and one.plan is not None]
     if largest:
         world = generated_map(largest[0].objects, largest[0].seed)
         plan_picture(out / "plan.png", world, largest[0].plan)
-    return Result(
-        NAME,
+    return experiment.result(
         figures(tried),
         {
-            "quick": quick,
             "sizes": sizes,
             "maps": maps,
             "room_m": ROOM,
@@ -80,9 +80,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "cell_m": CELL,
             "timed": "from the map in memory to the plan, or to the finding that there is none",
         },
-        [seed],
-        f"nothing is fitted; maps of seeds {SEEDS + 1000 * seed} on are evaluated",
-        timed() - began,
+        f"nothing is fitted; maps of seeds {first} on are evaluated",
+        [seed, *range(first, first + maps)],
     )
 
 
@@ -106,12 +105,7 @@ def figures(tried: list[Timed]) -> list[Figure]:
     slowest = max(one.planning_s for one in tried if one.objects == sizes[-1])
     rows = [
         Figure(
-            "exponent",
-            slope,
-            "",
-            bar=EXPONENT_BAR,
-            seed_document="typically linear",
-            spread=spread,
+            "exponent", slope, "", bar=EXPONENT_BAR, seed_document="typically linear", spread=spread
         ),
         Figure(f"planning_s_at_{sizes[-1]}", slowest, "s", bar=TIME_BAR),
         Figure("reached_rate", reached, "", better="higher"),
@@ -135,7 +129,7 @@ def figures(tried: list[Timed]) -> list[Figure]:
 def exponent(points: list[tuple[int, float]]) -> tuple[float, float]:
     """The slope of log time over log objects by least squares, and its 90 % half-width."""
     x, y = np.log(np.array(points, float)).T
-    (slope, offset), covariance = np.polyfit(x, y, 1), np.nan
+    slope, offset = np.polyfit(x, y, 1)
     residual = y - slope * x - offset
     freedom = max(1, len(x) - 2)
     covariance = (residual @ residual) / freedom / ((x - x.mean()) @ (x - x.mean()))

@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.experiments.experiment import Experiment
 from palpate.families.furniture.plan_picture import plan_animation, plan_picture
 from palpate.numerics.polygons import length_of
 from palpate.planning.movable_obstacles.maps.files import maps_in, read_map
 from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.search.paths import distances
-from palpate.planning.movable_obstacles.search.plan import Plan, timed, write_plan
+from palpate.planning.movable_obstacles.search.plan import Plan, write_plan
 from palpate.planning.movable_obstacles.search.planner import Planner
 from palpate.planning.movable_obstacles.search.verification import faults_of
 from palpate.runs import Figure, Result
@@ -103,30 +104,26 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0, maps: Path | Non
     if maps is None:
         raise PalpateError("namo-scenarios needs maps: give a folder with --maps")
     files = maps_in(maps)
-    print(f"{NAME}: {len(files)} maps, a few seconds each", flush=True)
-    began = timed()
+    experiment, repeats = Experiment(NAME, out, quick, seed), 1 if quick else REPEATS
+    experiment.announce({f"{len(files)} maps": 1})
     trials: list[Trial] = []
-    for path in files:
-        taken = {trial.name for trial in trials}
-        trial = tried(path, out, 1 if quick else REPEATS, seed, taken)
-        trials.append(trial)
-        print(trial.line(), flush=True)
-    return Result(
-        NAME,
+    with experiment.counted():
+        for path in files:
+            taken = {trial.name for trial in trials}
+            trials.append(tried(path, out, repeats, seed, taken))
+            print(trials[-1].line(), flush=True)
+    return experiment.result(
         figures(trials),
         {
-            "quick": quick,
             "maps": [path.relative_to(maps).as_posix() for path in files],
             "margin": "each map's own",
             "timed": "from the map in memory to the plan, each from nothing; the least of them",
-            "repeats": 1 if quick else REPEATS,
+            "repeats": repeats,
             "carried": "what the robot drives while it carries, as namosim counts it",
             "goals": "one after the other, each on the map as the plans before left it",
             "rival": "namosim bb857218, Stilman 2005, planning of all replans in total, of one run",
         },
-        [seed],
         "nothing is fitted; every map in the folder is evaluated",
-        timed() - began,
     )
 
 
@@ -213,25 +210,14 @@ def figures(trials: list[Trial]) -> list[Figure]:
     goals = sum(trial.goals for trial in trials)
     reached = sum(len(trial.plans) for trial in trials) / goals
     times = [trial.planning_s for trial in trials if trial.plans]
+    slowest = [NAMOSIM[trial.name].planning_s for trial in trials if trial.name in NAMOSIM]
+    speedup_bar, ratio_bar = (SPEEDUP_BAR, RATIO_BAR) if compared else (None, None)
     head = [
         Figure("reached_rate", reached, "", bar=1.0, better="higher", rival=1.0),
-        Figure(
-            "speedup_min",
-            _least(speedups),
-            "",
-            bar=SPEEDUP_BAR if compared else None,
-            better="higher",
-            rival=1.0,
-        ),
-        Figure(
-            "distance_ratio_max",
-            _most(ratios),
-            "",
-            bar=RATIO_BAR if compared else None,
-            rival=1.0,
-        ),
-        Figure("object_distance_ratio_max", _most(body_ratios), "", rival=1.0),
-        Figure("planning_s_max", _most(times), "s", rival=_slowest(trials)),
+        Figure("speedup_min", min(speedups, default=None), "", speedup_bar, "higher", rival=1.0),
+        Figure("distance_ratio_max", max(ratios, default=None), "", ratio_bar, rival=1.0),
+        Figure("object_distance_ratio_max", max(body_ratios, default=None), "", rival=1.0),
+        Figure("planning_s_max", max(times, default=None), "s", rival=max(slowest, default=None)),
     ]
     return head + rows
 
@@ -250,16 +236,3 @@ def _rows(trial: Trial, known: Reference | None) -> list[Figure]:
     rows = [Figure(f"{trial.name}.{name}", v, unit, rival=other) for name, v, unit, other in values]
     efficiency = Figure(f"{trial.name}.path_efficiency", trial.efficiency, "", better="higher")
     return [reached, *rows, efficiency]
-
-
-def _least(values: list[float]) -> float | None:
-    return min(values) if values else None
-
-
-def _most(values: list[float]) -> float | None:
-    return max(values) if values else None
-
-
-def _slowest(trials: list[Trial]) -> float | None:
-    known = [NAMOSIM[trial.name].planning_s for trial in trials if trial.name in NAMOSIM]
-    return _most(known)

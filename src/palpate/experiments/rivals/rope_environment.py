@@ -1,4 +1,4 @@
-"""Bringing a rope to rest, as reinforcement learning asks for it: a Gymnasium environment.
+"""Bringing a rope to rest, as reinforcement learning asks for it: many episodes side by side.
 
 Inside is the identified model, drawn anew for each episode within the spreads of its parameters,
 from the start states, with the sensors' noise and the limits that our own policy is trained with:
@@ -189,34 +189,3 @@ class Episodes(eqx.Module):
         features = self.task.features(RopeState(position, velocity), None)
         seen = self.actor.told(situation.command, features)
         return dataclasses.replace(situation, window=window, key=key), seen
-
-
-class RopeEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One such episode after the other, as Gymnasium has it. Time runs out; nothing else ends one.
-
-    Observations are scaled features and the command (see `Actor.told`), actions as of `Actor`.
-    """
-
-    metadata = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own name and kind
-
-    def __init__(self, episodes: Episodes):
-        self._episodes = episodes
-        self.observation_space = episodes.observation_space
-        self.action_space = episodes.action_space
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """See `gymnasium.Env.reset`; there are no options."""
-        super().reset(seed=seed)
-        key = jax.random.key(int(self.np_random.integers(2**31)))
-        self._situation, seen = self._episodes.begin(key, 1)
-        self._step = 0
-        return np.asarray(seen[0]), {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """See `gymnasium.Env.step`."""
-        actions = jnp.asarray(action, jnp.float32)[None]
-        self._situation, seen, reward = self._episodes.step(self._situation, actions)
-        self._step += 1
-        return np.asarray(seen[0]), float(reward[0]), False, self._step >= self._episodes.length, {}

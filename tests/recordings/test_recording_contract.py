@@ -1,6 +1,8 @@
 """Several channels on one grid, events that are never interpolated, and typed facts."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -110,6 +112,17 @@ def test_each_frame_has_the_newest_event():
     assert cloud[1, 30:33].tolist() == [0, -1, -1]  # the second trial is over
     with pytest.raises(PalpateError, match="no events 'depth'; it has: cloud, picture"):
         Recording((hinge(),), {}).align(0.01, "angle", (), events=("depth",))
+
+
+def test_the_page_on_recordings_shows_how_one_is_made(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    given = {"tracked": np.arange(50) / 50, "felt": np.arange(500) / 500, "taken": np.array([0.5])}
+    given |= {"poses": np.zeros((50, 3)), "forces": np.ones((500, 3))}
+    monkeypatch.chdir(tmp_path)
+    exec(example, given | {"images": [np.zeros((480, 640, 3), np.uint8)]}, found := {})
+    assert found["newest"][0, [0, 24, 25, 49]].tolist() == [-1, -1, 0, 0]
+    assert read_recording("R.npz").fact("camera", Intrinsics).focal == [600.0, 600.0]
 
 
 # --- events -----------------------------------------------------------------------------------

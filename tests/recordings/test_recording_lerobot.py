@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Channel, Quantity, Recording, Role, Trial
 from palpate.recordings.lerobot import write_lerobot
 
 pytest.importorskip("pyarrow")
@@ -207,7 +207,8 @@ def test_several_channels_stand_side_by_side(tmp_path):
         command(),
         Channel("grip", Role.COMMAND, TIME, TIME, "N"),
     )
-    write_lerobot(tmp_path / "set", recording(trial("a", *channels)))
+    whole = Trial("a", {part.name: part for part in channels}, {}, {"rope": Quantity(0.5, "kg")})
+    write_lerobot(tmp_path / "set", recording(whole))
     info, frames, _ = read(tmp_path / "set")
     names = info["features"]["observation.state"]["names"]
     assert (names[:2], len(names)) == (["force", "markers_0.x"], 13)
@@ -216,6 +217,10 @@ def test_several_channels_stand_side_by_side(tmp_path):
     np.testing.assert_allclose(state[5:, 0], force[5:], atol=1e-6)
     assert column(frames, "seen")[3:6].tolist() == [[True] * 5, [False] + [True] * 4, [True] * 5]
     assert info["features"]["action"]["names"][-1] == "grip"
+    about = json.loads((tmp_path / "set/meta/palpate.json").read_text())
+    assert about["facts"] == [
+        {"rope": {"kind": "quantity", "values": 0.5, "unit": "kg", "frame": ""}}
+    ]
     np.testing.assert_allclose(column(frames, "action")[:-1, 3], TIME[:-1], atol=1e-6)
 
 

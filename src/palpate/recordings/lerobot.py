@@ -22,6 +22,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.recordings.alignment import Aligned
 from palpate.recordings.channel import Role
+from palpate.recordings.facts import fact_to_json
 from palpate.recordings.recording import Recording
 from palpate.runs.storage import write_json
 
@@ -219,6 +220,10 @@ def _write(
             "episodes": [trial.name for trial in recording.trials],
             "units": {c.name: c.unit for c in recording.trials[0].channels.values()},
             "provenance": recording.provenance,
+            "facts": [
+                {name: fact_to_json(fact) for name, fact in trial.facts.items()}
+                for trial in recording.trials
+            ],
             "notes": recording.notes,
         },
     )

@@ -12,7 +12,6 @@ from palpate.families.options import Evaluate
 from palpate.models.files import load_model
 from palpate.models.model import Model
 from palpate.networks import CommandPolicy, load_policy
-from palpate.runs import Result
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import write_text
@@ -47,16 +46,9 @@ def run(options: Evaluate) -> Path:
             figures = [*found.figures]
             if model is not None:
                 figures += figures_in_model(task, model, policy, options.seed)
-            result = Result(
-                name=name,
-                figures=figures,
-                settings=configuration | found.settings | {"notes": found.notes},
-                seeds=[options.seed],
-                split=found.split,
-                wall_time_s=run.elapsed,
-            )
             write_text(run.path / folders.TABLE, "\n".join(found.table) + "\n")
-            run.finish(result.to_dict())
+            settings = found.settings | {"notes": found.notes}
+            folders.finish(run, options, name, figures, settings, found.split)
         print((run.path / folders.TABLE).read_text(encoding="utf-8"), end="")
         notes = read_result(run.path / RESULT).settings["notes"]
         for note in notes:

@@ -8,7 +8,7 @@ from palpate.deployment.contract import contract_of, read_contract, write_contra
 from palpate.deployment.onnx_export import difference, write_onnx
 from palpate.errors import PalpateError
 from palpate.networks import load_policy
-from palpate.runs import Figure, Result
+from palpate.runs import Figure
 from palpate.runs.storage import write_bytes
 
 AGREES = 5e-6  # of the limit of a command
@@ -47,16 +47,7 @@ def run(options: Export) -> Path:
         write_contract(beside, contract, target.name)
         if not run.finished:
             figure = Figure("onnx_difference", off, "of the limit", bar=AGREES)
-            run.finish(
-                Result(
-                    name="export",
-                    figures=[figure],
-                    settings=configuration,
-                    seeds=[options.seed],
-                    split=None,
-                    wall_time_s=run.elapsed,
-                ).to_dict()
-            )
+            folders.finish(run, options, "export", [figure])
         print(f"policy: {target} (commands differ by at most {off:.1g} of their limits)")
         print(f"contract: {beside}")
         folders.hand_over(options, run, "A policy as ONNX")

@@ -12,7 +12,7 @@ from palpate.errors import PalpateError
 from palpate.families.options import Options
 from palpate.report import build_report
 from palpate.report.evidence import EVIDENCE, RENDERINGS
-from palpate.runs import Run
+from palpate.runs import Figure, Result, Run
 from palpate.runs.run import CONFIGURATION, ENVIRONMENT, RESULT
 from palpate.runs.storage import plain, read_json, write_bytes
 
@@ -57,6 +57,26 @@ def open_run(
                 return Run.open(path, configuration)
     number = numbered[-1][0] + 1 if numbered else 1
     return Run.open(RUNS / f"{name}-{number:03d}", configuration)
+
+
+def finish(
+    run: Run,
+    options: Options,
+    name: str,
+    figures: Sequence[Figure] = (),
+    settings: Mapping[str, Any] | None = None,
+    split: dict[str, Any] | None = None,
+) -> None:
+    """Finish a command's run with its `result.json`: `settings` beside the run's configuration."""
+    result = Result(
+        name=name,
+        figures=list(figures),
+        settings={**run.configuration, **(settings or {})},
+        seeds=[options.seed],
+        split=split,
+        wall_time_s=run.elapsed,
+    )
+    run.finish(result.to_dict())
 
 
 def deliver(options: Options, run: Run, product: str) -> Path:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from palpate.commands import folders
 from palpate.families.options import Plan
-from palpate.runs import Result
 
 
 def run(options: Plan) -> Path:
@@ -21,15 +20,7 @@ def run(options: Plan) -> Path:
     configuration = folders.configuration_of(options, f"plan {options.problem}") | problem.inputs
     with folders.open_run(options, name, configuration, folders.PLAN) as run:
         if not run.finished:
-            result = Result(
-                name=name,
-                figures=problem.solve(run),
-                settings=configuration,
-                seeds=[options.seed],
-                split=None,
-                wall_time_s=run.elapsed,
-            )
-            run.finish(result.to_dict())
+            folders.finish(run, options, name, problem.solve(run))
         print("\n".join(problem.describe(run.path / folders.PLAN)))
         folders.hand_over(options, run, problem.title, folders.PLAN)
         for picture in sorted(run.path.glob("*.png")):

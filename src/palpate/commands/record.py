@@ -7,9 +7,7 @@ from typing import Any
 from palpate.commands import folders
 from palpate.errors import PalpateError
 from palpate.families.options import Record
-from palpate.recordings import Recording
 from palpate.recordings.files import read_recording, write_recording
-from palpate.runs import Result
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 
@@ -33,7 +31,8 @@ def run(options: Record) -> Path:
             provenance = {**recording.provenance, **configuration}
             recording = dataclasses.replace(recording, provenance=provenance)
             write_recording(run.path / folders.RECORDING, recording)
-            run.finish(_result(name, options, recording, run.elapsed).to_dict())
+            names = {"trial_names": [trial.name for trial in recording.trials]}
+            folders.finish(run, options, name, settings=names)  # nothing is claimed
         count = len(read_result(run.path / RESULT).settings["trial_names"])
         path = folders.deliver(options, run, folders.RECORDING)
     trials = "1 trial" if count == 1 else f"{count} trials"
@@ -50,16 +49,4 @@ def _is_there(file: Path, options: Record, configuration: dict[str, Any]) -> boo
         return True
     raise PalpateError(
         f"{file} holds another recording: give another --out, or --fresh to overwrite it"
-    )
-
-
-def _result(name: str, options: Record, recording: Recording, wall_time: float) -> Result:
-    return Result(
-        name=name,
-        figures=[],  # nothing is claimed
-        settings=folders.configuration_of(options, f"record {options.family}")
-        | {"trial_names": [trial.name for trial in recording.trials]},
-        seeds=[options.seed],
-        split=None,
-        wall_time_s=wall_time,
     )

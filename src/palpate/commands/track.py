@@ -9,7 +9,7 @@ from palpate.commands import folders
 from palpate.families.options import Track
 from palpate.models.files import load_model
 from palpate.recordings.files import write_recording
-from palpate.runs import Figure, Result
+from palpate.runs import Figure
 
 
 def run(options: Track) -> Path:
@@ -28,15 +28,8 @@ def run(options: Track) -> Path:
             tracked = options.track(model, run)
             write_recording(run.path / folders.RECORDING, tracked.recording)
             frames, share = len(tracked.lost), float(tracked.lost.mean())
-            result = Result(
-                name=name,
-                figures=[Figure("frames", float(frames), ""), Figure("lost_share", share, "")],
-                settings=configuration,
-                seeds=[options.seed],
-                split=None,
-                wall_time_s=run.elapsed,
-            )
-            run.finish(result.to_dict())
+            figures = [Figure("frames", float(frames), ""), Figure("lost_share", share, "")]
+            folders.finish(run, options, name, figures)
             print(
                 f"{frames} frames followed; the {options.family} was lost in {100 * share:.0f} % "
                 "of them"

@@ -19,7 +19,7 @@ from palpate.models.files import load_model
 from palpate.models.model import Model
 from palpate.networks import CommandPolicy, Controller, save_controller
 from palpate.parameters import describe
-from palpate.runs import Figure, Result, Run
+from palpate.runs import Figure, Run
 from palpate.runs.result import machine, read_result
 from palpate.runs.run import RESULT
 from palpate.tasks.task import Task
@@ -54,15 +54,8 @@ def run(options: Train) -> Path:
                 command=folders.command(options, f"train {options.task}"),
             )
             figures = figures_in_model(task, model, policy, options.seed)
-            result = Result(
-                name=name,
-                figures=figures,
-                settings=run.configuration,
-                seeds=[options.seed],
-                split={"scored": f"{EPISODES} new start states in the model it was trained on"},
-                wall_time_s=run.elapsed,
-            )
-            run.finish(result.to_dict())
+            split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
+            folders.finish(run, options, name, figures, split=split)
         for figure in read_result(run.path / RESULT).figures:
             value = "none" if figure.value is None else f"{figure.value:.4g} {figure.unit}"
             print(f"{figure.name.replace('_', ' ').replace('.', ': ')} {value}".rstrip())

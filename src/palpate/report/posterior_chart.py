@@ -1,4 +1,4 @@
-"""Static figures of posteriors: ranks of a calibration, and prior against posterior."""
+"""A static figure of posteriors: the ranks of a calibration."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.stats import binom, gaussian_kde
+from jaxtyping import Int
+from scipy.stats import binom
 
-from palpate.errors import PalpateError
 from palpate.report.style import STYLES
 from palpate.runs.storage import write_bytes
 
@@ -41,43 +40,6 @@ def rank_figure(
             axis.set_ylabel("simulations")
         if index >= len(names) - ACROSS:
             axis.set_xlabel("rank of the truth / draws")
-    return _save(canvas, axes, Path(out))
-
-
-def marginal_figure(
-    out: str | Path,
-    prior: Mapping[str, Float[np.ndarray, " samples"]],
-    posterior: Mapping[str, Float[np.ndarray, "chains draws"]],
-    truth: Mapping[str, float] | None = None,
-) -> Path:
-    """Densities of prior and posterior of each parameter, on the prior's range, by chain.
-
-    Keys say name and unit. Where the posterior is so narrow that it would be a line, the range is
-    the posterior's, and the prior is nearly flat in it. Writes a PNG.
-    """
-    if prior.keys() != posterior.keys() or not prior:
-        raise PalpateError("expected draws of the same parameters from the prior and the posterior")
-    canvas, axes = _panels(len(prior))
-    for index, (name, draws) in enumerate(posterior.items()):
-        axis = axes[index]
-        low, high = np.quantile(prior[name], (0.02, 0.98))
-        narrow_low, narrow_high = np.quantile(draws, (0.001, 0.999))
-        margin = 0.5 * (narrow_high - narrow_low)
-        if narrow_high - narrow_low < 0.1 * (high - low):
-            low, high = narrow_low - margin, narrow_high + margin
-        at = np.linspace(low, high, 300)
-        look = STYLES[0]
-        axis.plot(at, gaussian_kde(prior[name])(at), color=look.light, lw=look.width, label="prior")
-        for style, (number, chain) in zip(STYLES[1:], enumerate(draws), strict=False):
-            if np.ptp(chain) > 0.0:
-                dashes = (0, style.dash) if style.dash else "-"
-                density = gaussian_kde(chain)(at)
-                axis.plot(
-                    at, density, color=style.light, ls=dashes, lw=1.3, label=f"chain {number + 1}"
-                )
-        if truth is not None and name in truth:
-            axis.axvline(truth[name], color="#1c2127", lw=1.0, label="truth")
-        axis.set(xlabel=name, yticks=[], xlim=(low, high), ylim=(0.0, None))
     return _save(canvas, axes, Path(out))
 
 

@@ -2,8 +2,7 @@
 
 After SPiD (Long et al. 2026, arXiv 2602.03623: "monitoring loss evolution online; the states are
 added in the dataset; training is still done offline later; it does not require expert data") and
-DAgger (Ross, Gordon and Bagnell 2011, AISTATS). The talk says no more than that. What counts as a
-shift, and why, stands in `palpate.learning.loss_monitor`.
+DAgger (Ross, Gordon and Bagnell 2011, AISTATS). For what counts as a shift, see `loss_monitor`.
 
 The states from which the loss parts from what was predicted are collected, and training through the
 model goes on from a pool of starts of which they are half.
@@ -110,11 +109,8 @@ def dagger(
         seen, comparison, _ = watched(f"{name}-watch", world, policy, seed + number)
         marked = alarm.collected(comparison)
         trials, columns = np.nonzero(marked)
-        print(
-            f"round {number}: {marked.any(axis=1).sum()} of {len(marked)} trials part from what "
-            f"was predicted; {len(trials)} states collected",
-            flush=True,
-        )
+        shifted = f"{marked.any(axis=1).sum()} of {len(marked)} trials part from what was predicted"
+        print(f"round {number}: {shifted}; {len(trials)} states collected", flush=True)
         if len(trials):
             steps = jnp.asarray(comparison.steps[columns])
             pools.append(seen.starts(task, jnp.asarray(trials), steps))

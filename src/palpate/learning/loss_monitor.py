@@ -7,9 +7,8 @@ The loss of every instant is watched, l(t). From decision to decision its mean o
 - what training promises: the mean that follows the same loss l(t) in episodes of the model that
   begin where the policy was trained.
 
-The first sees a world that parts from the model; but it is blind where a policy is lost and the
-model says so too, which is what training through the model can mend. That is why there is the
-second.
+The first sees a world that differs from the model; the second a policy that is lost where the model
+says so too, which training through the model can mend.
 
 No threshold is tuned. Each gap is counted in what it comes to in nominal trials at worst, the limit
 is a quantile of the larger of the two in those trials, and no shift is seen unless more trials
@@ -140,12 +139,9 @@ def promise(
 
     loss = np.asarray(losses(policy), float)
     now, following = _windows(loss, np.arange(0, steps - horizon, every), horizon)
-    order = np.argsort(now, axis=None)
-    groups = np.array_split(order, LEVELS)
-    return Promise(
-        np.array([now.ravel()[group].mean() for group in groups]),
-        np.array([following.ravel()[group].mean() for group in groups]),
-    )
+    groups = np.array_split(np.argsort(now, axis=None), LEVELS)
+    means = (np.array([each.ravel()[g].mean() for g in groups]) for each in (now, following))
+    return Promise(*means)
 
 
 def compare(

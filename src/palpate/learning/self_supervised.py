@@ -125,9 +125,8 @@ def train(
         for iteration in bar:
             horizon = stages[(iteration - 1) * len(stages) // training.iterations]
             if horizon not in updates:
-                updates[horizon] = _update(
-                    task, model, training, optimiser, starts, static, horizon
-                )
+                given = task, model, training, optimiser, starts, static
+                updates[horizon] = _update(*given, horizon)
             state, metrics = updates[horizon](state, for_updates, jnp.asarray(iteration))
             metrics = {name: _finite(value) for name, value in metrics.items()}
             bar.show(loss=metrics["loss"], horizon=horizon)
@@ -223,18 +222,14 @@ def _update(
         episodes = jax.random.split(keys[3], training.batch)
         lag = None
         if task.action_lag:
-            lag = (
-                amplitude
-                * task.action_lag
-                * jax.random.uniform(jax.random.fold_in(keys[0], 1), (training.batch,))
-            )
+            share = jax.random.uniform(jax.random.fold_in(keys[0], 1), (training.batch,))
+            lag = amplitude * task.action_lag * share
         loss, gradient = divided((state.policy, common), (own, start, episodes, lag))
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(norm) & jnp.isfinite(loss)
         changes, moments = optimiser.update(gradient, state.optimiser)
-        changed = TrainingState(
-            optax.apply_updates(state.policy, changes), moments, jnp.zeros((), int)
-        )
+        policy = optax.apply_updates(state.policy, changes)
+        changed = TrainingState(policy, moments, jnp.zeros((), int))
         kept = eqx.tree_at(lambda s: s.skipped, state, state.skipped + 1)
         state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), changed, kept)
         metrics = {

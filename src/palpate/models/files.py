@@ -24,10 +24,9 @@ _VERSIONS = {1: False, 2: True}  # whether it has a correction, which version 1 
 def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None = None) -> None:
     """Write a model as JSON; `about` is what it was made from (recordings, errors, intervals).
 
-    Of a `Residual`, the physics as any other, and the arrays of its network beside the parameters.
-    What this instance declares differently (fixed, shared, other priors) is not kept: it belongs
-    to the identification that used it. Raises `PalpateError` for a model that is not registered,
-    and for a batch of models.
+    Of a `Residual` the network's arrays too. What this instance declares differently (fixed,
+    shared, other priors) is not kept: it belongs to the identification that used it. Raises
+    `PalpateError` for a model that is not registered, and for a batch of models.
     """
     network = model.network if isinstance(model, Residual) else None
     physics = model.physics if isinstance(model, Residual) else model

@@ -11,10 +11,9 @@ from importlib.metadata import PackageNotFoundError, version
 from queue import SimpleQueue
 from typing import Any
 
-# Measured with JAX 0.10 on CPUs: models are loops over small arrays, and these let XLA compile
-# such a loop as one function with full vectors instead of dispatching every operation (12x on a
-# single rope). A flag that XLA does not know ends the process, so they are set for the versions
-# they were tried with and for no other.
+# These let XLA compile a loop over small arrays as one function with full vectors (measured with
+# JAX 0.10 on CPUs: 12x on a single rope). A flag that XLA does not know ends the process, so they
+# are set for the versions they were tried with and for no other.
 _FLAGS = (
     "--xla_cpu_prefer_vector_width=512",
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000",
@@ -61,19 +60,19 @@ def cores() -> int:
 
 
 def compiled_sooner(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`eqx.filter_jit` of what is compiled anew for every recording, and then runs for a minute.
+    """`eqx.filter_jit` for what is compiled anew for every recording and runs for a minute.
 
-    A posterior compiles in two thirds of the time and runs as fast. Not for everything: a single
-    rope can run at half the speed.
+    A posterior compiles in two thirds of the time and runs as fast; a single rope may run at half
+    the speed.
     """
     return _compiled(function, {"xla_cpu_use_fusion_emitters": False})
 
 
 def compiled_at_once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`eqx.filter_jit` of what is compiled anew for every recording, and runs for a few seconds.
+    """`eqx.filter_jit` for what is compiled anew for every recording and runs for seconds.
 
-    LLVM is asked for its second level of four: derivatives compile in three quarters of the time
-    of `compiled_sooner`, and run up to a tenth slower; densities alone run at half the speed.
+    With LLVM's second level of four derivatives compile in three quarters of the time of
+    `compiled_sooner` and run up to a tenth slower; densities alone run at half the speed.
     """
     options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
     return _compiled(function, options)
@@ -119,10 +118,9 @@ def data_parallel(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], A
 def over_devices(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """Divide what is independent over the devices: chains of a sampler, starts of a search.
 
-    `function(shared, each)` takes and gives batches: the leading axis of every leaf of `each`, of
-    the same length in all, and of what it returns. The result takes the same and runs `function` on
-    an equal part of the batch on each of as many devices as there are such parts for; none waits
-    for another before its end. `shared` may hold what is no array.
+    `function(shared, each)` takes and gives batches, along the leading axis of every leaf of `each`
+    and of what it returns. The result takes the same and runs `function` on equal parts of the
+    batch, on as many devices as divide it evenly. `shared` may hold what is no array.
     """
     import equinox as eqx
     import jax
@@ -156,9 +154,8 @@ def own_device() -> Any:
 def one_on_each(function: Callable[[Any], Any], work: Iterable[Any]) -> list[Any]:
     """`function` of every piece of work, as many at a time as there are devices, each on its own.
 
-    Small batches are better whole on one device each than one after another on all: 16 chains of a
-    posterior take but a sixth less time on two cores than on one. What is raised by one piece is
-    raised when those that have begun are done, and no others begin.
+    Small batches are better whole on one device each than one after another on all. What one piece
+    raises is raised when those that have begun are done, and no others begin.
     """
     import jax
     import jax.numpy as jnp
@@ -186,8 +183,7 @@ def one_on_each(function: Callable[[Any], Any], work: Iterable[Any]) -> list[Any
 def everywhere(tree: Any) -> Any:
     """The arrays on all devices, as a computation by `data_parallel` leaves what it returns.
 
-    What a loop starts from has to be placed so too: else its first turn is compiled by itself, and
-    rounds differently from the others.
+    Else a loop's first turn is compiled by itself, and rounds differently from the others.
     """
     import jax
     from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -197,12 +193,11 @@ def everywhere(tree: Any) -> Any:
 
 
 def compiled_apart(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function of arrays apart from its surroundings, so that what it returns is stored.
+    """Compile a function of arrays by itself, so that what it returns is stored.
 
     XLA's CPU compiler otherwise computes an intermediate again for each of its uses: three times
-    the arithmetic in the reverse sweep of a rope. Differentiation and batching pass through.
-    Arguments that are no arrays are given by keywords, and only they are. On other processors the
-    function is called as it is.
+    the arithmetic in the reverse sweep of a rope. Keyword arguments, and only they, are no arrays.
+    On other processors the function is called as it is.
     """
     import jax
     from jax.experimental.xla_metadata import set_xla_metadata

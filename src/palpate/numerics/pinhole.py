@@ -80,14 +80,10 @@ class Pinhole:
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
         focal = 0.5 * width / math.tan(0.5 * field_of_view)
-        return cls(
-            width,
-            height,
-            (focal, focal),
-            ((width - 1) / 2, (height - 1) / 2),
-            (float(position[0]), float(position[1]), float(position[2])),
-            tuple(map(tuple, rotation.tolist())),
-        )
+        middle = (width - 1) / 2, (height - 1) / 2
+        x, y, z = map(float, position)
+        rows = tuple(map(tuple, rotation.tolist()))
+        return cls(width, height, (focal, focal), middle, (x, y, z), rows)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (..., 2), as (u, v), and depths (...) in m along the axis, of points (..., 3).

@@ -47,8 +47,8 @@ def checked_polygon(points: object, what: str) -> Polygon:
     """
     try:
         corners = np.asarray(points, float)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise PalpateError(f"{what} is no list of corners: expected [[x, y], ...] in m") from error
+    except (TypeError, ValueError, OverflowError):
+        corners = np.empty(0)
     if corners.ndim != 2 or corners.shape[-1] != 2:
         raise PalpateError(f"{what} is no list of corners: expected [[x, y], ...] in m")
     if not np.isfinite(corners).all() or np.abs(corners).max(initial=0.0) > LARGEST:

@@ -1,8 +1,7 @@
 """Symmetric positive definite systems of a few unknowns, thousands side by side.
 
-JAX hands such batches to LAPACK, in pieces, on the threads that also run the rest of the program:
-with as many calls at once as there are cores each waits for a thread, for ever (seen with JAX
-0.10 on two cores). These are loops over columns of elementwise arithmetic, which call nobody.
+JAX hands such batches to LAPACK on the threads that also run the rest of the program, which can
+wait for each other for ever (seen with JAX 0.10 on two cores). These are loops over columns.
 """
 
 import jax

@@ -18,6 +18,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from PIL import Image  # comes with matplotlib
 
 from palpate.errors import PalpateError
 from palpate.numerics.pinhole import Frame, Pinhole
@@ -125,8 +126,6 @@ def _film(path: Path, count: int) -> list[np.ndarray]:
 
 
 def _picture(path: Path, mode: str) -> np.ndarray:
-    from PIL import Image  # comes with matplotlib
-
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as image:
             if mode == "RGB":

@@ -13,17 +13,11 @@ from jaxtyping import Array, Float
 
 
 class VelocityEstimator(eqx.Module):
-    """Positions in, velocities out, one frame at a time or for whole windows.
+    """Positions in, velocities out, one frame at a time or for whole windows."""
 
-    Args:
-        period: seconds between frames.
-        frames: length of the window.
-        order: degree of the polynomial, below `frames`.
-    """
-
-    period: float = eqx.field(static=True)
-    frames: int = eqx.field(static=True, default=7)
-    order: int = eqx.field(static=True, default=2)
+    period: float = eqx.field(static=True)  # s between frames
+    frames: int = eqx.field(static=True, default=7)  # in the window
+    order: int = eqx.field(static=True, default=2)  # of the polynomial, below `frames`
 
     @property
     def weights(self) -> np.ndarray:

@@ -34,9 +34,8 @@ class Plan(eqx.Module):
 class CurvePlanner(eqx.Module):
     """A planner through any model: `init` once, then call it in every control period.
 
-    `stage_loss(states, commands, goal)` gives the loss of one instant for each of many states,
-    (plans,), after a control period with these commands. `goal` is what is asked for at that
-    instant. Limits are as in `tasks.Task`.
+    `stage_loss(states, commands, goal)` gives the losses (plans,) of many states after a control
+    period with these commands; `goal` is what is asked for then. Limits are as in `tasks.Task`.
     """
 
     model: Model

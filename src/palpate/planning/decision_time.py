@@ -15,12 +15,11 @@ TIMED = 20  # decisions that are timed
 def most_within(
     budget: float, decision: Callable[[int], Callable[[], Any]], noun: str, unit: int = 1
 ) -> tuple[int, float]:
-    """How many of a planner's samples, or the like, fit into `budget` seconds a decision.
+    """How many of a planner's samples, or the like, fit into `budget` s a decision, and their time.
 
-    And the seconds that those take. `decision(number)` makes a function without arguments that
-    takes one decision with so many of what `noun` names. The number, a multiple of `unit`, is
-    doubled and then narrowed down until the fastest quarter of some decisions is just within the
-    budget: what else runs on a machine only adds.
+    `decision(number)` makes a function without arguments that takes one decision with so many of
+    what `noun` names. The number, a multiple of `unit`, is doubled and then narrowed down until the
+    fastest quarter of some decisions is within the budget: what else runs on a machine only adds.
 
     Raises `PalpateError` when not even one `unit` fits.
     """

@@ -9,11 +9,9 @@ together, and the summed stage losses l become a quadratic of which the minimum 
 
 This is the step of iLQR (Tassa, Erez, Todorov 2012, IROS), which leaves out the curvature of the
 dynamics as well: Gauss-Newton through a shooting of the dynamics (Giftthaler et al. 2018, IROS,
-arXiv 1711.11006). What differs is by what the step is found. iLQR decides on every control period
-and solves for them backwards in time, with the Jacobian of the dynamics in all directions of the
-state; here a few knots are decided on, so that as many directions as there are numbers in them
-suffice. For a state of many numbers and a smooth plan that is the smaller work by far. Limits are
-in the curve itself, so that no step can leave them.
+arXiv 1711.11006). iLQR solves for every control period backwards in time, with the Jacobian in all
+directions of the state; here only the directions of a few knots are needed, which is far less work
+for a large state and a smooth plan. Limits are in the curve itself, so that no step leaves them.
 
 Many dampings are tried in the model side by side (Marquardt 1963, with a parallel line search as in
 Tassa et al.) and the best is taken, or the plan as it was: no iteration makes a plan worse. One

@@ -76,7 +76,7 @@ class CommandSequence:
 
 @dataclass(frozen=True)
 class Found:
-    """What one search came upon: each time that was better than all before, the longest first.
+    """Each time that was better than all before in one search, the longest first.
 
     `times` (found,) in control periods, falling; `knots` (found, knots, *action) of each.
     """

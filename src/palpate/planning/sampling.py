@@ -67,11 +67,10 @@ class Cem:
 class SamplingPlanner(CurvePlanner):
     """MPPI or CEM through any model; see `CurvePlanner`.
 
-    `shares` say, in turn, about how much of the plan samples are drawn. A plan has no reason to
-    give up what achieves nothing, such as parts of a wrench that cancel, and commands that are
-    limited as a whole then leave no room for what is needed. Samples of share 0 forget the plan and
-    are one command each, the same at all knots: what sticks is loosened by who pushes it one way
-    for long, which independent knots hardly ever do.
+    `shares` say, in turn, about how much of the plan samples are drawn: a plan would else keep what
+    achieves nothing, such as parts of a wrench that cancel, and limited commands leave no room for
+    what is needed. Samples of share 0 forget the plan and are one command each, the same at all
+    knots: what sticks is loosened by one long push, which independent knots hardly ever make.
     """
 
     rule: Rule = eqx.field(static=True, kw_only=True)

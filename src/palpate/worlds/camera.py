@@ -61,12 +61,7 @@ class Sensor:
 
 
 class Camera:
-    """Pictures of a MuJoCo model, before still scenery that is a model of its own.
-
-    Args:
-        model: what may move, and what stands still beside it.
-        scenery: what else stands there and is not part of the physics; None: nothing.
-    """
+    """Pictures of a MuJoCo model before scenery that stands still and is no part of the physics."""
 
     def __init__(
         self,
@@ -115,9 +110,8 @@ class Camera:
         mujoco.mj_kinematics(self._model, self._data)
         rows, columns = np.nonzero(self._near_what_moves())
         rays = self._directions[index][rows, columns]
-        geoms, distance, normals = _cast(
-            self._model, self._data, self.pinhole.position, rays, still=False
-        )
+        origin = self.pinhole.position
+        geoms, distance, normals = _cast(self._model, self._data, origin, rays, still=False)
         nearer = distance < depth[rows, columns]
         rows, columns, geoms = rows[nearer], columns[nearer], geoms[nearer]
         colour[rows, columns] = _lit(self._model.geom_rgba[geoms, :3], normals[nearer])
@@ -142,11 +136,10 @@ class Camera:
         colour = np.broadcast_to(SKY, flat.shape).copy()
         depth = np.full(len(flat), np.inf)
         for still in self._fixed:
-            geoms, distance, normals = _cast(
-                still.model, still.data, self.pinhole.position, flat, still=True
-            )
+            origin = self.pinhole.position
+            geoms, distance, normals = _cast(still.model, still.data, origin, flat, still=True)
             hit = (distance < depth) & still.fixed[geoms]
-            points = self.pinhole.position + flat[hit] * distance[hit, None]
+            points = origin + flat[hit] * distance[hit, None]
             squares = np.floor(points / CHECKER + 1e-3).sum(-1) % 2
             surface = still.model.geom_rgba[geoms[hit], :3] * (1 - 0.12 * squares[:, None])
             colour[hit], depth[hit] = _lit(surface, normals[hit]), distance[hit]

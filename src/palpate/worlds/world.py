@@ -112,16 +112,11 @@ def _gl_context() -> Any:
 class OffscreenCamera:
     """Draws a MuJoCo model without a window.
 
-    OpenGL is first touched when the camera is made, so that a machine without it can import
-    and run every world. The back end is EGL on Linux, unless the variable MUJOCO_GL names
-    another.
+    OpenGL is first touched when the camera is made, so that a machine without it can run every
+    world. The back end is EGL on Linux, unless the variable MUJOCO_GL names another. `width` and
+    `height` are the picture's, in pixels.
 
-    Args:
-        model: the compiled scene.
-        width, height: size of the picture in pixels.
-
-    Raises:
-        PalpateError: the size is not positive, or OpenGL is missing or refuses to start.
+    Raises `PalpateError` for a size that is not positive, and where OpenGL does not start.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):

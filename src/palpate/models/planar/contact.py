@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from palpate.models.planar.geometry import Shapes, nearest, pick
+from palpate.models.planar.geometry import nearest, pick
+from palpate.models.planar.system import System
 
 SLOWEST = 1e-4  # m/s: friction of a contact that slides more slowly is viscous
 STIFFNESS = 3e3  # of a contact, in the mass it feels
@@ -47,15 +48,12 @@ class Contacts(NamedTuple):
 
 
 def contacts(
-    shapes: Shapes,
-    restitution: Float[Array, " bodies"],
-    friction: Float[Array, " bodies"],
+    system: System,
     pose: Float[Array, "bodies 3"],
     centre: Float[Array, "bodies 2"],
     ahead: Float[Array, " bodies"],
     start: Float[Array, "bodies 3"],
     free: Float[Array, "bodies 3"],
-    inverse_mass: Float[Array, "bodies 3"],
     time_step: float,
 ) -> Contacts:
     """The contacts of a step: the nearest pairs, `SLOTS` for each body.
@@ -64,6 +62,10 @@ def contacts(
     Velocities at the `start` of the step, and `free` of contacts at its end, are in the bodies'
     axes when turned by `ahead`. A wall has the restitution and friction of what touches it.
     """
+    shapes, restitution, friction = system.shapes, system.restitution, system.contact_friction
+    assert shapes is not None
+    mass, inertia = system.bodies.mass, system.bodies.inertia
+    inverse_mass = 1.0 / jnp.stack([mass, mass, inertia], axis=-1)
     near = nearest(shapes, pose)
     slots = min(near.gap.shape[0], SLOTS * pose.shape[0])
     closest = jnp.min(near.gap, axis=1)

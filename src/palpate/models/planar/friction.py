@@ -9,10 +9,9 @@ Papadopoulos, Wear 143, 1991). A dry wheel whose friction is the symmetric tenso
 along and across it being the axes of F: an ellipse of forces, and of these the one that takes most.
 Both are elements that take an impulse in proportion to the slope of a convex function of the size
 of two rates, which is that size, and quadratic below `STICTION` (Huber's). The velocity at the end
-of a step minimises the sum of all of them and of what is quadratic. Newton's method for it carries
-the pull of each element beside the velocity (Chan, Golub and Mulet, SIAM J. Sci. Comput. 20, 1999):
-a size has hardly any curvature away from zero, and without the pulls a step across an ellipse of
-1 : 60 goes astray again and again.
+of a step minimises the sum of all of them and of what is quadratic, by a Newton's method that
+carries the pull of each element beside the velocity (Chan, Golub and Mulet, SIAM J. Sci. Comput.
+20, 1999): away from zero a size has hardly any curvature to find the minimum by.
 
 Arrays have one entry for each body, (bodies,), or one for each element of each body, (elements,
 bodies), and after these any axes of models that are stepped side by side: last, where processors
@@ -109,8 +108,7 @@ class Resistance(NamedTuple):
 def exponential(log: Tensor) -> Tensor:
     """The exponential of symmetric matrices.
 
-    Smooth where the two eigenvalues meet, as their eigenvectors are not: a wheel that resists alike
-    in all directions has none to be told.
+    Smooth where the two eigenvalues meet, as their eigenvectors are not.
     """
     mean, half = 0.5 * (log.xx + log.yy), 0.5 * (log.xx - log.yy)
     squared = jnp.square(half) + jnp.square(log.xy)
@@ -175,9 +173,9 @@ def pulls(resisting: Resistance, velocity: Triple) -> Pull:
 
 
 def pulls_after(resisting: Resistance, velocity: Triple, pull: Pull, step: Triple) -> Pull:
-    """What dry elements take after a step back from a velocity, by its linearisation.
+    """What dry elements take after a step back from a velocity, to first order.
 
-    That of s pull = rates, where s is their size, or one where they are smaller.
+    s pull = rates is linearised, where s is their size, or one where they are smaller.
     """
     dry = resisting.dry
     soft, along = _directions(dry, velocity)

@@ -6,12 +6,10 @@ The velocity at the end of a step minimises a convex potential,
 
 where psi_i is half the power that a viscous element takes, or all that dry friction takes
 (maximum dissipation; Moreau, "Unilateral contact and dry friction in finite freedom dynamics",
-1988). Newton's method for velocity and friction together finds it in a few iterations from the
-velocity at the step's start. At last every dry element counts as a viscous one of the same
-force, which changes nothing at the minimum, and short of it takes energy and never adds any. How
-the minimum moves with what it depends on is the implicit function theorem's, so that nothing
-differentiates the iterations. What contacts take changes with the iterations (`contact`);
-where bodies touch there are more of them.
+1988). Newton's method for velocity and friction together finds it in a few iterations, more where
+bodies touch (`contact`). At last every dry element counts as a viscous one of the same force, which
+changes nothing at the minimum, and short of it takes energy and never adds any. Derivatives are
+the implicit function theorem's: no iteration is differentiated.
 
 Positions take half a step before and half a step after (drift, kick, drift), which makes free
 motion under a constant wrench exact. All of it happens in each body's axes about its centre of
@@ -74,9 +72,8 @@ def advance(
     lever_x, lever_y = turn(centre_x, centre_y, *cosine_and_sine(angle))
     torque = wrench[:, 2] - (lever_x * wrench[:, 1] - lever_y * wrench[:, 0])
 
-    # The new velocity serves from the middle of this step to the middle of the next: what a wheel
-    # does not let through is told at the end of this one, or a body on a locked wheel would leave
-    # it along tangents.
+    # The new velocity serves from the middle of this step to the middle of the next: a wheel's axes
+    # are those at the end of this one, or a body on a locked wheel would leave it along tangents.
     ahead = angle + half * rate
     cosine, sine = cosine_and_sine(ahead)
     force_x, force_y = turn(wrench[:, 0], wrench[:, 1], cosine, -sine)
@@ -95,18 +92,9 @@ def advance(
     resisting = resistance(bodies, free, time_step)
     velocity = solve_velocity(resisting, (start[0], start[1], rate), links, iterations)
     if system.shapes is not None:
-        contacts = contact.contacts(
-            system.shapes,
-            system.restitution,
-            system.contact_friction,
-            pose,
-            jnp.stack([begin_x, begin_y], axis=-1),
-            ahead,
-            jnp.stack([*start, rate], axis=-1),
-            jnp.stack(velocity, axis=-1),
-            1.0 / jnp.stack([bodies.mass, bodies.mass, bodies.inertia], axis=-1),
-            time_step,
-        )
+        middle = jnp.stack([begin_x, begin_y], axis=-1)
+        before, after = jnp.stack([*start, rate], axis=-1), jnp.stack(velocity, axis=-1)
+        contacts = contact.contacts(system, pose, middle, ahead, before, after, time_step)
         velocity, late = solve_contacts(resisting, velocity, links, contacts, iterations)
         late_x, late_y = turn(late[0], late[1], cosine, sine)
         x, y, angle = x + late_x, y + late_y, angle + late[2]
@@ -180,10 +168,9 @@ def own_curvature(resisting: Resistance, velocity: Triple) -> Entries:
 def held_back(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
     """The velocity that the forces at a velocity leave: the same where that is the least cost.
 
-    It has less energy than a step without resistance however far from there it is.
+    Elsewhere too it has less energy than a step without resistance. It is solved for as a
+    correction: a wheel holds a million times as much across as along, which costs digits.
     """
-    # As a correction: solved for itself, it would have the rounding of a matrix in which a wheel
-    # holds a million times as much across as along.
     left = leftover(resisting, rows, velocity)
     return minus(velocity, solve_bodies(as_viscous(resisting, velocity), left, rows))
 
@@ -243,9 +230,8 @@ def solve_three(entries: Entries, right: Triple) -> Triple:
     """Solve symmetric 3 x 3 systems by LDL', one for each body.
 
     Written out: a library call for each of thousands of 3 x 3 systems costs more than its sums.
-    Derivatives solve once more and do not differentiate the elimination. Where rounding would leave
-    nothing of a pivot, as of a wheel that holds 10 kN across and 1 N along, it is as small as it
-    may be: the solution errs, and is corrected by the iteration after it.
+    Derivatives solve once more. A pivot of which rounding would leave nothing is bounded below: the
+    next iteration corrects the error.
     """
     x, y, t, xy, xt, yt = entries
     least = 4.0 * jnp.finfo(x.dtype).eps

@@ -37,19 +37,17 @@ class Planar(PlanarParameters):
     Lengths that place something on a body are shares of its half width and half depth, so that one
     prior serves a stool and a couch.
 
-    The parameters of a wheel are the entries of the logarithm of F in the body's axes: those on the
-    diagonal are the logarithms of `wheel_along` and `wheel_across`, the other is `wheel_shear`. So
-    a wheel has one name, although turned by a quarter with its two forces swapped it is the same,
-    and one that resists alike in all directions is a point like any other, where an angle would be
-    undefined and the posterior cut in two. Square to the body the shear is zero and the
-    others are the wheel's own forces; `models.planar.wheels` turns those of one that is not.
+    The parameters of a wheel are the entries of the logarithm of F in the body's axes: the
+    logarithms of `wheel_along` and `wheel_across` on the diagonal, and `wheel_shear`. So a wheel
+    has one set of parameters (an angle and two forces would have two, and no angle where it resists
+    alike in all directions). Square to the body the shear is zero and the others are the wheel's
+    own forces; `models.planar.wheels` turns those of one that is not.
 
     Which wheels and links there are, their law, what a link leads to (-1: the world) and which
     bodies are bolted down, at `bolted_pose`, is data: hypotheses about it are a batch axis. Batch
     axes of parameters and structure lead, as those of states and actions do.
 
-    Raises `PalpateError` for arrays that do not fit each other, and links or contacts of bodies,
-    parts or walls that do not exist.
+    Raises `PalpateError` as `PlanarParameters`.
     """
 
     @property

@@ -16,11 +16,10 @@ d = u_{i+1} - u_i. Energies and dissipation:
                binormals, faded out where a joint is straight and psi has no meaning
     air        linear and quadratic drag of each node's velocity
 
-A rope stretches little, so u is a unit vector but for that little, |d|^2 = 2 (1 - cos beta) is
-beta^2 to fourth order, and there is neither an arc cosine nor a singularity where the rope is
-straight. Dividing by l0 and not by l keeps bending linear: a crumpled rope is as stable as a
-straight one. Seed 1 (SPiD); Lv et al. 2017 for stretch, bend and twist; their twist force is
-singular on a straight rope, this energy is not.
+A rope stretches little, so that |d|^2 = 2 (1 - cos beta) is beta^2 to fourth order: neither an arc
+cosine nor a singularity where the rope is straight. Dividing by l0 and not by l keeps bending
+linear: a crumpled rope is as stable as a straight one. Seed 1 (SPiD); Lv et al. 2017 for stretch,
+bend and twist; their twist force is singular on a straight rope.
 
 Layout: a block of `lanes` ropes is kept as flat arrays, one per axis, of nodes x lanes elements
 with the lanes innermost, so that the neighbour of every element stands `lanes` further on and

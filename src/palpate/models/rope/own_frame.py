@@ -18,11 +18,10 @@ FADE = 0.05
 def features(
     rope: RopeParameters, state: RopeState, following: Float[Array, "*batch nodes 3"]
 ) -> Float[Array, "*batch nodes 11"]:
-    """Of each node: its velocity, the next segment, where it is; and how far apart the ends are.
+    """Of each node: its velocity, the next segment (none after the last), its place; and the ends.
 
     `following` is the velocity (m/s) that the driven nodes will have, the state's for the others.
-    Lengths are relative to rest: the segment to its own, the others to the whole rope. After the
-    last node stands no segment.
+    Lengths are relative to rest: the segment's to its own, the others to the whole rope's.
     """
     along = axes(rope, state.position)
     length = jnp.sum(rope.rest_length, axis=-1)[..., None, None]

@@ -104,8 +104,7 @@ class Rope(RopeParameters):
     def _rest_bend(self, position: Array) -> Array | None:
         """Bend at rest in the world frame, (*batch, joints, 3); None for a straight rope.
 
-        The frame is the chord's: along it in the horizontal plane, across it, and up. Grips that
-        move without turning keep a rope's own bends in it; held at one end, it has no such frame.
+        The frame is the chord's: along it in the horizontal plane, across it, and up.
         """
         if not self.held_at_both_ends:
             return None
@@ -236,9 +235,8 @@ class Rope(RopeParameters):
 
         Gravity, motion, stretch, bend and twist (seed 1: E_rope), minus the same of the rope
         hanging still, stretched by its own weight, from where the gripper is now: lowering the
-        gripper earns nothing. Never negative; what bending takes from a hanging rope's uneven
-        stretch is left out of that rest, some 1e-6 of a swing. Raises `PalpateError` for a rope
-        that is not held at its first end alone: it has no such rest.
+        gripper earns nothing. Raises `PalpateError` for a rope that is not held at its first end
+        alone: it has no such rest.
         """
         if self.driven != (0,):
             raise PalpateError(

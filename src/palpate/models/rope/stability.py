@@ -10,14 +10,12 @@ adds w |a_i| sum |a_j| to row i.
     grip       a = (-1/l, 1/l) of the first segment
     twist      at most 4 k_t / TWIST_FADE on directions, with sum |a_j| <= 2/l for the shortest l
 
-Stretch and bend add up because they share directions where the rope is bent. Driven nodes have
-neither row nor column, since no force moves them; drag is implicit and only helps. The stability
-limit in the literature, h^2 4 k/m + 2 h 4 c/m < 4, is this one without bending.
+Driven nodes have neither row nor column, since no force moves them; drag is implicit and only
+helps. The limit in the literature, h^2 4 k/m + 2 h 4 c/m < 4, is this one without bending.
 
 The limit is for constant stiffness. That of a stretched segment turns with it: from about 0.4 rad
 per time step on (30 m/s across a segment of 7 cm, at 1 ms) and loads above 2 it can pump energy
-into the segment, bounded only where it is so long that its stiffness no longer turns. Ropes as the
-prior expects them stay well below; a fine enough time step cures the others.
+into the segment. Ropes as the prior expects them stay well below; a fine time step cures others.
 """
 
 from typing import TypeVar

@@ -91,10 +91,7 @@ class CentreLine:
 
 
 def line_points(segmentation: Segmentation) -> LinePoints:
-    """The ridges of the segmented picture, and the median depth of the 3 x 3 pixels around.
-
-    Of those pixels that show the same strand.
-    """
+    """The ridges of the segmented picture, and the median depth of their strand around each."""
     share = segmentation.share
     rows, columns = np.nonzero(share)
     if not len(rows):
@@ -132,17 +129,14 @@ def _depth_around(depth: np.ndarray | None, rows: np.ndarray, columns: np.ndarra
         [padded[rows + row, columns + column] for row in range(3) for column in range(3)], axis=-1
     )
     # Of two strands, one before the other, that which the pixel itself shows.
-    own = np.where(
-        np.isfinite(depth[rows, columns]), depth[rows, columns], np.fmin.reduce(around, 1)
-    )
+    own = depth[rows, columns]
+    own = np.where(np.isfinite(own), own, np.fmin.reduce(around, 1))
     around[~(np.abs(around - own[:, None]) < SAME_STRAND)] = np.nan
     around = np.sort(around, axis=-1)  # NaN comes last
     count = np.isfinite(around).sum(-1)
-    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, 8)
     pick = np.arange(len(around))
-    return np.where(
-        count > 0, 0.5 * (around[pick, low] + around[pick, np.minimum(high, 8)]), np.nan
-    )
+    return np.where(count > 0, 0.5 * (around[pick, low] + around[pick, high]), np.nan)
 
 
 def centre_lines(
@@ -150,8 +144,7 @@ def centre_lines(
 ) -> list[CentreLine]:
     """Curves from `gripper` (3,) m that the picture may show, the likeliest first.
 
-    For a rope of about `length` m. With depth there are two at most, for the two ways to put pixels
-    in order, which mostly agree.
+    For a rope of about `length` m. With depth there are two at most, of the two orders of pixels.
     Raises `PalpateError` when less than four points of a rope are seen.
     """
     found = line_points(segmentation)
@@ -173,9 +166,8 @@ def centre_lines(
     misfits = [_misfit(line, points, length) for line in lines]
     if misfits[-1] < misfits[0] - SURELY:
         lines, misfits = lines[::-1], misfits[::-1]
-    return [
-        line for line, misfit in zip(lines, misfits, strict=True) if misfit < misfits[0] + SURELY
-    ]
+    judged = zip(lines, misfits, strict=True)
+    return [line for line, misfit in judged if misfit < misfits[0] + SURELY]
 
 
 def _enough(count: int) -> None:
@@ -227,13 +219,8 @@ def _leaning(
     parameter = np.concatenate([[0.0], np.cumsum(np.maximum(step, 1e-3))])
     # Behind a gap there may be more of the rope, or something else of its colour.
     ends = np.append(np.flatnonzero(step[FEWEST:] > GAP) + FEWEST + 1, len(pixels))
-    lines = [
-        line
-        for end in ends
-        for line in _in_planes(
-            _smooth_curve(parameter[:end], pixels[:end]), pinhole, gripper, length
-        )
-    ]
+    curves = [_smooth_curve(parameter[:end], pixels[:end]) for end in ends]
+    lines = [line for curve in curves for line in _in_planes(curve, pinhole, gripper, length)]
     if lines:
         return [line for _, line in sorted(lines, key=lambda each: each[0])]
     _, distance = pinhole.project(gripper)

@@ -171,15 +171,8 @@ def correct(
         length = jnp.linalg.norm(edge, axis=-1)
         rate = jnp.sum(jnp.diff(state.velocity, axis=0) * edge, axis=-1) / length
         stretch = length - bent(model, state.position, mean[-1]).rest_length
-        return jnp.concatenate(
-            [
-                across / ACROSS,
-                further / DEPTH,
-                (sighting.pixels[tip] - end) / TIP,
-                -stretch / STRETCH,
-                -rate / STRETCH_RATE,
-            ]
-        )
+        seen = across / ACROSS, further / DEPTH, (sighting.pixels[tip] - end) / TIP
+        return jnp.concatenate([*seen, -stretch / STRETCH, -rate / STRETCH_RATE])
 
     def iterate(w: Array, _) -> tuple[Array, tuple[Array, Fit]]:
         mean = belief.mean + root @ w
@@ -196,14 +189,9 @@ def correct(
         # Where a whipping tip's depth is missed, what lies across may still be right.
         across, in_depth = near & (deviations[: 2 * count].reshape(2, count) < GATE)
         ends &= jnp.all(deviations[2 * count : 2 * count + 2] < TIP_GATE)
-        rows = jnp.concatenate(
-            [
-                across,
-                in_depth & jnp.isfinite(sighting.depth),
-                jnp.stack([ends, ends]),
-                jnp.ones(2 * model.nodes - 2, bool),
-            ]
-        )
+        measured = in_depth & jnp.isfinite(sighting.depth)
+        always = jnp.ones(2 * model.nodes - 2, bool)
+        rows = jnp.concatenate([across, measured, jnp.stack([ends, ends]), always])
         a = jnp.where(rows[:, None], jacobian, 0.0)
         precision = jnp.eye(size) + a.T @ a
         missed = jnp.where(rows, missed, 0.0)
@@ -212,11 +200,10 @@ def correct(
         w = -jnp.linalg.solve(precision, a.T @ (missed - a @ before))
         left_over = missed + a @ (w - before)
         explained = across & in_depth
-        shared = ALONE * (
-            0.5 * jnp.sum(left_over**2) + UNEXPLAINED * jnp.sum(sighting.valid & ~explained)
-        )
+        unexplained = UNEXPLAINED * jnp.sum(sighting.valid & ~explained)
         half = jnp.linalg.cholesky(precision)
-        surprise = shared + 0.5 * jnp.sum(w**2) + jnp.sum(jnp.log(jnp.diagonal(half)))
+        evidence = ALONE * (0.5 * jnp.sum(left_over**2) + unexplained)
+        surprise = evidence + 0.5 * jnp.sum(w**2) + jnp.sum(jnp.log(jnp.diagonal(half)))
         return w, (half, Fit(explained, surprise))
 
     w, found = jax.lax.scan(iterate, jnp.zeros(size), None, length=3)
@@ -267,9 +254,8 @@ def _block(position: Array, velocity: Array, length: float) -> Array:
     def smooth(deviation: Array) -> Array:
         return jnp.kron(alike * jnp.outer(deviation, deviation), jnp.eye(3))
 
-    return jax.scipy.linalg.block_diag(
-        smooth(position), smooth(velocity), jnp.full((1, 1), length**2)
-    )
+    last = jnp.full((1, 1), length**2)
+    return jax.scipy.linalg.block_diag(smooth(position), smooth(velocity), last)
 
 
 @functools.cache

@@ -42,11 +42,9 @@ def gains(interval: float, noise: float) -> tuple[float, float]:
 class MarkerObserver:
     """Follows a batch of ropes whose nodes are measured at the same instants.
 
-    Args:
-        model: driven by velocity at node 0. Parameters may lead with the batch axis.
-        noise: standard deviation of a measured coordinate, m.
-
-    Call `begin` with a first measurement, then `step` once every control period.
+    `model` is driven by velocity at node 0, its parameters may lead with the batch axis; `noise` is
+    the standard deviation of a measured coordinate, m. Call `begin` with a first measurement, then
+    `step` once every control period.
     """
 
     def __init__(self, model: Rope, noise: float):
@@ -122,9 +120,8 @@ def _corrected(state: RopeState, measured: Array, alpha: Array, rate: Array) -> 
     first = position[:, 0], velocity[:, 0]
     nodes = position[:, 1:], velocity[:, 1:], length, stretching
     _, rest = jax.lax.scan(place, first, jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), nodes))
-    return RopeState(
-        *(
-            jnp.concatenate([one[:, None], jnp.moveaxis(more, 0, 1)], axis=1)
-            for one, more in zip(first, rest, strict=True)
-        )
+    joined = (
+        jnp.concatenate([one[:, None], jnp.moveaxis(more, 0, 1)], axis=1)
+        for one, more in zip(first, rest, strict=True)
     )
+    return RopeState(*joined)

@@ -57,10 +57,7 @@ class _Hypothesis:
 class RopeTracker:
     """Follows one rope: `start` with its first frame, then `step` every control period.
 
-    Args:
-        model: the identified rope, held at node 0; how it is driven does not matter.
-        pinhole: the calibrated camera.
-        rope: what it looks like.
+    `model` is the identified rope, held at node 0; how it is driven does not matter.
 
     Raises `PalpateError` for a rope held elsewhere, or a first frame in which no rope is seen.
     """
@@ -213,18 +210,13 @@ class RopeTracker:
         chosen = np.linspace(0, count - 1, min(count, MOST_POINTS)).round().astype(int)
         pixels, depth = np.zeros((MOST_POINTS, 2)), np.full(MOST_POINTS, np.nan)
         may_end = np.zeros(MOST_POINTS, bool)
-        pixels[: len(chosen)], depth[: len(chosen)] = found.pixels[chosen], found.depth[chosen]
-        may_end[: len(chosen)] = self._may_end(
-            frame, seen, found.pixels[chosen], found.depth[chosen]
-        )
+        shown = found.pixels[chosen], found.depth[chosen]
+        pixels[: len(chosen)], depth[: len(chosen)] = shown
+        may_end[: len(chosen)] = self._may_end(frame, seen, *shown)
         age = self._instant - frame.time
-        return Sighting(
-            jnp.asarray(pixels, jnp.float32),
-            jnp.asarray(depth, jnp.float32),
-            jnp.arange(MOST_POINTS) < len(chosen),
-            jnp.asarray(may_end),
-            jnp.asarray(age, jnp.float32),
-        )
+        pixels, depth, age = (jnp.asarray(each, jnp.float32) for each in (pixels, depth, age))
+        valid = jnp.arange(MOST_POINTS) < len(chosen)
+        return Sighting(pixels, depth, valid, jnp.asarray(may_end), age)
 
     def _may_end(
         self, frame: Frame, seen: Segmentation, pixels: np.ndarray, depth: np.ndarray

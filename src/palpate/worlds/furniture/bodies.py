@@ -13,8 +13,8 @@ from palpate.worlds.furniture.pieces import PieceKind, PieceParameters
 class Bodies:
     """The pieces of a compiled scene, by their names in it.
 
-    Angles are unwrapped: `poses` counts on from the last call, or from `yaw` (bodies,) rad, where
-    the pieces start; between two calls a piece turns by less than half a turn.
+    Angles are unwrapped from call to call of `poses`, between which a piece turns by less than half
+    a turn, from `yaw` (bodies,) rad on, where the pieces start.
     """
 
     def __init__(

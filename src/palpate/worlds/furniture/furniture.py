@@ -120,12 +120,8 @@ class FurnitureWorld(World):
     Without a robot the action is a wrench (bodies, 3) in N, N, N m, in world axes about each body
     frame's origin, held for one control period; with one it is a `RobotAction`.
 
-    Args:
-        pieces: what stands where; hidden constants that a piece does not bring are drawn by the
-            seed of `reset`.
-        walls: simple polygons (points, 2) in m.
-        robot: the mobile manipulator among them, if any.
-        sensors: how noisy observations are.
+    Hidden constants that a piece does not bring are drawn by the seed of `reset`. `walls` are
+    simple polygons (points, 2) in m.
 
     Raises `PalpateError` for a scene without pieces, pieces that start inside one another or a
     wall, a malformed wall or action; and `DivergedError`, also when a piece tips over.
@@ -210,17 +206,15 @@ class FurnitureWorld(World):
             draw_swivels(kind, parameters, self._random)
             for kind, parameters in zip(self._kinds, self._parameters, strict=True)
         ]
-        spec = furniture_scene(
-            self._names, self._kinds, self._parameters, swivels, start, self._walls
-        )
+        pieces = self._names, self._kinds, self._parameters
+        spec = furniture_scene(*pieces, swivels, start, self._walls)
         if self._robot:
             add_robot(spec, self._robot, self._names)
         model = spec.compile()
         data = mujoco.MjData(model)
         bodies = Bodies(model, data, self._names, self._kinds, start[:, 2])
-        robot = self._robot and RobotInScene(
-            model, data, self._robot, bodies, list(self.outlines.values())
-        )
+        outlines = list(self.outlines.values())
+        robot = self._robot and RobotInScene(model, data, self._robot, bodies, outlines)
         mujoco.mj_step(model, data, round(SETTLING / TIME_STEP))
         self._running = _Running(model, data, bodies, robot)
         self._check()
@@ -297,11 +291,10 @@ class FurnitureWorld(World):
         return self._running
 
     def _refuse_overlaps(self, poses: np.ndarray) -> None:
-        shapes = [
-            shapely.Polygon(placed(outline, pose))
-            for outline, pose in zip(self.outlines.values(), poses, strict=True)
+        named = [
+            (name, shapely.Polygon(placed(outline, pose)))
+            for (name, outline), pose in zip(self.outlines.items(), poses, strict=True)
         ]
-        named = list(zip(self._names, shapes, strict=True))
         robot = self._robot
         if robot:
             named.append(("robot", shapely.Point(robot.pose[:2]).buffer(robot.radius)))
@@ -335,11 +328,11 @@ class FurnitureWorld(World):
         self, wrench: np.ndarray, felt: tuple[np.ndarray, np.ndarray] | None
     ) -> FurnitureObservation:
         sensors, random = self._sensors, self._random
-        poses, robot = self._now().bodies.poses(), None
+        _, _, bodies, scene = self._now()
+        poses, robot = bodies.poses(), None
         pose_noise = (sensors.position_noise, sensors.position_noise, sensors.angle_noise)
         relative, offset, drift = random.standard_normal((3, *wrench.shape))
         poses += drift * pose_noise
-        scene = self._now().robot
         if scene is None or self._robot is None:
             held = wrench.any(-1, keepdims=True)
             wrench = held * sensors.measured(wrench, relative, offset)

@@ -224,13 +224,9 @@ def _cart() -> PieceKind:
     )
 
 
-def _all(kinds: Sequence[PieceKind]) -> dict[str, PieceKind]:
-    return {kind.name: kind for kind in kinds}
-
-
 RUBBER = (0.6, 0.9)  # wheels on the floor
 
-KINDS: dict[str, PieceKind] = _all([
+KINDS: dict[str, PieceKind] = {kind.name: kind for kind in (
     PieceKind(
         name="table", outline=_rectangle(1.2, 0.7), mass=25.0, mounts=_corners(0.5, 0.27, "caster"),
         hand_force=50.0, friction=RUBBER, locked_casters=1,
@@ -264,4 +260,4 @@ KINDS: dict[str, PieceKind] = _all([
         mounts=_corners(0.27, 0.22, "foot", 0.02), hand_force=80.0, friction=(0.25, 0.35),
         height=0.5,
     ),
-])  # fmt: skip
+)}  # fmt: skip

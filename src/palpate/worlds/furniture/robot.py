@@ -2,9 +2,9 @@
 
 The base is a cylinder on two slides and a yaw hinge (it never tips, and its own wheels are left
 out), the arm has three hinges. Servos of both follow the integral of the commanded velocities, and
-give way at their force limits. Base and gripper collide; the links reach
-over the furniture and do not. A grasp is a weld, made where the gripper touches an outline. What
-is sensed: encoders, motor efforts and a force-torque sensor in the wrist.
+give way at their force limits. Base and gripper collide; the links, above the furniture, do not. A
+grasp is a weld, made where the gripper touches an outline. What is sensed: encoders, motor efforts
+and a force-torque sensor in the wrist.
 """
 
 from __future__ import annotations

@@ -53,12 +53,8 @@ def furniture_scene(
     """The scene, uncompiled, with each body called by its name in `names`.
 
     Its first 3 * bodies controls are each body's wrench (N, N, N m), in world axes about the
-    body's origin at `HANDLE_HEIGHT`.
-
-    Args:
-        swivels: rad, per body and mount, where casters start.
-        poses: (bodies, 3) m, m, rad, where bodies start.
-        walls: simple polygons (points, 2) m.
+    body's origin at `HANDLE_HEIGHT`. Casters start at `swivels` (rad, per body and mount), bodies
+    at `poses` (bodies, 3) m, m, rad; `walls` are simple polygons (points, 2) m.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "furniture"

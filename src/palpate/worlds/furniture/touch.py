@@ -27,10 +27,7 @@ def felt_wrenches(
 
     The wrist's wrench goes to the body that is held. An empty gripper's force, and the base's,
     go to the nearest body within 3 cm, at its nearest point, unless a wall is nearer still.
-
-    Args:
-        radius: of the base, m.
-        poses: (bodies, 3) m, m, rad, as seen.
+    `radius` (m) is the base's; `poses` (bodies, 3) m, m, rad are as seen.
     """
     wrenches = np.zeros_like(poses)
     gripper, base = robot.gripper_pose[:2], robot.base_pose[:2]

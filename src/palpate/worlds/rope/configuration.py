@@ -46,9 +46,8 @@ class RopeConfiguration:
     times its angular velocity. MuJoCo applies its inertia-box fluid law to each body: with the
     half sides r of the box that has the body's inertia, the force along axis i is
     -6 pi viscosity mean(r) v_i (linear) and -2 density r_j r_k |v_i| v_i (quadratic); torques
-    likewise. The viscosity is an effective one: still air alone (1.8e-5 Pa s) would let a rope
-    swing for minutes, while the fuzz and the sliding fibres of a real one stop it within
-    seconds. With the defaults a small free swing halves its amplitude in about 3.6 periods.
+    likewise. The viscosity is an effective one, for fuzz and sliding fibres too (still air has
+    1.8e-5 Pa s): with the defaults a small free swing halves its amplitude in about 3.6 periods.
 
     **Time step.** The simulation is explicit but for the joint damping, of first order, and gains
     energy where a limp rope spins about its own axis: at 0.5 ms some 4 % of the start's within

@@ -104,9 +104,8 @@ class FilmedRope(World):
         return self._world.render(width, height)
 
     def _observed(self, observation, frame: Frame | None) -> FilmedObservation:
-        return FilmedObservation(
-            observation.time, observation.gripper_position, observation.gripper_velocity, frame
-        )
+        seen = observation.time, observation.gripper_position, observation.gripper_velocity
+        return FilmedObservation(*seen, frame)
 
     def _film(self, time: float) -> Frame:
         poses = [self._pose(time + instant) for instant in self._sensor.instants]
@@ -138,9 +137,8 @@ def _scenery(background: Background, random: np.random.Generator) -> mujoco.MjMo
         geoms += [_object(random, index % 4 == 0) for index in range(CLUTTER)]
     if background == "occluder":
         geoms.append(_bar())
-    return mujoco.MjModel.from_xml_string(
-        f"<mujoco><worldbody>{''.join(geoms)}</worldbody></mujoco>"
-    )
+    scene = f"<mujoco><worldbody>{''.join(geoms)}</worldbody></mujoco>"
+    return mujoco.MjModel.from_xml_string(scene)
 
 
 def _bar() -> str:

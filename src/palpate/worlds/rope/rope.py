@@ -117,12 +117,10 @@ class RopeWorld(World):
 
         Args:
             seed: draws the azimuth and the observation noise.
-            start: "hanging", or one of `START_POSES`: "straight" (60 degrees from hanging),
-                "half_circle" (in a vertical plane, tip level with the gripper), "helix" (1.5
-                turns about an axis 45 degrees from hanging), all at rest; "shaken": released
-                while still in motion, when a three-dimensional shaking of the gripper at 1.2 Hz
-                from hanging has just stopped; or a polyline of shape (n, 3) from gripper to tip,
-                which is scaled to the rope's length, moved to the gripper, and starts at rest.
+            start: "hanging", or one of `START_POSES`: "straight", "half_circle", "helix" (see
+                `starts`), all at rest; "shaken": released in motion, when a three-dimensional
+                shaking of the gripper at 1.2 Hz from hanging has just stopped; or a polyline (n, 3)
+                from gripper to tip, scaled to the rope's length and moved to the gripper, at rest.
             azimuth: angle in radians by which the start is turned about the vertical; drawn
                 uniformly from the circle if None.
         """
@@ -216,9 +214,8 @@ class RopeWorld(World):
         command = _limit(command, configuration.speed_limit)
         greatest_change = configuration.acceleration_limit * configuration.time_step
         for _ in range(self._steps_per_period):
-            self._profile_velocity = self._profile_velocity + _limit(
-                command - self._profile_velocity, greatest_change
-            )
+            change = _limit(command - self._profile_velocity, greatest_change)
+            self._profile_velocity = self._profile_velocity + change
             data.ctrl += self._profile_velocity * configuration.time_step
             if disturbed and configuration.disturbances:
                 self._disturb()
@@ -253,9 +250,8 @@ class RopeWorld(World):
         )
 
     def _nodes(self) -> np.ndarray:
-        return np.concatenate(
-            [self._data.xpos[self._rope], self._data.site_xpos[self._tip_site][None]]
-        )
+        tip = self._data.site_xpos[self._tip_site]
+        return np.concatenate([self._data.xpos[self._rope], tip[None]])
 
     def _energy(self, angular: np.ndarray, linear: np.ndarray, centre: np.ndarray) -> float:
         model, data, configuration = self._model, self._data, self._configuration

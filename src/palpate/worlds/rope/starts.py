@@ -63,12 +63,9 @@ START_POSES = ("straight", "half_circle", "helix", "shaken")  # those used for e
 def start_tangents(start: str | np.ndarray, bodies: int) -> np.ndarray:
     """Unit directions (bodies, 3) of the chords between nodes spread evenly along `start`.
 
-    Args:
-        start: a name in `START_CURVES`, or a polyline (n, 3) from gripper to tip in any unit.
-
-    Raises:
-        PalpateError: the name is unknown, or the polyline has a wrong shape, is not finite, has
-            no length, or folds back onto itself so that two neighbouring nodes coincide.
+    `start` is a name in `START_CURVES`, or a polyline (n, 3) from gripper to tip in any unit.
+    Raises `PalpateError` for an unknown name, and for a polyline that has a wrong shape, is not
+    finite, has no length, or folds back onto itself so that two neighbouring nodes coincide.
     """
     fractions = np.linspace(0, 1, bodies + 1)
     if isinstance(start, str):
@@ -89,9 +86,8 @@ def start_tangents(start: str | np.ndarray, bodies: int) -> np.ndarray:
         along = np.cumsum([0, *np.linalg.norm(np.diff(points, axis=0), axis=-1)])
         if along[-1] == 0:
             raise PalpateError("a start curve has a length, but all points of this one coincide")
-        nodes = np.stack(
-            [np.interp(fractions * along[-1], along, points[:, axis]) for axis in range(3)], axis=-1
-        )
+        places = fractions * along[-1]
+        nodes = np.stack([np.interp(places, along, axis) for axis in points.T], axis=-1)
     chords = np.diff(nodes, axis=0)
     lengths = np.linalg.norm(chords, axis=-1, keepdims=True)
     if lengths.min() < 1e-9:
@@ -110,7 +106,7 @@ def joint_rotations(tangents: np.ndarray) -> np.ndarray:
     rotations = []
     for tangent in tangents:
         turned = _multiply(_least_rotation(direction, tangent), frame)
-        rotations.append(_multiply(_conjugate(frame), turned))
+        rotations.append(_multiply(frame * (1, -1, -1, -1), turned))
         direction, frame = tangent, turned
     return np.array(rotations)
 
@@ -133,10 +129,6 @@ def _multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     product = np.empty(4)
     mujoco.mju_mulQuat(product, p, q)
     return product
-
-
-def _conjugate(q: np.ndarray) -> np.ndarray:
-    return q * (1, -1, -1, -1)
 
 
 def _least_rotation(before: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -49,15 +49,11 @@ class Space:
         self.xs = left + (np.arange(self.shape[1]) + 0.5) * self.cell
         self.ys = bottom + (np.arange(self.shape[0]) + 0.5) * self.cell
         self.inflation = math.hypot(world.clearance, self.cell / math.sqrt(2))
-        fixed = set(fixed)
-        self.fixed = {name: movable for name, movable in world.movables.items() if name in fixed}
-        self.movables = {
-            name: movable for name, movable in world.movables.items() if name not in fixed
-        }
-        edges = list(world.wall_edges)
+        fixed, self.movables = set(fixed), dict(world.movables)
+        self.fixed = {name: self.movables.pop(name) for name in world.movables if name in fixed}
         walls = [world.walls, *(movable.polygon for movable in self.fixed.values())]
-        edges += [edge for movable in self.fixed.values() for edge in _edges(movable)]
-        self.wall_tree = shapely.STRtree(edges)
+        edges = [edge for movable in self.fixed.values() for edge in _edges(movable)]
+        self.wall_tree = shapely.STRtree([*world.wall_edges, *edges])
         self.static = self._blocked_by(walls)
         self.count = np.zeros(self.shape, np.int16)
         self.covers: dict[str, Cover] = {}
@@ -71,26 +67,23 @@ class Space:
     def moved(self, name: str, pose: Pose | np.ndarray) -> "Space":
         """The same with one object elsewhere."""
         after = copy.copy(self)
-        after.movables = dict(self.movables)
-        after.movables[name] = movable = self.movables[name].moved(pose)
-        after.covers, after.count = dict(self.covers), self.count.copy()
-        old = self.covers[name]
+        movable = self.movables[name].moved(pose)
+        after.movables = self.movables | {name: movable}
+        old, new, after.count = self.covers[name], self.cover_of(movable), self.count.copy()
         after.count[old.window] -= old.mask
-        after.covers[name] = new = self.cover_of(movable)
         after.count[new.window] += new.mask
-        after._tree = None
+        after.covers, after._tree = self.covers | {name: new}, None
         return after
 
     def without(self, names: Iterable[str]) -> "Space":
         """The same with some objects gone altogether."""
         after = copy.copy(self)
         after.movables, after.covers = dict(self.movables), dict(self.covers)
-        after.count = self.count.copy()
+        after.count, after._tree = self.count.copy(), None
         for name in names:
             cover = after.covers.pop(name)
             after.count[cover.window] -= cover.mask
             del after.movables[name]
-        after._tree = None
         return after
 
     @property
@@ -105,9 +98,8 @@ class Space:
         for name in names:
             cover = self.covers[name]
             count[cover.window] -= cover.mask
-        if window is not None:
-            return ~self.static[window] & (count[window] == 0)
-        return ~self.static & (count == 0)
+        part = ... if window is None else window
+        return ~self.static[part] & (count[part] == 0)
 
     def cover_of(self, movable: Movable) -> Cover:
         """The cells that an object covers where it stands."""
@@ -139,10 +131,7 @@ class Space:
         """Row and column of one point (2 or more), clipped to the grid."""
         column = math.floor((float(point[0]) - self.map.bounds[0]) / self.cell)
         row = math.floor((float(point[1]) - self.map.bounds[1]) / self.cell)
-        return (
-            min(max(row, 0), self.shape[0] - 1),
-            min(max(column, 0), self.shape[1] - 1),
-        )
+        return min(max(row, 0), self.shape[0] - 1), min(max(column, 0), self.shape[1] - 1)
 
     def centres(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """(*batch, 2): the middles of cells, m."""

@@ -105,12 +105,9 @@ def _borders(space: Space, node: np.ndarray) -> tuple[Border, ...]:
         two = node[down:, max(0, right) : width + min(0, right)]
         rows, columns = np.nonzero((one != two) & (one >= 0) & (two >= 0))
         columns = columns + max(0, -right)
-        beside = rows + down, columns + right
-        a, b = node[rows, columns], node[beside]
-        here, there = rows * width + columns, beside[0] * width + beside[1]
-        sources += [a, b]
-        targets += [b, a]
-        places += [here, there]
+        a, b = node[rows, columns], node[rows + down, columns + right]
+        here, there = rows * width + columns, (rows + down) * width + columns + right
+        sources, targets, places = [*sources, a, b], [*targets, b, a], [*places, here, there]
     source, target, place = (np.concatenate(part) for part in (sources, targets, places))
     if not len(source):
         return ()

@@ -4,11 +4,10 @@ Of every object a set of hypotheses about its structure, each with particles of 
 parameters: it rolls or slides freely, has a fixed wheel axis (along its x or its y), pivots about a
 locked caster or a hinge at an unknown place, or is static. A contact is cut into short pieces; each
 particle predicts, from how the object moved before a piece and from the wrench that was felt during
-it, where the object is at its end (physics-based RL, Scholz et al. 2014). Robust, because casters
-swivel and hands slip; and every hypothesis keeps a small share, so that a belief never dies.
+it, where the object is at its end (physics-based RL, Scholz et al. 2014). The likelihood is robust,
+because casters swivel and hands slip; and every hypothesis keeps a small probability.
 
-All objects share one compiled function: whatever the outline, it is a rectangle's extent and radius
-of gyration that the model needs, and these are data.
+All objects share one compiled function: extent and radius of gyration are data.
 """
 
 import dataclasses

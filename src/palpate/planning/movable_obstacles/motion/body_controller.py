@@ -2,9 +2,8 @@
 
 The body controller of Scholz (2015), "Physics-Based Reinforcement Learning for Mobile
 Manipulation", turns a desired object velocity v_o into velocities of the manipulator v_m and of
-the base v_b. Here the arm returns to its nominal posture while the base follows, and what the
-base cannot do at once, because its acceleration is limited, the arm does in its stead. Pure
-kinematics, no state.
+the base v_b. Here the arm returns to its nominal posture while the base follows, and does what the
+base's limited acceleration does not allow at once. Pure kinematics, no state.
 """
 
 from __future__ import annotations
@@ -21,9 +20,7 @@ from palpate.errors import PalpateError
 def gripper_pose(joint_angles: np.ndarray, links: Sequence[float]) -> np.ndarray:
     """Pose (3,) in m, m, rad of the end of a planar arm in the frame of its shoulder.
 
-    Args:
-        joint_angles: (joints,) rad, each relative to the link before.
-        links: lengths (joints,) m.
+    `joint_angles` (joints,) rad are relative to the link before, `links` lengths (joints,) m.
     """
     headings = np.cumsum(joint_angles)
     lengths = np.asarray(links)
@@ -87,17 +84,12 @@ class BodyController:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Velocities of base (3,) and joints (joints,) that move the gripper as wanted.
 
-        The base would let the arm return to its posture at `return_rate`; it gets there as its
-        acceleration allows. The arm makes up for the rest by damped least squares around that
-        return. If anything were too fast for its limit, both slow down alike, so that the gripper
-        keeps its direction.
+        The base moves, as its acceleration allows, so that the arm returns to its posture at
+        `return_rate`; the arm makes up for the rest by damped least squares around that return.
+        What is too fast slows both down alike, so that the gripper keeps its direction.
 
-        Args:
-            base_pose: (3,) m, m, rad.
-            base_velocity: (3,) m/s, m/s, rad/s, world axes, that the base has now.
-            joint_angles: (joints,) rad.
-            gripper_velocity: (3,) m/s, m/s, rad/s, world axes, wanted.
-            period: seconds until the next call.
+        Poses (3,) in m, m, rad; velocities (3,) in m/s, m/s, rad/s along world axes, of the base
+        now and of the gripper as wanted; joints (joints,) in rad; `period`: s until the next call.
         """
         cosine, sine = math.cos(base_pose[2]), math.sin(base_pose[2])
         rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -108,7 +100,8 @@ class BodyController:
         homewards = np.clip(homewards, -0.5 * self.joint_speed, 0.5 * self.joint_speed)
 
         base = np.linalg.solve(carried, gripper_velocity - arm @ homewards)
-        base = self._within_base_speed(base)
+        linear = self.base_speed / max(math.hypot(*base[:2]), 1e-12)
+        base *= min(1.0, linear, self.turn_speed / max(abs(base[2]), 1e-12))
         change = base - base_velocity
         planar = self.base_acceleration * period
         change[:2] *= min(1.0, planar / max(math.hypot(*change[:2]), 1e-12))
@@ -121,8 +114,3 @@ class BodyController:
         joints = homewards + arm.T @ np.linalg.solve(gram, missing)
         slower = min(1.0, self.joint_speed / max(np.abs(joints).max(), 1e-12))
         return slower * base, slower * joints
-
-    def _within_base_speed(self, velocity: np.ndarray) -> np.ndarray:
-        linear = self.base_speed / max(math.hypot(*velocity[:2]), 1e-12)
-        angular = self.turn_speed / max(abs(velocity[2]), 1e-12)
-        return velocity * min(1.0, linear, angular)

@@ -3,12 +3,10 @@
 Scholz et al.'s manipulation primitives: linear velocities along the object's free directions and a
 turn about one point, and where to hold it. Free: any direction, a turn about the centroid, held
 anywhere. A free axis (fixed wheels): along it, a turn about a point beside the wheels' middle. A
-fixed point (a locked caster, a hinge): a turn about it. What is turned about a point that is held
-in place is held away from that point. Static: none.
+fixed point (a locked caster, a hinge): a turn about it, held away from it. Static: none.
 
-The deck holds a piece on wheels at faces across the axis alone, as one takes a cart by its handle.
-A gripper that holds on pulls it along from any face, and the face that can be reached in a doorway
-is often the other one.
+The deck holds a piece on wheels at faces across the axis alone; here it may be pulled along from
+any face, as often only another one can be reached in a doorway.
 """
 
 import math
@@ -81,11 +79,11 @@ def anchors(constraints: Sequence[Constraint], most: int = 5) -> list[tuple[floa
 
 def turns(constraints: Sequence[Constraint]) -> list[Turn]:
     """Both ways about each anchor."""
-    found = []
-    for number, anchor in enumerate(anchors(constraints)):
-        for name, turn in (("left", 1.0), ("right", -1.0)):
-            found.append(Turn(f"turn {name} about {number}", turn=turn, anchor=anchor))
-    return found
+    return [
+        Turn(f"turn {name} about {number}", turn=turn, anchor=anchor)
+        for number, anchor in enumerate(anchors(constraints))
+        for name, turn in (("left", 1.0), ("right", -1.0))
+    ]
 
 
 def grasp_share(constraint: Constraint, grasps: Sequence[Grasp]) -> np.ndarray:
@@ -106,19 +104,17 @@ def twist(constraint: Constraint, wanted: np.ndarray, lever: float, yielding: fl
     Zero where the constraint holds it: where more than the share `yielding` of the hand's way,
     `lever` m per rad from the point turned about, would go against it.
     """
-    still = np.zeros(3)
     if constraint.kind == STATIC:
-        return still
+        return np.zeros(3)
     if constraint.kind == FREE:
         return wanted
     x, y = constraint.anchor
     at_anchor = np.array([wanted[0] - wanted[2] * y, wanted[1] + wanted[2] * x])
     hand = max(float(np.hypot(*wanted[:2])) if not wanted[2] else abs(wanted[2]) * lever, 1e-9)
+    off = at_anchor
     if constraint.kind == AXIS:
         along = np.array([math.cos(constraint.direction), math.sin(constraint.direction)])
         off = at_anchor - along * (along @ at_anchor)
-    else:
-        off = at_anchor
     if np.hypot(*off) > yielding * hand:
-        return still
+        return np.zeros(3)
     return np.array([wanted[0] - off[0], wanted[1] - off[1], wanted[2]])

@@ -2,9 +2,8 @@
 
 An abstract state is a node of `regions` as it was entered, because how far it is to the next border
 depends on where one stands. Scholz, Levihn, Isbell et al. (NAMO-MDP, WAFR 2012) iterate
-V(s) <- max_a R + gamma sum P V over free regions; here as costs without discount, and with one
-difference: an object that did not give way once is not tried again, so that a failure leads to the
-best action with another object, not back to the same choice.
+V(s) <- max_a R + gamma sum P V over free regions; here as costs without discount, and an object
+that did not give way once is not tried again: a failure leads to the best action with another.
 """
 
 from collections.abc import Sequence

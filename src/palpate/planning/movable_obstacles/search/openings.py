@@ -97,6 +97,7 @@ class OpeningSearch:
         world = space.map
         self.standoff = world.robot.radius + world.reach
         self._nearby = {move.name: self.standoff}
+        self._handling = HANDLING * world.robot.radius
         self._reached = distances(space, window, robot, standing=True)
         self._passage = Passage(space, window, move)
         spacing = max(world.robot.radius / 2, 2 * world.cell_size)
@@ -199,7 +200,7 @@ class OpeningSearch:
     def _grasp_bounds(self) -> dict[int, float]:
         """The least cost with each grasp that is free and that the robot may get to."""
         poses = self._robot_at
-        # As far behind the grasp as a cell may be free, where a hand reaches less than the margin.
+        # as far behind the grasp as a cell may be free where a hand reaches less than the margin
         world = self.space.map
         behind = 1.5 * self.space.cell + max(0.0, world.margin - world.reach)
         back = poses[:, :2] - behind * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
@@ -211,10 +212,6 @@ class OpeningSearch:
     @cached_property
     def _ordered_grasps(self) -> list[int]:
         return sorted(self._grasp_bounds, key=lambda index: self._grasp_bounds[index])
-
-    @property
-    def _handling(self) -> float:
-        return HANDLING * self.space.map.robot.radius
 
     def approach(self, grasp: int) -> float:
         """How far it is from where the robot is to that grasp, m."""

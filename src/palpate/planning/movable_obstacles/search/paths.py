@@ -70,12 +70,10 @@ class Distances:
         return straightened(self.space, points, self._allowed, allowed)
 
     def _link(self, point: np.ndarray, nearby: dict[str, float]) -> tuple[int, float] | None:
-        best = None
-        for node, gap in links(self.space, self.window, point, self.lengths < np.inf, nearby):
-            length = float(self.lengths.flat[node]) + gap
-            if best is None or length < best[1]:
-                best = node, length
-        return best
+        allowed = allowed_at(self.space, point, nearby)
+        joined = links(self.space, self.window, point, self.lengths < np.inf, allowed)
+        ways = [(node, float(self.lengths.flat[node]) + gap) for node, gap in joined]
+        return min(ways, key=lambda way: way[1], default=None)
 
 
 def distances(
@@ -111,7 +109,7 @@ def distances(
     counts = np.zeros(size, np.int32)
     counts[node] = beside.sum(axis=1)
     allowed = allowed_at(space, source, nearby, standing=standing)
-    joined = _links(space, window, source, free, allowed)
+    joined = links(space, window, source, free, allowed)
     columns = (node[:, None] + offsets)[beside]
     weights = np.broadcast_to(_LENGTHS * space.cell, beside.shape)[beside]
     columns = np.concatenate([columns, np.array([n for n, _ in joined], int)])
@@ -121,36 +119,17 @@ def distances(
     lengths, predecessors = dijkstra(
         graph, indices=size, return_predecessors=True, limit=max(limit, 0.0)
     )
-    return Distances(
-        space,
-        window,
-        np.asarray(source, float)[:2],
-        lengths[:-1].reshape(height, width),
-        predecessors,
-        allowed,
-    )
+    source, lengths = np.asarray(source, float)[:2], lengths[:-1].reshape(height, width)
+    return Distances(space, window, source, lengths, predecessors, allowed)
 
 
 def links(
-    space: Space,
-    window: Window,
-    point: np.ndarray,
-    free: np.ndarray,
-    nearby: dict[str, float],
-    *,
-    standing: bool = False,
+    space: Space, window: Window, point: np.ndarray, free: np.ndarray, allowed: "Allowed"
 ) -> list[tuple[int, float]]:
     """Free cells of the window that a straight way joins to `point`: their nodes and lengths, m.
 
-    The nearest ones, with the exceptions of `allowed_at`.
+    The nearest ones, with the exceptions `allowed`.
     """
-    return _links(space, window, point, free, allowed_at(space, point, nearby, standing=standing))
-
-
-def _links(
-    space: Space, window: Window, point: np.ndarray, free: np.ndarray, allowed: "Allowed"
-) -> list[tuple[int, float]]:
-    """`links` with the exceptions worked out."""
     point = np.asarray(point, float)[:2]
     around = math.ceil((space.map.margin + 1e-9) / space.cell) + 2
     row, column = space.cell_at(point)
@@ -258,12 +237,9 @@ def straightened(space: Space, points: np.ndarray, first: Allowed, last: Allowed
 
 def _joined(one: Allowed, other: Allowed) -> Allowed:
     """What either of them allows."""
-    walls, objects = dict(one.walls), dict(one.objects)
-    for index, gap in other.walls.items():
-        walls[index] = min(gap, walls.get(index, gap))
-    for name, gap in other.objects.items():
-        objects[name] = min(gap, objects.get(name, gap))
-    return Allowed(walls, objects)
+    walls = {k: min(gap, one.walls.get(k, gap)) for k, gap in other.walls.items()}
+    objects = {k: min(gap, one.objects.get(k, gap)) for k, gap in other.objects.items()}
+    return Allowed(one.walls | walls, one.objects | objects)
 
 
 def _resampled(points: np.ndarray, spacing: float) -> np.ndarray:

@@ -1,9 +1,8 @@
 """The planner: value iteration over regions, and tree search for the openings it cares about.
 
-Abstract actions begin with the least they could cost. Value iteration finds the best policy; what
-it would do from where the robot stands is worked out below, in order, each on the map as the
-earlier actions leave it; what is found replaces the bound, and value iteration is solved
-anew, until the whole policy consists of actions that have been worked out (the lazy evaluation of
+Abstract actions begin with the least they could cost. What the best policy would do from where the
+robot stands is worked out in order, each action on the map as the earlier ones leave it, and what
+is found replaces the bound, until the whole policy has been worked out (the lazy evaluation of
 LAO*, Hansen and Zilberstein 2001). Objects that the policy never needs are never simulated.
 
 An object is held once for each way that it opens. Only where no plan is found so, it may be put
@@ -237,7 +236,7 @@ class Planner:
     def _stops(self, ahead: Progress, move: Move) -> list[Opening]:
         """Where the object may be put down to be held elsewhere."""
         for window in (window_of(ahead.space, ahead.robot, move), whole(ahead.space)):
-            below = self._below(ahead, move, window)
+            below = OpeningSearch(ahead.space, self.model, ahead.robot, move, window)
             if below.reachable:
                 return stops_of(below)
         return []
@@ -257,15 +256,12 @@ class Planner:
                         "an opening: its objects stand too much in one another's way"
                     )
                 self._sizes["evaluations"] += 1
-                below = self._below(ahead, move, window)
+                below = OpeningSearch(space, self.model, ahead.robot, move, window)
                 self._known[key] = open_way(below, self.settings, self.seed), below.reachable
             opening, reachable = self._known[key]
             if opening is not None or reachable:
                 return opening
         return None
-
-    def _below(self, ahead: Progress, move: Move, window: Window) -> OpeningSearch:
-        return OpeningSearch(ahead.space, self.model, ahead.robot, move, window)
 
     def _key(self, ahead: Progress, move: Move, window: Window) -> Hashable:
         """All that decides what a search finds."""

@@ -12,7 +12,7 @@ from palpate.planning.movable_obstacles.maps.regions import Border, Regions, reg
 from palpate.planning.movable_obstacles.motion.collisions import SHRUNK
 from palpate.planning.movable_obstacles.search.abstract import Actions, iterate
 from palpate.planning.movable_obstacles.search.openings import HANDLING
-from palpate.planning.movable_obstacles.search.paths import links
+from palpate.planning.movable_obstacles.search.paths import allowed_at, links
 from palpate.planning.movable_obstacles.search.situation import whole
 from palpate.planning.movable_obstacles.search.transfers import Move
 
@@ -44,7 +44,6 @@ class PolicyGraph:
         self._goal = np.array(goal[:2])
         start = self._start(robot, nearby or {})
         aim = _node(space, self.regions, self._goal, "goal")
-        self.aim = aim
         points = np.array([robot[:2], *(border.point for border in borders), self._goal])
         entered = np.array([start, *(border.target for border in borders)])
         self._states = len(borders) + 2
@@ -74,8 +73,7 @@ class PolicyGraph:
                 cost.append(np.linalg.norm(points[state] - self._goal))
                 group.append(-1)
                 self.needed.append(())
-        self._points = points
-        self._cheapest = math.inf
+        self._points, self._cheapest = points, math.inf
         self._known = np.zeros(len(source), bool)
         self._count = np.array([len(names) for names in self.needed], int)
         self._straight = np.array(cost, float) - handling * self._count
@@ -97,8 +95,8 @@ class PolicyGraph:
         """The free region that the robot gets to from where it stands; else the node it is in."""
         free = self.space.free
         if not free[self.space.cell_at(robot)]:
-            window = whole(self.space)
-            joined = links(self.space, window, robot, free, nearby, standing=True)
+            allowed = allowed_at(self.space, robot, nearby, standing=True)
+            joined = links(self.space, whole(self.space), robot, free, allowed)
             if joined:
                 return int(self.regions.node.flat[min(joined, key=lambda link: link[1])[0]])
         return _node(self.space, self.regions, robot, "start")
@@ -189,11 +187,10 @@ class PolicyGraph:
 
     def complaint(self, name: str) -> str:
         """Why there is no way."""
-        area = self.space.cell**2 * np.bincount(
-            self.regions.node[self.regions.node >= 0], minlength=1
-        )
-        here = int(self.regions.node[self.space.cell_at(self._points[0])])
-        size = f"region of {area[here]:.3g} square m" if here >= 0 else "start"
+        node = self.regions.node
+        here = int(node[self.space.cell_at(self._points[0])])
+        area = self.space.cell**2 * np.count_nonzero(node == here)
+        size = f"region of {area:.3g} square m" if here >= 0 else "start"
         if not self.tried:
             fixed = [f"'{one}'" for one in self.space.fixed]
             more = ", ..." if len(fixed) > 6 else ""
@@ -227,7 +224,8 @@ def _node(space: Space, regions: Regions, point: np.ndarray, what: str) -> int:
     if node >= 0:
         return node
     open_cells = ~space.static
-    joined = links(space, whole(space), point, open_cells, {name: 0.0 for name in space.names})
+    allowed = allowed_at(space, point, dict.fromkeys(space.names, 0.0))
+    joined = links(space, whole(space), point, open_cells, allowed)
     if not joined:
         place = f"the {what} ({point[0]:.3g}, {point[1]:.3g})"
         if shapely.distance(space.map.walls, shapely.Point(point[:2])) >= space.map.clearance:

@@ -10,7 +10,7 @@ from scipy import ndimage
 from palpate.numerics.polygons import length_of
 from palpate.planning.movable_obstacles.maps.map import Pose
 from palpate.planning.movable_obstacles.maps.occupancy import Space, Window
-from palpate.planning.movable_obstacles.search.paths import distances, links
+from palpate.planning.movable_obstacles.search.paths import allowed_at, distances, links
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, TRANSIT, Segment
 from palpate.planning.movable_obstacles.search.transfers import Opening
 
@@ -28,7 +28,8 @@ def at_hand(now: Progress) -> set[str]:
     """The objects that the robot can drive up to."""
     space = now.space
     labels, _ = ndimage.label(space.free, np.ones((3, 3), int))
-    joined = links(space, whole(space), now.robot, space.free, beside(now), standing=True)
+    allowed = allowed_at(space, now.robot, beside(now), standing=True)
+    joined = links(space, whole(space), now.robot, space.free, allowed)
     own = {int(labels.ravel()[node]) for node, _ in joined}
     found = set()
     for name, cover in space.covers.items():

@@ -1,10 +1,10 @@
 """Monte-Carlo tree search with progressive widening, over sequences of actions.
 
 UCT (Kocsis and Szepesvari 2006) with double progressive widening (Couetoux et al. 2011): a node of
-n visits has at most k n^alpha children, actions as well as outcomes. Outcomes are draws of a belief
-that a domain numbers, so that a sequence of actions meets the same draws again; a node's value is
-the mean of what came of it, or the most where there is but one draw and nothing is left to chance.
-An action that even at its best is no better than what was found is closed.
+n visits has at most k n^alpha children, actions as well as outcomes. Outcomes are numbered draws of
+a belief, which a sequence of actions meets again; a node's value is the mean of what came of it, or
+the most where there is but one draw. An action that at best is no better than what was found is
+closed.
 """
 
 import math
@@ -154,12 +154,7 @@ def _simulate(
 
 
 def _select(
-    domain: Domain,
-    settings: Settings,
-    node: _Node,
-    state: Any,
-    actions: Sequence[Any],
-    best: float,
+    domain: Domain, settings: Settings, node: _Node, state: Any, actions: Sequence[Any], best: float
 ) -> Any:
     """The action of the greatest upper confidence bound among those open; None closes the node."""
     width = _width(settings, node.visits + 1)

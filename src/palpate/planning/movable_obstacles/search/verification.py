@@ -43,9 +43,8 @@ def _faults(plan: Plan, world: Map) -> Iterator[str]:
     released: str | None = None
     for index, segment in enumerate(plan.segments):
         what = f"segment {index} ({segment.kind})"
-        if np.abs(segment.poses[0] - robot)[:2].max() > _JOINED or _differ(
-            segment.poses[0, 2], robot[2]
-        ):
+        moved = np.abs(segment.poses[0] - robot)[:2].max() > _JOINED
+        if moved or _differ(segment.poses[0, 2], robot[2]):
             yield f"{what} does not begin where the robot is"
         robot = segment.poses[-1]
         if world.robot.drive == "differential":
@@ -53,8 +52,7 @@ def _faults(plan: Plan, world: Map) -> Iterator[str]:
         ahead = plan.segments[index + 1 : index + 2]
         near = {name for name in (released, *(s.name for s in ahead)) if name is not None}
         if segment.kind == TRANSIT:
-            others = dict(standing)
-            yield from (f"{what}: {f}" for f in _disc(segment, world, others, near))
+            yield from (f"{what}: {f}" for f in _disc(segment, world, standing, near))
             released = None
             continue
         name = str(segment.name)

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands.serve import free_endpoint, limits_of, supervisor_of
-from palpate.deployment.contract import contract_of
+from palpate.deployment.deployment import deployment_of
 from palpate.deployment.loop import LATE, Record, run_loop, wait_until
 from palpate.deployment.scheduling import ROBOT, real_time
 from palpate.deployment.supervisor import Mode, Supervisor
@@ -99,16 +99,16 @@ def benchmark(seconds: float, trials: int) -> Result:
     began = time.monotonic()
     file = importlib.resources.files("palpate") / "assets" / "rope-stabilization.safetensors"
     policy, manifest = load_policy(str(file))
-    contract = contract_of(policy, manifest)
-    limits = limits_of(contract, None, None)
-    markers = contract.features[0].shape[0] + 1
+    deployment, limits = deployment_of(policy, manifest), limits_of(policy, (), ())
+    ((_, _, change),) = limits.vectors
+    markers, period = deployment.sensors[-1].shape[0], policy.period
 
     def supervisor() -> Supervisor:
-        return supervisor_of(policy, contract, markers, limits)
+        return supervisor_of(deployment, limits)
 
     endpoint = free_endpoint()
     words = [sys.executable, "-m", "benchmarks.serve", "--robot", endpoint, str(markers)]
-    words += [str(contract.period), str(seconds + 3 * EVERY), str(trials)]
+    words += [str(period), str(seconds + 3 * EVERY), str(trials)]
     first, second = supervisor(), supervisor()
     with (
         subprocess.Popen([sys.executable, "-c", BUSY]) as busy,
@@ -120,14 +120,12 @@ def benchmark(seconds: float, trials: int) -> Result:
             with real_time() as prompt, ZenohLink(STATE, COMMAND, listen=endpoint) as link:
                 _await(link, other)
                 stolen = _stolen()
-                record = run_loop(first, link, contract.period, lambda now: now < seconds, _told)
+                record = run_loop(first, link, period, lambda now: now < seconds, _told)
                 stolen = _stolen() - stolen
-                silent = run_loop(
-                    second, link, contract.period, lambda now: other.poll() is None, _told
-                )
+                silent = run_loop(second, link, period, lambda now: other.poll() is None, _told)
             said = other.communicate()[0]
             with real_time():
-                bare = _bare(seconds, contract.period)
+                bare = _bare(seconds, period)
         finally:
             busy.kill()
             other.kill()
@@ -135,7 +133,7 @@ def benchmark(seconds: float, trials: int) -> Result:
     if not measured or not record.turnaround.count:
         raise PalpateError("the policy never moved the robot fast enough: nothing was measured")
     brakes = np.array([one["brake"] for one in measured])
-    allowed = np.array([ALLOWED + one["speed"] / limits.acceleration for one in measured])
+    allowed = np.array([ALLOWED + one["speed"] * period / change for one in measured])
     rests = np.array([np.inf if one["rest"] is None else one["rest"] for one in measured])
     excess = float(np.max(rests - allowed))
     excess_ms = _ms(excess) if np.isfinite(excess) else None
@@ -150,7 +148,7 @@ def benchmark(seconds: float, trials: int) -> Result:
         ],
         {
             "seconds": seconds,
-            "rate_hz": contract.rate,
+            "rate_hz": 1 / period,
             "cores": devices.cores(),
             "real_time_scheduling": prompt,
             "stolen_s": stolen,

@@ -9,8 +9,9 @@ import numpy as np
 
 from palpate.deployment.intake import Intake
 from palpate.deployment.messages import StateMessage, encode_state
-from palpate.deployment.plausibility import ChainCheck
+from palpate.deployment.plausibility import Values
 from palpate.deployment.supervisor import Limits, Order, Supervisor
+from palpate.families.rope.chain_check import ChainCheck
 from palpate.models.rope import Rope
 from palpate.networks import Channel, CommandPolicy
 from palpate.tasks.rope import RopeStabilization
@@ -23,7 +24,10 @@ IMPEDANCE = (
     Channel("damping ratio", (1,), "", 2.0),
 )
 NODES, SPACING = 6, 0.1
-LIMITS = Limits(speed=1.5, acceleration=10.0, period=PERIOD)
+SENSORS = Channel("gripper", (3,), "m"), Channel("markers", (NODES, 3), "m")
+SPEED, ACCELERATION = 1.5, 10.0  # limits, m/s and m/s^2
+CHANGE = ACCELERATION * PERIOD
+LIMITS = Limits([VELOCITY], PERIOD)
 
 
 def manifest(nodes: int = NODES) -> dict:
@@ -51,6 +55,14 @@ def rope_policy(nodes: int = NODES, **changes) -> CommandPolicy:
     return dataclasses.replace(policy, network=scaled(policy.network, 4.0))
 
 
+def impedance_policy(**changes) -> CommandPolicy:
+    """What an impedance-controlled arm is told: displacement, and stiffness axis by axis."""
+    seen = jax.random.normal(jax.random.key(2), (64, 7))
+    settings = {"period": 0.02, "width": 64} | changes
+    policy = CommandPolicy.create(jax.random.key(3), seen, IMPEDANCE, **settings)
+    return dataclasses.replace(policy, network=scaled(policy.network, 4.0))
+
+
 def scaled(network, factor: float):
     """The network with all its weights multiplied."""
     return jax.tree.map(lambda leaf: factor * leaf if eqx.is_array(leaf) else leaf, network)
@@ -67,7 +79,8 @@ def state(sequence: int, time: float, session: int = 7, markers=None, gripper=No
     """A message of that chain, unless it is told otherwise."""
     markers = shape(time) if markers is None else markers
     gripper = markers[0] if gripper is None else gripper
-    return encode_state(StateMessage(session, sequence, time, single(gripper), single(markers)))
+    values = {"gripper": single(gripper), "markers": single(markers)}
+    return encode_state(StateMessage(session, sequence, time, values))
 
 
 def single(values) -> np.ndarray:
@@ -86,8 +99,8 @@ class Pusher:
     def forget(self) -> None:
         self.forgotten += 1
 
-    def see(self, gripper: np.ndarray, markers: np.ndarray) -> None:
-        self.seen.append(markers)
+    def see(self, values: Values) -> None:
+        self.seen.append(values["markers"])
 
     def decide(self, command: np.ndarray) -> np.ndarray:
         return self.wanted
@@ -96,7 +109,8 @@ class Pusher:
 def supervisor(decision=None, limits: Limits = LIMITS, length: float = 0.5) -> Supervisor:
     """One for that chain, or one of another length (m)."""
     check = ChainCheck(np.full(NODES - 1, length / (NODES - 1)), limits.period)
-    return Supervisor(Intake(check, limits.period), decision or Pusher(), limits)
+    intake = Intake(check, SENSORS, limits.period)
+    return Supervisor(intake, decision or Pusher(), limits)
 
 
 class Bench:
@@ -145,13 +159,12 @@ class Bench:
     @property
     def velocities(self) -> np.ndarray:
         """All orders, (ticks, 3) m/s."""
-        return np.array([order.velocity for order in self.orders])
+        return np.array([order.action for order in self.orders])
 
     def check_limits(self) -> None:
         """No order, whatever happened, is faster or changes faster than is allowed."""
         velocities = np.concatenate([np.zeros((1, 3)), self.velocities])
         assert np.isfinite(velocities).all()
-        limits = LIMITS
-        assert np.linalg.norm(velocities, axis=1).max() <= limits.speed * (1 + 1e-6)
+        assert np.linalg.norm(velocities, axis=1).max() <= SPEED * (1 + 1e-6)
         changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1)
-        assert changes.max() <= limits.change * (1 + 1e-5)
+        assert changes.max() <= CHANGE * (1 + 1e-5)

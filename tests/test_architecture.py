@@ -54,12 +54,12 @@ PLACE_KEEPERS = {"families", "family", "cli"}
 FAMILY_WORDS = {"rope", "ropes", "furniture", "appliance", "appliances", "maze", "mazes"}
 GENERAL = {
     *FOUNDATION,
-    *("identification", "planning", "learning", "safety", "report", "cli"),
+    *("identification", "planning", "learning", "safety", "deployment", "report", "cli"),
     *(
         f"commands/{name}.py"
         for name in (
             *("demo", "record", "convert", "track", "identify", "plan", "train", "evaluate"),
-            *("export", "report", "reproduce", "folders", "parsing"),
+            *("export", "serve", "report", "reproduce", "folders", "parsing"),
         )
     ),
     *("models/model.py", "models/residual.py", "models/files.py"),

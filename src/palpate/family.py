@@ -27,10 +27,11 @@ class Family:
     """What one family of objects hands over. Every value of a table is a place, "module:name".
 
     `about` says in a few words what objects these are. `models`, `tasks`, `controllers`: classes by
-    the name that files and the command line use. `evidence`: pieces (`palpate.report.Piece`) that
-    the family adds to a run's page. `options`: for each command the options of each thing that it
-    works on (a family, a task, a problem), as `palpate.families.options` describes. `experiments`:
-    what `palpate reproduce` can repeat.
+    the name that files and the command line use. `deployments`: how the policies of a task are
+    connected to a robot. `evidence`: pieces (`palpate.report.Piece`) that the family adds to a
+    run's page. `options`: for each command the options of each thing that it works on (a family, a
+    task, a problem), as `palpate.families.options` describes. `experiments`: what `palpate
+    reproduce` can repeat.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Family:
     models: Places = field(default_factory=dict)
     tasks: Places = field(default_factory=dict)
     controllers: Places = field(default_factory=dict)
+    deployments: Places = field(default_factory=dict)
     evidence: Places = field(default_factory=dict)
     options: Mapping[str, Places] = field(default_factory=dict)
     experiments: Places = field(default_factory=dict)

@@ -3,12 +3,16 @@
 import json
 import sys
 
+import numpy as np
 import pytest
 
-from deployed import manifest, rope_policy
+from deployed import PERIOD, impedance_policy, manifest, rope_policy
 from palpate.cli import main
-from palpate.commands.serve import free_endpoint
-from palpate.networks import save_controller
+from palpate.commands.serve import free_endpoint, limits_of, supervisor_of
+from palpate.deployment.deployment import deployment_of
+from palpate.deployment.messages import StateMessage, encode_state
+from palpate.deployment.supervisor import GOOD, Mode
+from palpate.networks import load_policy, save_controller
 from palpate.runs.result import read_result
 
 
@@ -28,21 +32,25 @@ def refused(capsys):
 
 
 def test_sentences(refused, tmp_path, monkeypatch):
-    assert refused("--speed-limit 2") == (
-        "--speed-limit 2 is above the 1.5 that the policy was trained with: give that, or less"
+    assert refused("--limit 2") == (
+        "--limit 2 is above the 1.5 that the policy was trained with: give that, or less"
     )
-    assert "--acceleration-limit 11 is above the 10" in refused("--acceleration-limit 11")
+    assert "--rate-limit 11 is above the 10" in refused("--rate-limit 11")
     assert refused("", rate_limit=None) == (
-        "the policy has no limit of acceleration, and without one nothing can brake: give "
-        "--acceleration-limit"
+        "the gripper velocity has no limit of its rate, and without one nothing can brake: give "
+        "--rate-limit"
     )
-    assert refused("--speed-limit 0") == "a limit of speed is greater than 0, not 0.0"
-    assert refused("--markers 8") == (
+    assert refused("--limit 0") == ("a limit of the gripper velocity is greater than 0, not 0.0")
+    assert refused("--rows markers=8") == (
         "a policy for 6 nodes needs a multiple of 5 markers and one more, not 8"
     )
-    assert refused("", {"task": "cart-to-origin"}) == (
-        "the policy is for 'cart-to-origin' and `palpate serve` knows the features of "
-        "rope-stabilization alone; `palpate export` writes any policy for a loop of your own"
+    assert "did you mean 'gripper velocity'" in refused("--limit gripper-velocity=1")
+    assert refused("--rows 8") == "--rows 8 is not NAME=NUMBER"
+    assert "--rows markers=8.5 is not NAME=NUMBER" in refused("--rows markers=8.5")
+    assert "'marker'; did you mean 'markers'" in refused("--rows marker=11")
+    assert "expected no --rows" in refused("--rows markers=11", {"task": "cart-to-origin"})
+    assert "no family brings a simulated robot for 'cart-to-origin'" in refused(
+        "--simulate", {"task": "cart-to-origin"}
     )
     assert "does not say how long its rope's segments are" in refused("", {"model": []})
     assert "servo every 0.002 s: expected a whole number" in refused("--simulate", period=0.015)
@@ -70,3 +78,33 @@ def test_with_nobody_there_it_waits_and_says_how_it_went(tmp_path, capsys):
     assert main([*words, "--out", "served"]) == 2
     assert "served holds the record of an earlier `palpate serve`" in capsys.readouterr().err
     assert main([*words, "--out", "served", "--fresh"]) == 0
+
+
+def test_a_policy_of_no_family_is_served_by_its_declared_channels(tmp_path):
+    """Stiffness in N/m and metres: from the file to orders within the limits of each channel."""
+    save_controller("policy.safetensors", impedance_policy(period=PERIOD), {"task": "a toy"})
+    policy, manifest = load_policy("policy.safetensors")
+    deployment = deployment_of(policy, manifest)
+    limits = limits_of(policy, ["displacement=0.02"], ["damping ratio=3"])
+    supervisor = supervisor_of(deployment, limits)
+    assert [channel.name for channel in deployment.sensors] == ["features"]
+    random, actions = np.random.default_rng(0), []
+    for step in range(2 * GOOD):
+        values = {"features": random.normal(size=7).astype(np.float32)}
+        data = encode_state(StateMessage(1, step + 1, PERIOD * step, values))
+        now = PERIOD * step
+        order = supervisor.tick(now, [(now, data)])
+        actions.append(order.action)
+    assert order.mode is Mode.RUNNING
+    actions = np.array(actions)
+    assert 0 < np.linalg.norm(actions[:, :3], axis=1).max() <= 0.02 * (1 + 1e-6)
+    assert 1 < np.abs(actions[:, 3:6]).max() <= 800.0
+    assert np.abs(np.diff(actions[:, 6])).max() <= 3 * PERIOD * (1 + 1e-4)
+    values["features"][3] = np.nan
+    bad = encode_state(StateMessage(1, step + 2, now + PERIOD, values))
+    order = supervisor.tick(now + PERIOD, [(now + PERIOD, bad)])
+    assert order.mode is Mode.BRAKING
+    assert order.reason == "the features has no value"
+    wrong = encode_state(StateMessage(1, 1, 0.0, {"features": np.zeros(6, np.float32)}))
+    order = supervisor_of(deployment, limits).tick(0.0, [(0.0, wrong)])
+    assert order.reason == "6 features where 7 were agreed"

@@ -5,7 +5,7 @@ import gc
 import numpy as np
 import pytest
 
-from deployed import LIMITS, PERIOD, shape, state, supervisor
+from deployed import ACCELERATION, CHANGE, PERIOD, SPEED, shape, state, supervisor
 from palpate.deployment import loop
 from palpate.deployment.loop import FOLLOW, LATE, LEAD, run_loop
 from palpate.deployment.messages import decode_command
@@ -51,7 +51,7 @@ class Robot:
             found.append((arrived, state(self.published, time, markers=shape(time))))
 
     def send(self, data):
-        self.commands.append((self.clock.now, decode_command(data)))
+        self.commands.append((self.clock.now, decode_command(data, 3)))
 
 
 @pytest.fixture
@@ -82,11 +82,11 @@ def test_a_hundred_orders_a_second_none_late(clock):
 def test_it_ends_at_rest_within_the_limits(clock):
     robot = Robot(clock)
     run_loop(supervisor(), robot, PERIOD, lasting(3.0))
-    velocities = np.array([command.velocity for _, command in robot.commands])
-    assert np.linalg.norm(velocities, axis=1).max() == pytest.approx(LIMITS.speed)
+    velocities = np.array([command.action for _, command in robot.commands])
+    assert np.linalg.norm(velocities, axis=1).max() == pytest.approx(SPEED)
     assert not velocities[-1].any()
     changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1)
-    assert changes.max() <= LIMITS.change * (1 + 1e-5)
+    assert changes.max() <= CHANGE * (1 + 1e-5)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.003, 0.007])
@@ -116,8 +116,8 @@ def test_a_robot_that_falls_silent_is_told_to_brake_within_20_ms(clock):
     due = robot.began + robot.phase + 2.0
     told = [time for time, command in robot.commands if command.mode == Mode.BRAKING]
     assert 0 < told[0] - due < 0.006
-    still = [time for time, command in robot.commands if time > due and not command.velocity.any()]
-    assert still[0] + PERIOD - due < 0.02 + LIMITS.speed / LIMITS.acceleration
+    still = [time for time, command in robot.commands if time > due and not command.action.any()]
+    assert still[0] + PERIOD - due < 0.02 + SPEED / ACCELERATION
     assert record.events[-2][2] == "no state for 14 ms"
 
 

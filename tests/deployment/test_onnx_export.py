@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from deployed import IMPEDANCE, rope_policy, scaled
+from deployed import impedance_policy, rope_policy, scaled
 from palpate.deployment.onnx_export import difference, write_onnx
 from palpate.errors import PalpateError
 from palpate.networks import Channel, CommandPolicy
@@ -25,19 +25,12 @@ def wide(rate_limit):
     )
 
 
-def impedance():
-    """What an impedance-controlled arm is told: displacement, and stiffness axis by axis."""
-    seen = jax.random.normal(jax.random.key(2), (64, 7))
-    policy = CommandPolicy.create(jax.random.key(3), seen, IMPEDANCE, period=0.02, width=64)
-    return dataclasses.replace(policy, network=scaled(policy.network, 4.0))
-
-
 POLICIES = {
     "rope": rope_policy,
     "no rate limit": lambda: rope_policy(rate_limit=None),
     "two grippers": lambda: wide(3.0),
     "two grippers, no rate limit": lambda: wide(None),
-    "impedance": impedance,
+    "impedance": impedance_policy,
     "one layer": lambda: rope_policy(depth=1),
 }
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from deployed import LIMITS, PERIOD, Bench, Pusher, shape, state, supervisor
+from deployed import CHANGE, IMPEDANCE, PERIOD, SPEED, Bench, Pusher, shape, state, supervisor
 from palpate.deployment.supervisor import (
     GOOD,
     PAUSE,
@@ -19,6 +19,7 @@ from palpate.deployment.supervisor import (
     slowed,
 )
 from palpate.errors import PalpateError
+from palpate.networks import Channel
 
 WAITING, RUNNING, BRAKING, STOPPED = Mode
 FULL_SPEED = 20 + SOFT  # periods until 1.5 m/s are reached with the soft start
@@ -34,7 +35,7 @@ def fast(bench):
     """Running at the limit of speed."""
     bench.good(GOOD + FULL_SPEED)
     assert bench.orders[-1].mode is RUNNING
-    assert np.linalg.norm(bench.orders[-1].velocity) == pytest.approx(LIMITS.speed)
+    assert np.linalg.norm(bench.orders[-1].action) == pytest.approx(SPEED)
     return bench
 
 
@@ -124,16 +125,16 @@ def test_one_fault_brakes_to_rest_within_the_limits(fast, name):
         reason = "no state for 14 ms"
     assert order.mode is BRAKING
     assert reason in order.reason
-    speed = np.linalg.norm(order.velocity)
-    assert speed == pytest.approx(LIMITS.speed - LIMITS.change, rel=1e-5)
+    speed = np.linalg.norm(order.action)
+    assert speed == pytest.approx(SPEED - CHANGE, rel=1e-5)
     ticks = 1
-    while order.velocity.any():
+    while order.action.any():
         assert order.mode is BRAKING
         order = fast.tick(fast.message())  # good states do not talk a brake out of it
-        assert np.linalg.norm(order.velocity) < speed
-        speed = np.linalg.norm(order.velocity)
+        assert np.linalg.norm(order.action) < speed
+        speed = np.linalg.norm(order.action)
         ticks += 1
-    assert ticks <= np.ceil(LIMITS.speed / LIMITS.change)
+    assert ticks <= np.ceil(SPEED / CHANGE)
     assert order.mode is STOPPED
     fast.check_limits()
 
@@ -161,13 +162,13 @@ def test_the_way_from_nothing_to_running(bench):
     assert not bench.velocities.any()
     assert bench.good(1).mode is RUNNING
     assert bench.orders[-1].reason == ""
-    assert 0 < np.linalg.norm(bench.orders[-1].velocity) <= LIMITS.change / SOFT * 1.001
+    assert 0 < np.linalg.norm(bench.orders[-1].action) <= CHANGE / SOFT * 1.001
 
 
 def test_a_start_is_soft(bench):
     bench.good(GOOD + FULL_SPEED)
     changes = np.linalg.norm(np.diff(bench.velocities[GOOD - 2 :], axis=0), axis=1)
-    allowed = LIMITS.change * np.minimum(1, np.arange(1, len(changes) + 1) / SOFT)
+    allowed = CHANGE * np.minimum(1, np.arange(1, len(changes) + 1) / SOFT)
     assert (changes <= allowed * 1.0001).all()
     bench.check_limits()
 
@@ -177,7 +178,7 @@ def test_after_a_stop_it_takes_good_states_in_a_row_from_rest(fast):
     fast.silent(40)
     assert fast.orders[-1].mode is STOPPED
     assert fast.good(GOOD - 1).mode is WAITING
-    assert not fast.orders[-1].velocity.any()
+    assert not fast.orders[-1].action.any()
     assert fast.orders[-1].reason == "no state for 22 ms"
     assert fast.good(1).mode is RUNNING
     fast.check_limits()
@@ -218,10 +219,10 @@ def test_two_states_at_once_are_both_seen_and_decided_on_once(fast):
 
 
 def test_a_command_is_held_while_the_next_state_may_still_come(fast):
-    before = fast.orders[-1].velocity
+    before = fast.orders[-1].action
     order = fast.silent(1)
     assert order.mode is RUNNING
-    np.testing.assert_array_equal(order.velocity, before)
+    np.testing.assert_array_equal(order.action, before)
 
 
 def test_lasting_delay_is_never_taken_for_good(fast):
@@ -268,13 +269,13 @@ def test_two_robots_at_once_never_move(bench):
 
 
 def test_a_loop_that_was_held_up_goes_on_where_the_robot_braked_to(fast):
-    before = np.linalg.norm(fast.orders[-1].velocity)
+    before = np.linalg.norm(fast.orders[-1].action)
     order = fast.tick(fast.message(), after=0.055)
     assert order.mode is BRAKING
     assert order.reason == "the loop was held up for 65 ms"
     braked = 0.065 / PERIOD - PAUSE  # periods that a robot has braked by itself by then
-    left = np.linalg.norm(order.velocity)
-    assert left == pytest.approx(before - braked * LIMITS.change, rel=1e-4)
+    left = np.linalg.norm(order.action)
+    assert left == pytest.approx(before - braked * CHANGE, rel=1e-4)
 
 
 def test_the_loops_own_clock_running_backwards_brakes(fast):
@@ -294,7 +295,7 @@ def test_a_policy_that_gives_no_number_brakes(fast):
 
 def test_what_was_asked_to_stop_goes_to_rest(fast):
     ticks = 0
-    while fast.orders[-1].velocity.any():
+    while fast.orders[-1].action.any():
         fast.orders.append(fast.supervised.halt(fast.times[-1] + ticks * PERIOD))
         ticks += 1
     assert ticks == 15
@@ -330,7 +331,7 @@ def test_whatever_happens_the_limits_hold_and_rest_comes_before_motion(faults, w
     bench.silent(20)
     bench.check_limits()
     assert bench.orders[-1].mode in (STOPPED, WAITING)
-    assert not bench.orders[-1].velocity.any()
+    assert not bench.orders[-1].action.any()
     modes = [order.mode for order in bench.orders]
     for before, after in itertools.pairwise(modes):
         assert (before, after) not in {
@@ -352,8 +353,41 @@ def test_a_brake_keeps_its_direction():
     assert shortened(velocity, 0.51) is velocity
 
 
-@pytest.mark.parametrize("name", ["speed", "acceleration", "period"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_limit_that_is_none_is_refused(name, value):
-    with pytest.raises(PalpateError, match=f"a limit of {name} is greater than 0, not"):
-        dataclasses.replace(Limits(1.0, 1.0, 0.01), **{name: value})
+def test_a_limit_that_is_none_is_refused(value):
+    for channel, period, name in (
+        (Channel("force", (1,), "N", value, 1.0), 0.01, "the force"),
+        (Channel("force", (1,), "N", 1.0, value), 0.01, "the rate of the force"),
+        (Channel("force", (1,), "N", 1.0, 1.0), value, "period"),
+    ):
+        with pytest.raises(PalpateError, match=f"a limit of {name} is greater than 0, not"):
+            Limits([channel], period)
+    with pytest.raises(PalpateError, match="the force has no limit of its rate"):
+        Limits([Channel("force", (1,), "N", 1.0)], 0.01)
+    with pytest.raises(PalpateError, match="'force' has no limit"):
+        Limits([Channel("force", (1,), "N", None, 1.0)], 0.01)
+
+
+def test_each_channel_runs_and_brakes_within_limits_of_its_own():
+    """Metres and newtons per metre: a displacement as a vector, stiffness axis by axis."""
+    wanted = (3.0, 4.0, 0.0, 500.0, -9e9, 200.0, 1.0)
+    channels = dataclasses.replace(IMPEDANCE[2], rate_limit=20.0)
+    limits = Limits([*IMPEDANCE[:2], channels], PERIOD)
+    bench = Bench(supervisor(Pusher(wanted), limits))
+    bench.good(GOOD + SOFT + 20)
+    assert bench.orders[-1].mode is RUNNING
+    actions = np.array([order.action for order in bench.orders])
+    np.testing.assert_allclose(actions[-1], [0.03, 0.04, 0, 500, -800, 200, 1], rtol=1e-5)
+    bench.tick()
+    bench.silent(50)
+    actions = np.array([order.action for order in bench.orders])
+    assert bench.orders[-1].mode is STOPPED
+    assert not actions[-1].any()
+    changes = np.abs(np.diff(actions, axis=0))
+    assert np.linalg.norm(changes[:, :3], axis=1).max() <= 0.004 * (1 + 1e-4)
+    np.testing.assert_array_less(changes[:, 3:6].max(axis=0), 40.0 * (1 + 1e-4))
+    braking = [order.action for order in bench.orders if order.mode is BRAKING]
+    for part in (slice(0, 3), 3, 4, 5, 6):  # no norm grows, and no vector turns
+        norms = [np.linalg.norm(action[part]) for action in braking]
+        assert norms == sorted(norms, reverse=True)
+    np.testing.assert_allclose(braking[0][:2] / braking[0][1], [0.75, 1.0], rtol=1e-5)

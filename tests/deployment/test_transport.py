@@ -111,7 +111,7 @@ def test_a_robot_that_is_killed_is_braked_for(monkeypatch):
             with ZenohLink(STATE, COMMAND, listen=endpoint) as link:
 
                 def goes_on(elapsed):
-                    if not killed and supervisor.velocity[0] > 0.1:
+                    if not killed and supervisor.action[0] > 0.1:
                         robot.send_signal(signal.SIGKILL)
                         robot.wait()
                         killed.append(elapsed)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from palpate.commands import folders
 from palpate.commands.options import Export
-from palpate.deployment.contract import contract_of, read_contract, write_contract
+from palpate.deployment.contract import check_contract, write_contract
 from palpate.deployment.onnx_export import difference, write_onnx
 from palpate.errors import PalpateError
 from palpate.networks import load_policy
@@ -30,7 +30,6 @@ def run(options: Export) -> Path:
         _check_contract(beside)
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_policy(file)
-    contract = contract_of(policy, manifest)
     configuration = folders.configuration_of(options, "export") | {
         "policy": folders.fingerprint(file)
     }
@@ -44,7 +43,7 @@ def run(options: Export) -> Path:
                 f"limits: expected at most {AGREES:g}"
             )
         write_bytes(target, made.read_bytes())
-        write_contract(beside, contract, target.name)
+        write_contract(beside, policy, manifest, target.name)
         if not run.finished:
             figure = Figure("onnx_difference", off, "of the limit", bar=AGREES)
             folders.finish(run, options, "export", [figure])
@@ -56,7 +55,7 @@ def run(options: Export) -> Path:
 
 def _check_contract(path: Path) -> None:
     try:
-        read_contract(path)
+        check_contract(path)
     except PalpateError as error:
         raise PalpateError(
             f"{path}, where the contract would go, holds something else: give another --onnx"

@@ -11,7 +11,12 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from palpate.families.options import Options, Reading, Whole
+from palpate.families.options import Options, Reading
+
+PerChannel = Annotated[
+    tuple[str, ...],
+    arg(metavar="[NAME=]NUMBER ...", help_behavior_hint="(default: the policy's)"),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,26 +116,23 @@ class Serve(Options):
     braked to rest, and moves again only after half a second of good states.
 
     1. With a simulated robot, for a look:      palpate serve POLICY --simulate
-    2. With a robot's program that connects:    palpate serve POLICY --acceleration-limit 4
+    2. With a robot's program that connects:    palpate serve POLICY --rate-limit 4
+    3. More rows of a channel than needed:      palpate serve POLICY --rows markers=21
     """
 
     policy: Positional[Annotated[Path, arg(metavar="POLICY", help_behavior_hint="")]]
     """What `palpate train` wrote: its folder, or the policy file in it."""
     simulate: bool = False
-    """Start a simulated rope and robot, as a process of its own, and serve that."""
+    """Start a simulated robot, as a process of its own, and serve that."""
     seconds: Annotated[
         float | None, arg(metavar="NUMBER", help_behavior_hint="(default: 10 simulated, else ever)")
     ] = None
     """How long."""
     listen: str = "tcp/127.0.0.1:7447"
     """Where the robot's program connects; whoever reaches it can move the robot."""
-    markers: Whole = None
-    """In each state, gripper and tip included."""
-    speed_limit: Annotated[
-        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: the policy's)")
-    ] = None
-    """Of the gripper, m/s."""
-    acceleration_limit: Annotated[
-        float | None, arg(metavar="NUMBER", help_behavior_hint="(default: the policy's)")
-    ] = None
-    """Of the gripper, m/s^2; it brakes with this."""
+    rows: PerChannel = ()
+    """How long a sensor channel is, where the policy leaves it open."""
+    limit: PerChannel = ()
+    """Of the action, in its unit; lower than the policy's. One number, or one for each channel."""
+    rate_limit: PerChannel = ()
+    """Of the action's change, per second; it brakes with this."""

@@ -1,35 +1,31 @@
 """`palpate serve`: a policy in command of a robot, in real time."""
 
 import contextlib
-import json
-import math
+import dataclasses
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from palpate.commands import folders
 from palpate.commands.options import Serve
-from palpate.deployment.contract import Contract, contract_of
-from palpate.deployment.decision import RopeDecision, segment_lengths
+from palpate.deployment.deployment import Deployment, deployment_of
 from palpate.deployment.intake import Intake
 from palpate.deployment.loop import Record, run_loop
-from palpate.deployment.plausibility import ChainCheck
 from palpate.deployment.scheduling import real_time
 from palpate.deployment.supervisor import ASKED, Limits, Mode, Supervisor
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.errors import PalpateError
-from palpate.families.rope import robot as rope_robot
+from palpate.family import check_name
 from palpate.networks import CommandPolicy, load_policy
 from palpate.runs import Figure, Result
 from palpate.runs.progress import Stop, interruptible
 from palpate.runs.storage import write_json
-from palpate.trials.rope.trials import settling_time
 
-TASK = "rope-stabilization"
 LATENCY = "latency.json"
 SIMULATED = 10.0  # s
 WARM_UP = 200  # decisions
@@ -44,16 +40,17 @@ def run(options: Serve) -> Path:
     """
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_policy(file)
-    contract = contract_of(policy, manifest)
-    markers = options.markers or contract.features[0].shape[0] + 1
-    limits = limits_of(contract, options.speed_limit, options.acceleration_limit)
-    supervisor = supervisor_of(policy, contract, markers, limits)
-    if options.simulate:
-        rope_robot.servoed(markers, contract.period)
+    deployment = deployment_of(policy, manifest, numbers(options.rows, "--rows", [], int))
+    limits = limits_of(policy, options.limit, options.rate_limit)
+    supervisor = supervisor_of(deployment, limits)
     configuration = folders.configuration_of(options, "serve") | {
         "policy": folders.fingerprint(file)
     }
-    listen = free_endpoint() if options.simulate else options.listen
+    listen, words = options.listen, None
+    if options.simulate:
+        listen = free_endpoint()
+        seconds = SIMULATED if options.seconds is None else options.seconds
+        words = deployment.simulated_robot(listen, seconds, options.seed)
     with folders.open_run(options, "serve", configuration) as run:
         if run.finished:
             raise PalpateError(
@@ -61,19 +58,19 @@ def run(options: Serve) -> Path:
                 "or --fresh to replace it"
             )
         with (
-            _robot(options, listen, markers, contract.period) as robot,
+            _robot(words) as robot,
             real_time() as prompt,  # after the robot's process and before the link's threads
             ZenohLink(STATE, COMMAND, listen=listen) as link,
         ):
             if not prompt:
                 print(f"note: {ORDINARY}")
             print(f"listening at {listen}; Ctrl-C brakes and ends", flush=True)
-            record = _served(supervisor, link, contract.period, options.seconds, robot)
-            settled = [] if robot is None else _settled(robot, contract.period)
+            record = _served(supervisor, link, policy.period, options.seconds, robot)
+            printed = [] if robot is None else robot.communicate()[0].splitlines()
         write_json(run.path / LATENCY, record.to_dict())
         result = Result(
             name="serve",
-            figures=figures_of(record) + settled,
+            figures=figures_of(record) + (deployment.outcome(printed[-1]) if printed else []),
             settings=configuration | {"real_time_scheduling": prompt},
             seeds=[options.seed],
             split=None,
@@ -85,42 +82,59 @@ def run(options: Serve) -> Path:
     return run.path
 
 
-def limits_of(contract: Contract, speed: float | None, acceleration: float | None) -> Limits:
-    """The policy's limits, or lower ones; raises `PalpateError` for higher ones or none."""
-    own = {"speed": contract.speed_limit, "acceleration": contract.acceleration_limit}
-    asked = {"speed": speed, "acceleration": acceleration}
-    for name, value in asked.items():
-        limit = own[name]
-        if value is not None and limit is not None and value > limit:
+def limits_of(policy: CommandPolicy, limit: Sequence[str], rate_limit: Sequence[str]) -> Limits:
+    """The policy's limits, or lower ones, as "NUMBER" or "CHANNEL=NUMBER".
+
+    Raises `PalpateError` for higher ones, for a rate without any, and for other channels.
+    """
+    names = [channel.name for channel in policy.actions]
+    actions = {channel.name: channel for channel in policy.actions}
+    for field, given in (("limit", limit), ("rate_limit", rate_limit)):
+        option = f"--{field.replace('_', '-')}"
+        for name, value in numbers(given, option, names).items():
+            channel = actions[check_name("action channel", name, names)]
+            own = getattr(channel, field)
+            if own is not None and value > own:
+                raise PalpateError(
+                    f"{option} {value:g} is above the {own:g} that the policy was trained with: "
+                    "give that, or less"
+                )
+            actions[name] = dataclasses.replace(channel, **{field: value})
+    return Limits(tuple(actions.values()), policy.period)
+
+
+def numbers(
+    given: Sequence[str], option: str, names: Sequence[str], kind: Callable[[str], Any] = float
+) -> dict[str, Any]:
+    """The numbers by name: "NAME=NUMBER", or "NUMBER" where there is one name.
+
+    Raises `PalpateError` for anything else.
+    """
+    found = {}
+    for word in given:
+        name, _, number = word.rpartition("=")
+        try:
+            if not name:
+                (name,) = names
+            found[name] = kind(number)
+        except ValueError as error:
             raise PalpateError(
-                f"--{name}-limit {value:g} is above the {limit:g} that the policy was trained "
-                "with: give that, or less"
-            )
-    chosen = {name: own[name] if value is None else value for name, value in asked.items()}
-    if chosen["acceleration"] is None:
-        raise PalpateError(
-            "the policy has no limit of acceleration, and without one nothing can brake: give "
-            "--acceleration-limit"
-        )
-    return Limits(period=contract.period, **chosen)
+                f"{option} {word} is not NAME=NUMBER"
+                + (f"; there are: {', '.join(names)}" if names else "")
+            ) from error
+    return found
 
 
-def supervisor_of(
-    policy: CommandPolicy, contract: Contract, markers: int, limits: Limits
-) -> Supervisor:
-    """What runs and brakes this policy, warmed up. Raises `PalpateError` for another task's."""
-    if contract.task != TASK:
-        raise PalpateError(
-            f"the policy is for '{contract.task}' and `palpate serve` knows the features of "
-            f"{TASK} alone; `palpate export` writes any policy for a loop of your own"
-        )
-    decision = RopeDecision(policy, contract, markers)
+def supervisor_of(deployment: Deployment, limits: Limits) -> Supervisor:
+    """What runs and brakes the deployment's policy, warmed up."""
+    decision, sensors = deployment.decision(), deployment.sensors
+    nothing = {channel.name: np.zeros(channel.shape, np.float32) for channel in sensors}
     for _ in range(WARM_UP):
-        decision.see(np.zeros(3, np.float32), np.zeros((markers, 3), np.float32))
-        decision.decide(np.zeros(3, np.float32))
+        decision.see(nothing)
+        decision.decide(np.zeros(limits.count, np.float32))
     decision.forget()
-    check = ChainCheck(segment_lengths(contract, markers), contract.period)
-    return Supervisor(Intake(check, contract.period), decision, limits)
+    intake = Intake(deployment.check(), sensors, limits.period)
+    return Supervisor(intake, decision, limits)
 
 
 def figures_of(record: Record) -> list[Figure]:
@@ -150,7 +164,7 @@ def _served(
     seconds: float | None,
     robot: subprocess.Popen | None,
 ) -> Record:
-    def told(mode: Mode, reason: str) -> None:
+    def report(mode: Mode, reason: str) -> None:
         print(f"{mode.name.lower()}{': ' if reason else ''}{reason}", flush=True)
 
     def goes_on(elapsed: float, stop: Stop) -> bool:
@@ -161,37 +175,19 @@ def _served(
     record = Record()
     # Ctrl-C is how serving ends: nothing is cut off by it.
     with contextlib.suppress(KeyboardInterrupt), interruptible() as stop:
-        record = run_loop(supervisor, link, period, lambda now: goes_on(now, stop), told)
+        record = run_loop(supervisor, link, period, lambda now: goes_on(now, stop), report)
     return record
 
 
 @contextlib.contextmanager
-def _robot(
-    options: Serve, listen: str, markers: int, period: float
-) -> Iterator[subprocess.Popen | None]:
-    if not options.simulate:
+def _robot(words: list[str] | None) -> Iterator[subprocess.Popen | None]:
+    """A process that runs a Python module with arguments; none without any."""
+    if words is None:
         yield None
         return
-    seconds = SIMULATED if options.seconds is None else options.seconds
-    words = [sys.executable, "-m", "palpate.families.rope.robot", "--connect", listen]
-    words += ["--markers", str(markers), "--period", str(period)]
-    words += ["--seconds", str(seconds), "--seed", str(options.seed)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as robot:
+    command = [sys.executable, "-m", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as robot:
         try:
             yield robot
         finally:
             robot.kill()
-
-
-def _settled(robot: subprocess.Popen, period: float) -> list[Figure]:
-    """What became of the simulated rope, unless its robot was interrupted too."""
-    said = robot.communicate()[0].splitlines()
-    if not said:
-        return []
-    motion = {name: np.array([values]) for name, values in json.loads(said[-1]).items()}
-    energy, speed = motion["energy_j"], motion["gripper_speed_m_per_s"]
-    time = float(settling_time(energy, speed, period)[0])
-    return [
-        Figure("time_to_1pct_s", time if math.isfinite(time) else None, "s"),
-        Figure("energy_left", float(energy[0, -1] / energy[0, 0]), ""),
-    ]

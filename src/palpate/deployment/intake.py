@@ -4,14 +4,16 @@ No clock is read here: the arrival time of each message comes with it.
 """
 
 import math
+from collections.abc import Sequence
 
 from palpate.deployment.messages import StateMessage, decode_state
-from palpate.deployment.plausibility import ChainCheck
+from palpate.deployment.plausibility import Check
 from palpate.errors import PalpateError
+from palpate.networks import Channel
 
 PATIENCE = 1.4  # periods after one state at which the next one is missing
 LATE = 1.0  # periods that a state may have been under way longer than the fastest
-JITTER = 0.5  # periods by which the sender's stamps may be apart more or less than one
+JITTER = 0.5  # periods by which two of the sender's stamps may differ from one period
 DRIFT = 2e-4  # s/s by which two clocks may run apart
 
 
@@ -22,13 +24,14 @@ class BadStateError(PalpateError):
 class Intake:
     """Takes messages as they arrive and tells good states from stale ones and faults.
 
-    A good state is whole, possible (`ChainCheck`), the very next of its session, stamped one period
+    A good state is whole, possible (`Check`), the very next of its session, stamped one period
     after the last, and not late. How long a message takes cannot be known without a common clock;
     late is one that took longer than the fastest of its session so far, by `LATE` periods.
     """
 
-    def __init__(self, check: ChainCheck, period: float):
+    def __init__(self, check: Check, sensors: Sequence[Channel], period: float):
         self._check = check
+        self._sensors = sensors
         self._period = period
         self._session: int | None = None
         self._fastest = 0.0  # arrival minus stamp: delay plus the offset of the clocks, s
@@ -46,6 +49,10 @@ class Intake:
         """When the next state counts as missing, in s; infinite before a first one."""
         return math.inf if self.newest is None else self._arrived + PATIENCE * self._period
 
+    def motion(self, first: StateMessage) -> str:
+        """What moved since the state `first` although the robot was at rest; "" if nothing did."""
+        return "" if self.newest is None else self._check.motion(first.values, self.newest.values)
+
     def missing(self, now: float) -> str:
         """What to say if the next state should have come by `now` (s); "" while it need not."""
         if now < self.due:
@@ -59,7 +66,7 @@ class Intake:
         series.
         """
         try:
-            return self._take(arrived, decode_state(data))
+            return self._take(arrived, decode_state(data, self._sensors))
         except PalpateError as error:
             self.forget()
             raise BadStateError(str(error)) from error
@@ -80,7 +87,7 @@ class Intake:
         took = arrived - state.time
         if took - self._fastest > LATE * self._period:
             raise BadStateError(f"a state is {1e3 * (took - self._fastest):.0f} ms late")
-        if problem := self._check.problem(state.gripper, state.markers):
+        if problem := self._check.problem(state.values):
             raise BadStateError(problem)
         self._fastest = min(self._fastest + DRIFT * self._period, took)
         self._arrived, self.newest = arrived, state
@@ -90,8 +97,8 @@ class Intake:
         lost = state.sequence - last.sequence - 1
         if lost:
             raise BadStateError(f"{lost} states were lost")
-        apart = state.time - last.time
-        if abs(apart - self._period) > JITTER * self._period:
+        elapsed = state.time - last.time
+        if abs(elapsed - self._period) > JITTER * self._period:
             raise BadStateError(
-                f"the sender's clock went on by {1e3 * apart:.1f} ms between two states"
+                f"the sender's clock went on by {1e3 * elapsed:.1f} ms between two states"
             )

@@ -100,7 +100,7 @@ def run_loop(
             sequence += 1
             link.send(
                 encode_command(
-                    CommandMessage(session, sequence, order.mode, supervisor.seen, order.velocity)
+                    CommandMessage(session, sequence, order.mode, supervisor.seen, order.action)
                 )
             )
             if arrivals:
@@ -114,7 +114,7 @@ def run_loop(
                 told(mode, reason)
                 if len(record.events) < EVENTS:
                     record.events.append((now - began, mode, reason))
-            if not going and not order.velocity.any():
+            if not going and not order.action.any():
                 return record
             behind = int((clock() - deadline) / period)
             if behind > 0:

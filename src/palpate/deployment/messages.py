@@ -1,69 +1,80 @@
-"""What robot and loop say to each other: two fixed layouts in little-endian bytes.
+"""What robot and loop say to each other: two layouts in little-endian bytes.
 
-    state:   magic "PLPT", version u8, kind u8 = 1, markers u16, session u64, sequence u64,
-             time f64 (s, the sender's own monotonic clock), gripper 3 f32, markers n x 3 f32 (m),
-             CRC-32 u32 of everything before
+    state:   magic "PLPT", version u8, kind u8 = 1, rows u16 (length of the last channel's first
+             axis), session u64, sequence u64, time f64 (s, the sender's own monotonic clock), the
+             declared sensor channels one after the other f32, CRC-32 u32 of everything before
     command: magic "PLPT", version u8, kind u8 = 2, mode u16, session u64, sequence u64,
-             state u64 (sequence of the newest state it rests on), velocity 3 f32 (m/s), CRC-32 u32
+             state u64 (sequence of the newest state it rests on), the declared action channels
+             one after the other f32, CRC-32 u32
 
 A session is a number that a sender draws when it starts, so that its successor is told apart.
-Nothing is unpickled: a message is numbers of known size, or it is refused.
+Nothing is unpickled: a message is numbers of declared size, or it is refused.
 """
 
 import struct
 import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.networks import Channel, count_of
 
 _MAGIC, _VERSION, _STATE, _COMMAND = b"PLPT", 1, 1, 2
 _HEAD = struct.Struct("<4sBBHQQ")
-_TIME, _NEWEST, _CHECK = struct.Struct("<d"), struct.Struct("<Q3f"), struct.Struct("<I")
+_TIME, _NEWEST, _CHECK = struct.Struct("<d"), struct.Struct("<Q"), struct.Struct("<I")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateMessage:
-    """Where everything was at `time` (s): `gripper` (3,) and `markers` (n, 3) in m, float32."""
+    """What the sensors showed at `time` (s): an array for each channel, float32, in its unit."""
 
     session: int
     sequence: int
     time: float
-    gripper: np.ndarray
-    markers: np.ndarray
+    values: Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommandMessage:
-    """The gripper velocity (3,) in m/s from now on; `mode` as `palpate.deployment.supervisor`."""
+    """The action from now on, flat; `mode` as in `palpate.deployment.supervisor`."""
 
     session: int
     sequence: int
     mode: int
     state: int
-    velocity: np.ndarray
+    action: np.ndarray
 
 
 def encode_state(message: StateMessage) -> bytes:
-    """The state as bytes."""
-    count = len(message.markers)
-    head = _HEAD.pack(_MAGIC, _VERSION, _STATE, count, message.session, message.sequence)
-    points = np.concatenate([message.gripper[None], message.markers]).astype("<f4")
-    return _checked(head + _TIME.pack(message.time) + points.tobytes())
+    """The state as bytes, channels in the order of `values`."""
+    values = [np.asarray(value, "<f4") for value in message.values.values()]
+    rows = len(values[-1])
+    head = _HEAD.pack(_MAGIC, _VERSION, _STATE, rows, message.session, message.sequence)
+    whole = b"".join(value.tobytes() for value in values)
+    return _checked(head + _TIME.pack(message.time) + whole)
 
 
-def decode_state(data: bytes) -> StateMessage:
-    """The state in these bytes; its numbers may be NaN, its points are read-only.
+def decode_state(data: bytes, sensors: Sequence[Channel]) -> StateMessage:
+    """The state of these channels in these bytes; its numbers may be NaN, its arrays are read-only.
 
     Raises `PalpateError` for anything else.
     """
-    count, session, sequence = _opened(data, _STATE, "state")
+    rows, session, sequence = _opened(data, _STATE, "state")
+    last = sensors[-1]
+    if rows != last.shape[0]:
+        raise PalpateError(f"{rows} {last.name} where {last.shape[0]} were agreed")
     start = _HEAD.size + _TIME.size
-    _length(data, start + 12 * (count + 1) + _CHECK.size, "state")
+    _length(data, start + 4 * count_of(sensors) + _CHECK.size, "state")
     (time,) = _TIME.unpack_from(data, _HEAD.size)
-    points = np.frombuffer(data, "<f4", 3 * (count + 1), start).reshape(-1, 3)
-    return StateMessage(session, sequence, time, points[0], points[1:])
+    values = {}
+    for channel in sensors:
+        values[channel.name] = np.frombuffer(data, "<f4", channel.count, start).reshape(
+            channel.shape
+        )
+        start += 4 * channel.count
+    return StateMessage(session, sequence, time, values)
 
 
 def encode_command(message: CommandMessage) -> bytes:
@@ -71,17 +82,23 @@ def encode_command(message: CommandMessage) -> bytes:
     head = _HEAD.pack(
         _MAGIC, _VERSION, _COMMAND, message.mode, message.session, message.sequence
     )  # fmt: skip
-    return _checked(head + _NEWEST.pack(message.state, *message.velocity))
+    action = np.asarray(message.action, "<f4").tobytes()
+    return _checked(head + _NEWEST.pack(message.state) + action)
 
 
-def decode_command(data: bytes) -> CommandMessage:
-    """The command in these bytes. Raises `PalpateError` for anything else, or if not finite."""
+def decode_command(data: bytes, count: int) -> CommandMessage:
+    """The command of `count` numbers in these bytes.
+
+    Raises `PalpateError` for anything else, or if not finite.
+    """
     mode, session, sequence = _opened(data, _COMMAND, "command")
-    _length(data, _HEAD.size + _NEWEST.size + _CHECK.size, "command")
-    state, *velocity = _NEWEST.unpack_from(data, _HEAD.size)
-    if not np.isfinite(velocity).all():
-        raise PalpateError(f"a command is a finite velocity, not {velocity}")
-    return CommandMessage(session, sequence, mode, state, np.array(velocity))
+    start = _HEAD.size + _NEWEST.size
+    _length(data, start + 4 * count + _CHECK.size, "command")
+    (state,) = _NEWEST.unpack_from(data, _HEAD.size)
+    action = np.frombuffer(data, "<f4", count, start).astype(float)
+    if not np.isfinite(action).all():
+        raise PalpateError(f"a command is finite, not {action.tolist()}")
+    return CommandMessage(session, sequence, mode, state, action)
 
 
 def _checked(data: bytes) -> bytes:

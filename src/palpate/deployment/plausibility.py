@@ -1,67 +1,70 @@
-"""Whether points along a chain can be where they are said to be.
+"""Whether what sensors show can be: numbers, within the limits that their channels declare."""
 
-A rope does not stretch by a third, its nodes do not outrun a thrown ball, and no node moves off
-its course by centimetres within one period. Nodes that exchanged their names break the first rule
-where the rope is straight and the last one everywhere.
-"""
+from collections.abc import Mapping, Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-STRETCH = 1.3  # of a segment's length at rest; ropes 10 % longer than the model, and noise, pass
-FASTEST = 15.0  # m/s; a free tip of 1 m swings and whips at 7
-HARDEST = 300.0  # m/s^2; seen of a whipping tip with noise: 140
+from palpate.networks import Channel
+
+Values = Mapping[str, np.ndarray]  # by sensor channel, in its shape and unit
 
 
-class ChainCheck:
-    """Gripper and markers, frame by frame.
-
-    Args:
-        spacing: (markers - 1,) rest length between neighbouring markers, gripper to tip, in m.
-        period: seconds between frames.
-    """
-
-    def __init__(self, spacing: np.ndarray, period: float):
-        # The first marker sits at the gripper, as nearly as anybody can glue it there.
-        self._longest = STRETCH * np.concatenate([spacing[:1], spacing])
-        self._farthest = FASTEST * period
-        self._sharpest = HARDEST * period**2
-        self.forget()
+@runtime_checkable
+class Check(Protocol):
+    """What tells possible states from impossible ones, frame by frame."""
 
     def forget(self) -> None:
         """The next frame has none before it."""
-        self._last: np.ndarray | None = None
-        self._before: np.ndarray | None = None
+        ...
 
-    def problem(self, gripper: np.ndarray, markers: np.ndarray) -> str:
+    def problem(self, values: Values) -> str:
         """What is impossible about this frame, after those before it; "" if nothing is.
 
-        `gripper` (3,) and `markers` (markers, 3) in m. A frame with a problem is not kept.
+        A frame with a problem is not kept.
         """
-        if len(markers) != len(self._longest):
-            return f"{len(markers)} markers where {len(self._longest)} were agreed"
-        points = np.concatenate([gripper[None], markers]).astype(float)
-        unknown = ~np.isfinite(points).all(axis=1)
-        if unknown.any():
-            return f"{_name(unknown.argmax())} has no position"
-        apart = _norms(np.diff(points, axis=0))
-        if (apart > self._longest).any():
-            place = (apart / self._longest).argmax()
-            return f"{_name(place)} and {_name(place + 1)} are {apart[place]:.3g} m apart"
-        if self._last is not None:
-            moved = _norms(points - self._last)
-            if moved.max() > self._farthest:
-                return f"{_name(moved.argmax())} jumped by {moved.max():.3g} m"
-            if self._before is not None:
-                off = _norms(points - 2 * self._last + self._before)
-                if off.max() > self._sharpest:
-                    return f"{_name(off.argmax())} is {off.max():.3g} m off its course"
-        self._before, self._last = self._last, points
+        ...
+
+    def motion(self, first: Values, values: Values) -> str:
+        """What moved since the `first` frame although the robot was at rest; "" if nothing did."""
+        ...
+
+
+class ChannelCheck:
+    """Every number is finite, no farther than its channel's limit and no faster than its rate.
+
+    Args:
+        sensors: the channels, with their limits.
+        period: seconds between frames.
+    """
+
+    def __init__(self, sensors: Sequence[Channel], period: float):
+        self._sensors, self._period = sensors, period
+        self.forget()
+
+    def forget(self) -> None:
+        """See `Check.forget`."""
+        self._last: Values | None = None
+
+    def problem(self, values: Values) -> str:
+        """See `Check.problem`."""
+        for channel in self._sensors:
+            value = values[channel.name].astype(float)
+            if not np.isfinite(value).all():
+                return f"the {channel.name} has no value"
+            if channel.limit is not None and (most := _longest(value)) > channel.limit:
+                return f"the {channel.name} is {most:.3g} {channel.unit}".rstrip()
+            if self._last is not None and channel.rate_limit is not None:
+                moved = _longest(value - self._last[channel.name])
+                if moved > channel.rate_limit * self._period:
+                    return f"the {channel.name} jumped by {moved:.3g} {channel.unit}".rstrip()
+        self._last = values
+        return ""
+
+    def motion(self, first: Values, values: Values) -> str:
+        """Never anything: channels do not say how still a robot at rest holds them."""
         return ""
 
 
-def _norms(vectors: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.sum(vectors**2, axis=1))
-
-
-def _name(point: np.intp) -> str:
-    return f"marker {point - 1}" if point else "the gripper"
+def _longest(vectors: np.ndarray) -> float:
+    return float(np.sqrt(np.sum(vectors**2, axis=-1)).max())

@@ -5,14 +5,15 @@ tried in a test.
 
     waiting   at rest; good states are counted, and enough of them in a row start the policy
     running   the policy decides, within the limits
-    braking   down to rest at the limit of acceleration, whatever is seen meanwhile
+    braking   down to rest, every channel at the limit of its rate, whatever is seen meanwhile
     stopped   at rest; the last state was bad, or none comes. A good one: waiting
 
-A brake is never left before rest, and there is no way from rest to motion but through `GOOD`
-states in a row during which the gripper stood still; then the acceleration grows softly.
+At rest every number of the action is zero. A brake is never left before rest, and there is no way
+from rest to motion but through `GOOD` states in a row during which the robot stood still; then
+the rate of the action grows softly to its limit.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol, runtime_checkable
@@ -20,13 +21,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from palpate.deployment.intake import BadStateError, Intake
+from palpate.deployment.messages import StateMessage
+from palpate.deployment.plausibility import Values
 from palpate.errors import PalpateError
+from palpate.networks import Channel, count_of
 
 GOOD = 50  # good states in a row, before the policy starts
-SOFT = 50  # periods in which the acceleration grows to its limit after a start
+SOFT = 50  # periods in which the rate of the action grows to its limit after a start
 PAUSE = 2.0  # periods without a command after which a robot brakes by itself
 ASKED = "asked to stop"
-STANDING = 0.02  # m by which a gripper at rest may move, servo and noise included
 
 
 class Mode(IntEnum):
@@ -38,34 +41,46 @@ class Mode(IntEnum):
     STOPPED = 3
 
 
-@dataclass(frozen=True)
 class Limits:
-    """What a command may be: `speed` in m/s, `acceleration` in m/s^2, one every `period` s.
+    """What an action may be: as its channels declare, one every `period` s.
 
-    Raises `PalpateError` for a limit that is not greater than 0.
+    `vectors`: of each vector of a channel its place in the flat action, the largest norm, and the
+    largest norm of its change in a period.
+
+    Raises `PalpateError` for a channel without limits and for one that is not greater than 0.
     """
 
-    speed: float
-    acceleration: float
-    period: float
+    def __init__(self, actions: Sequence[Channel], period: float):
+        _check_greater("period", period)
+        self.period, self.count = period, count_of(actions)
+        self.vectors: list[tuple[slice, float, float]] = []
+        first = 0
+        for channel in actions:
+            if channel.rate_limit is None:
+                raise PalpateError(
+                    f"the {channel.name} has no limit of its rate, and without one nothing can "
+                    "brake: give --rate-limit"
+                )
+            _check_greater(f"the {channel.name}", channel.bound)
+            _check_greater(f"the rate of the {channel.name}", channel.rate_limit)
+            size = channel.shape[-1]
+            change = channel.rate_limit * period
+            for start in range(first, first + channel.count, size):
+                self.vectors.append((slice(start, start + size), channel.bound, change))
+            first += channel.count
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < float("inf"):
-                raise PalpateError(f"a limit of {name} is greater than 0, not {value}")
 
-    @property
-    def change(self) -> float:
-        """The largest change of a command, m/s."""
-        return self.acceleration * self.period
+def _check_greater(name: str, value: float) -> None:
+    if not 0 < value < float("inf"):
+        raise PalpateError(f"a limit of {name} is greater than 0, not {value}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Order:
-    """The gripper velocity (3,) in m/s to hold for a period, and why: "" while all is well."""
+    """The action, flat, to hold for a period, and why: "" while all is well."""
 
     mode: Mode
-    velocity: np.ndarray
+    action: np.ndarray
     reason: str
 
 
@@ -77,12 +92,12 @@ class Decision(Protocol):
         """The next state is the first of a series."""
         ...
 
-    def see(self, gripper: np.ndarray, markers: np.ndarray) -> None:
-        """A state, one period after the last: (3,) and (markers, 3) in m."""
+    def see(self, values: Values) -> None:
+        """A state, one period after the last."""
         ...
 
     def decide(self, command: np.ndarray) -> np.ndarray:
-        """The next command (3,) in m/s, after the one in force."""
+        """The next action, after the one in force; both flat."""
         ...
 
 
@@ -92,7 +107,7 @@ class Supervisor:
     Args:
         intake: says which states are good.
         decision: the policy.
-        limits: of speed and acceleration.
+        limits: of the action.
     """
 
     def __init__(self, intake: Intake, decision: Decision, limits: Limits):
@@ -102,9 +117,9 @@ class Supervisor:
         self._now: float | None = None
         self._good = 0  # states in a row
         self._ran = 0  # decisions since the start
-        self._stood = np.zeros(3)  # where the gripper was when counting began, m
+        self._first: StateMessage | None = None  # when counting began
         self.mode = Mode.WAITING
-        self.velocity = np.zeros(3, np.float32)
+        self.action = np.zeros(limits.count, np.float32)
         self.reason = "no state has come yet"
 
     @property
@@ -136,15 +151,15 @@ class Supervisor:
             self._count(fresh)
         if self.mode is Mode.BRAKING:
             # After a pause the robot has begun to brake by itself: go on where it is by now.
-            self._brake(self._limits.change * max(1.0, elapsed / period - PAUSE))
-        return Order(self.mode, self.velocity, self.reason)
+            self._brake(max(1.0, elapsed / period - PAUSE))
+        return Order(self.mode, self.action, self.reason)
 
     def halt(self, now: float) -> Order:
         """One period of going to rest because it was asked for; nothing is looked at."""
         self._now = now
         self._start_over(ASKED)
-        self._brake(self._limits.change)
-        return Order(self.mode, self.velocity, self.reason)
+        self._brake(1.0)
+        return Order(self.mode, self.action, self.reason)
 
     def _take(self, now: float, arrivals: Iterable[tuple[float, bytes]]) -> tuple[int, str]:
         """How many good states there are, all of which the decision sees, and the first fault."""
@@ -157,7 +172,7 @@ class Supervisor:
                 self._decision.forget()
                 continue
             if good and (state := self._intake.newest) is not None:
-                self._decision.see(state.gripper, state.markers)
+                self._decision.see(state.values)
                 fresh += 1
         return fresh, fault or self._intake.missing(now)
 
@@ -169,12 +184,10 @@ class Supervisor:
         self._decision.forget()
 
     def _count(self, fresh: int) -> None:
-        newest = self._intake.newest
-        gripper = self._stood if newest is None else newest.gripper
-        if not self._good:
-            self._stood = gripper
-        if length(gripper - self._stood) > STANDING:
-            self._start_over("the gripper moved while it should stand")
+        if not self._good or self._first is None:
+            self._first = self._intake.newest
+        if self._first is not None and (motion := self._intake.motion(self._first)):
+            self._start_over(motion)
             return
         self.mode = Mode.WAITING
         self._good += fresh
@@ -183,19 +196,26 @@ class Supervisor:
             self._run()
 
     def _run(self) -> None:
-        wanted = self._decision.decide(self.velocity)
+        wanted = self._decision.decide(self.action)
         if not np.isfinite(wanted).all():
             self._start_over("the policy gave a command that is not finite")
             return
         self._ran += 1
-        change = self._limits.change * min(1.0, self._ran / SOFT)
-        moved = self.velocity + shortened(wanted - self.velocity, change)
-        self.velocity = shortened(moved, self._limits.speed)
+        share = min(1.0, self._ran / SOFT)
+        action = np.empty_like(self.action)
+        for part, limit, change in self._limits.vectors:
+            own = self.action[part]
+            moved = own + shortened(wanted[part] - own, change * share)
+            action[part] = shortened(moved, limit)
+        self.action = action
 
-    def _brake(self, change: float) -> None:
-        """Along its own direction, so that no power is put in."""
-        self.velocity = slowed(self.velocity, change)
-        if not self.velocity.any():
+    def _brake(self, periods: float) -> None:
+        """Every vector along its own direction, so that no power is put in."""
+        action = np.empty_like(self.action)
+        for part, _, change in self._limits.vectors:
+            action[part] = slowed(self.action[part], change * periods)
+        self.action = action
+        if not action.any():
             self.mode = Mode.STOPPED
             self._good = 0
 
@@ -211,7 +231,7 @@ def shortened(vector: np.ndarray, most: float) -> np.ndarray:
     return vector if norm <= most else vector * np.float32(most / norm)
 
 
-def slowed(velocity: np.ndarray, change: float) -> np.ndarray:
-    """The velocity shorter by `change`, or zero: one step of a brake."""
-    speed = length(velocity)  # zero too where the squares of denormal numbers vanish
-    return velocity * np.float32(max(0.0, 1 - change / speed)) if speed else np.zeros_like(velocity)
+def slowed(vector: np.ndarray, change: float) -> np.ndarray:
+    """The vector shorter by `change`, or zero: one step of a brake."""
+    norm = length(vector)  # zero too where the squares of denormal numbers vanish
+    return vector * np.float32(max(0.0, 1 - change / norm)) if norm else np.zeros_like(vector)

@@ -1,5 +1,6 @@
 """Channels of what a controller sees and does: names, shapes, units and limits."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +23,13 @@ class Channel:
     limit: float | None = None
     rate_limit: float | None = None
 
-    @property
+    def __post_init__(self) -> None:
+        if not self.shape or min(self.shape) < 1:
+            raise PalpateError(
+                f"the channel '{self.name}' has the shape {self.shape}: expected sizes"
+            )
+
+    @functools.cached_property
     def count(self) -> int:
         """How many numbers it is."""
         return math.prod(self.shape)

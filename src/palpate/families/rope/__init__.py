@@ -13,6 +13,7 @@ FAMILY = Family(
         "rope-tracking": "palpate.tasks.rope:RopeTracking",
     },
     evidence={"energy": "palpate.families.rope.energy:ENERGY"},
+    deployments={"rope-stabilization": "palpate.families.rope.deployment:RopeDeployment"},
     options={
         "demo": {"rope": "palpate.families.rope.demo:DemoRope"},
         "record": {"rope": f"{_OPTIONS}:RecordRope"},

@@ -89,16 +89,15 @@ class RopeRobot:
         self._sequence += 1
         self.published_at = self._link.clock()
         seen = self._seen
-        message = StateMessage(
-            self._session, self._sequence, self.published_at, seen.gripper_position, seen.markers
-        )
+        values = {"gripper": seen.gripper_position, "markers": seen.markers}
+        message = StateMessage(self._session, self._sequence, self.published_at, values)
         self._link.send(encode_state(message))
 
     def _listen(self) -> None:
-        heard = [(arrived, decode_command(data)) for arrived, data in self._link.arrivals()]
+        heard = [(arrived, decode_command(data, 3)) for arrived, data in self._link.arrivals()]
         if heard:
             self._heard_at, command = heard[-1]
-            self.velocity = command.velocity
+            self.velocity = command.action
             self.released = self.released or command.mode == Mode.RUNNING
             self.heard += heard
         elif self._link.clock() - self._heard_at > PAUSE * self.period:

@@ -1,0 +1,137 @@
+"""A rope's policy on a robot: markers and a gripper in, the gripper's velocity out."""
+
+import json
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from palpate.deployment.decision import NetworkDecision
+from palpate.deployment.deployment import Deployment
+from palpate.deployment.plausibility import Values
+from palpate.errors import PalpateError
+from palpate.families.rope.chain_check import ChainCheck
+from palpate.family import check_name
+from palpate.networks import Channel, CommandPolicy
+from palpate.perception.velocity import VelocityEstimator
+from palpate.runs import Figure
+from palpate.trials.rope.trials import settling_time
+
+
+class RopeDecision:
+    """A rope's policy, fed as in training: node positions relative to the gripper and velocities.
+
+    The nodes are the markers, or every second of them, and so on; at the gripper its encoder is
+    believed, not its marker. Velocities are `VelocityEstimator`'s, of the last frames.
+
+    Args:
+        policy: trained for `palpate.tasks.RopeStabilization`.
+        markers: how many a state has.
+
+    Raises:
+        PalpateError: the policy observes something else, or its nodes do not fall on so many
+            markers.
+    """
+
+    def __init__(self, policy: CommandPolicy, markers: int):
+        nodes = nodes_of(policy)
+        self._every, rest = divmod(markers - 1, nodes - 1)
+        if rest or not self._every:
+            raise PalpateError(
+                f"a policy for {nodes} nodes needs a multiple of {nodes - 1} markers and one more, "
+                f"not {markers}"
+            )
+        self._network = NetworkDecision(policy)
+        self._weights = np.asarray(VelocityEstimator(policy.period).weights, np.float32)
+        self._window = np.zeros((len(self._weights), nodes, 3), np.float32)
+        self._features = np.empty((2, nodes - 1, 3), np.float32)
+        self._started = False
+
+    def forget(self) -> None:
+        """See `palpate.deployment.supervisor.Decision.forget`: velocities start from rest."""
+        self._started = False
+
+    def see(self, values: Values) -> None:
+        """See `palpate.deployment.supervisor.Decision.see`."""
+        window = self._window
+        window[:-1] = window[1:]
+        window[-1] = values["markers"][:: self._every]
+        window[-1, 0] = values["gripper"]
+        if not self._started:
+            window[:-1] = window[-1]
+            self._started = True
+
+    def decide(self, command: np.ndarray) -> np.ndarray:
+        """See `palpate.deployment.supervisor.Decision.decide`."""
+        window = self._window
+        positions, velocities = self._features
+        np.subtract(window[-1, 1:], window[-1, :1], out=positions)
+        np.einsum("f,fnc->nc", self._weights, window[:, 1:], out=velocities)
+        return self._network(self._features.reshape(-1), command)
+
+
+class RopeDeployment(Deployment):
+    """See `Deployment`: the sensors are the gripper's encoder and the markers, gripper to tip."""
+
+    def set_rows(self, rows: Mapping[str, int]) -> None:
+        """As many markers as the policy has nodes, unless `rows` says how many there are."""
+        for name in rows:
+            check_name("sensor channel with open rows", name, ["markers"])
+        self.markers = rows.get("markers", nodes_of(self.policy))
+        self.sensors = (Channel("gripper", (3,), "m"), Channel("markers", (self.markers, 3), "m"))
+
+    def decision(self) -> RopeDecision:
+        """See `Deployment.decision`."""
+        return RopeDecision(self.policy, self.markers)
+
+    def check(self) -> ChainCheck:
+        """See `Deployment.check`. Raises `PalpateError` where the segments' length is unknown."""
+        return ChainCheck(self.segment_lengths(), self.policy.period)
+
+    def segment_lengths(self) -> np.ndarray:
+        """Rest length (markers - 1,) in m between markers of the rope that was trained on."""
+        rows = self.manifest.get("model", [])
+        lengths = [row["value"] for row in rows if row.get("name") == "rest_length"]
+        if not lengths:
+            raise PalpateError(
+                "the policy does not say how long its rope's segments are: expected one that "
+                "`palpate train rope-stabilization` wrote"
+            )
+        own = np.asarray(lengths[0], float)
+        every = (self.markers - 1) // len(own)
+        return np.repeat(own / every, every)
+
+    def simulated_robot(self, endpoint: str, seconds: float, seed: int) -> list[str]:
+        """See `Deployment.simulated_robot`: `palpate.families.rope.robot`."""
+        from palpate.families.rope import robot
+
+        period = self.policy.period
+        robot.servoed(self.markers, period)
+        arguments = {"markers": self.markers, "period": period, "seconds": seconds, "seed": seed}
+        words = [robot.__name__, "--connect", endpoint]
+        return words + [
+            word for name, value in arguments.items() for word in (f"--{name}", f"{value}")
+        ]
+
+    def outcome(self, printed: str) -> list[Figure]:
+        """When the rope had settled, and the energy it was left with; see `Deployment.outcome`."""
+        motion = {name: np.array([values]) for name, values in json.loads(printed).items()}
+        energy, speed = motion["energy_j"], motion["gripper_speed_m_per_s"]
+        time = float(settling_time(energy, speed, self.policy.period)[0])
+        return [
+            Figure("time_to_1pct_s", time if math.isfinite(time) else None, "s"),
+            Figure("energy_left", float(energy[0, -1] / energy[0, 0]), ""),
+        ]
+
+
+def nodes_of(policy: CommandPolicy) -> int:
+    """Of the rope that the policy sees; raises `PalpateError` where it sees or moves no rope."""
+    shapes = [channel.shape for channel in policy.observations]
+    nodes = shapes[0][0] + 1
+    commands = [channel.shape for channel in policy.actions]
+    if shapes != [(nodes - 1, 3)] * 2 or commands != [(1, 3)]:
+        raise PalpateError(
+            f"the policy observes {shapes} and gives {commands}: expected positions and velocities "
+            "of a rope's nodes, and one gripper's velocity, as in rope-stabilization"
+        )
+    return nodes

@@ -15,7 +15,8 @@ from palpate.errors import PalpateError
 from palpate.families.options import Identify, Train
 from palpate.families.rope.demo import PICTURE, DemoRope, Size
 from palpate.families.rope.options import IdentifyRope, RecordRope
-from palpate.identification.data.prediction import PredictionError, Windows
+from palpate.identification.data.prediction import PredictionError
+from palpate.identification.data.segments import known_start
 from palpate.identification.gradient.least_squares import Intervals
 from palpate.models.files import load_model
 from palpate.models.model import rollout
@@ -187,10 +188,10 @@ def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap():
     seen[:, 2] = seen[1:, 3] = seen[:, 4, 1] = False
     prediction, target = np.full(seen.shape, 0.1), np.zeros(seen.shape)
     target[0] = 7.0  # the median of those trials that were scored
-    parts = target[:, :2], target[:, :, 0, :1], target, seen
-    windows = Windows(*map(jnp.asarray, parts))
+    start = target[:, 0], target[:, 0], target[:, :, 0, :1]
+    segments = known_start(*map(jnp.asarray, (*start, target, seen)))
     by_trial, time = np.array([2.0, 1.0, np.nan, np.nan]), 0.1 * np.arange(1, 7)
-    error = PredictionError(0.1, by_trial, time, np.ones(6), prediction, windows)
+    error = PredictionError(0.1, by_trial, time, np.ones(6), prediction, segments)
     nothing = Intervals({}, {}, {}, ())
     identified = identify.Identified(START["cart"], nothing, error, error, error)
     found = identify.evidence(identified, "m")

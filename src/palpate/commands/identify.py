@@ -178,22 +178,22 @@ def evidence(identified: Identified, unit: str) -> dict[str, np.ndarray]:
         arrays |= {"horizon.identified.low": low, "horizon.identified.high": high}
         scored = np.isfinite(error.by_trial).sum()  # the others, NaN, are sorted last
         trial = int(np.argsort(error.by_trial)[scored // 2])
-        seen = np.asarray(error.windows.seen[trial])
+        seen = np.asarray(error.segments.seen[trial])
         arrays["motion.time"] = error.horizon
-        arrays["motion.observed"] = np.where(seen, error.windows.target[trial], np.nan)
+        arrays["motion.observed"] = np.where(seen, error.segments.target[trial], np.nan)
         arrays["motion.predicted"] = np.asarray(error.prediction[trial])
     return arrays
 
 
 def is_chain(error: PredictionError, unit: str) -> bool:
     """Whether what is observed is points in space, the last of which is called the tip."""
-    return unit == "m" and error.windows.target.ndim == 4 and error.windows.target.shape[-1] == 3
+    return unit == "m" and error.segments.target.ndim == 4 and error.segments.target.shape[-1] == 3
 
 
 def chain_error(error: PredictionError) -> np.ndarray:
     """Distance (trials, times, points) of each point from where it was seen, NaN if it was not."""
-    apart = np.where(error.windows.seen, error.prediction - error.windows.target, np.nan)
-    return np.linalg.norm(apart, axis=-1)
+    off = np.where(error.segments.seen, error.prediction - error.segments.target, np.nan)
+    return np.linalg.norm(off, axis=-1)
 
 
 def _root_mean_square(error: np.ndarray) -> np.ndarray:

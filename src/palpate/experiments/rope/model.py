@@ -157,8 +157,8 @@ def _compare(
 
 def tip_errors(error: PredictionError) -> np.ndarray:
     """Root mean square distance (m) of the last point from where it was seen, for each trial."""
-    miss = np.asarray(error.prediction)[:, :, -1] - np.asarray(error.windows.target)[:, :, -1]
-    seen = np.asarray(error.windows.seen)[:, :, -1].all(-1)
+    miss = np.asarray(error.prediction)[:, :, -1] - np.asarray(error.segments.target)[:, :, -1]
+    seen = np.asarray(error.segments.seen)[:, :, -1].all(-1)
     squared = np.where(seen, np.square(miss).sum(-1), 0.0)
     return np.sqrt(squared.sum(1) / np.maximum(seen.sum(1), 1))
 
@@ -171,7 +171,7 @@ def _simulated_figures(
     name: str, world: RopeConfiguration, errors: dict[str, PredictionError], unseen: Aligned
 ) -> list[Figure]:
     tips = {label: tip_errors(error) / world.length for label, error in errors.items()}
-    target = np.asarray(errors["damped"].windows.target)
+    target = np.asarray(errors["damped"].segments.target)
     hanging = unseen.action[:, 1 : 1 + target.shape[1], 0] - np.array([0.0, 0.0, world.length])
     still = np.linalg.norm(target[:, :, -1] - hanging, axis=-1) / world.length
     ours, theirs = _pooled(tips["damped"]), _pooled(tips["undamped"])
@@ -245,7 +245,7 @@ def _evidence(name: str, errors: dict[str, PredictionError]) -> dict[str, np.nda
     trial = int(np.argsort(tip_errors(error))[len(error.by_trial) // 2])
     return {
         f"motion/{name}.time": error.horizon,
-        f"motion/{name}.observed": np.asarray(error.windows.target[trial]),
+        f"motion/{name}.observed": np.asarray(error.segments.target[trial]),
         f"motion/{name}.predicted": np.asarray(error.prediction[trial]),
         f"motion/{name}.undamped": np.asarray(errors["undamped"].prediction[trial]),
     }

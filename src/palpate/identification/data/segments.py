@@ -1,27 +1,38 @@
-"""Pieces of recordings with what is known of the state they begin in.
+"""Segments of recordings with what is known of the state they begin in: for every method.
 
 A camera shows poses with millimetres of noise, and the difference of two frames says nothing of a
-velocity. Here each piece begins at a pose and a velocity from a local polynomial (Savitzky and
+velocity. Here a segment begins at a pose and a velocity from a local polynomial (Savitzky and
 Golay, Analytical Chemistry 36, 1964), with their standard deviations.
 """
+
+import dataclasses
+from functools import cached_property
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
+from scipy.stats import chi2
 
 from palpate.errors import PalpateError
 from palpate.models.model import Model
 from palpate.recordings import Aligned
 
-REACH = 0.2  # s before and after a frame that its smoothed pose is taken from
+REACH = 0.2  # s before and after a frame that its smoothed pose is taken from, at most
 ORDER = 3  # of the polynomial: a velocity that changes within the reach
 STILL = 0.06  # s at the beginning of a trial at rest that its pose is averaged over
+# A polynomial that misses the frames by more than noise does once in a thousand times is taken over
+# half the reach: there the motion is too fast for it.
+CHANCE = 1e-3
+START_FRAMES = 2  # complete frames in a row that a segment starts after: a pose, and how it moves
+# The smoothed start has seen the segment's own frames. By so much its deviation is widened where
+# the start is inferred from them once more, so that the segment decides.
+VAGUE = 3.0
 
 
 class Segments(eqx.Module):
-    """Pieces of trials, the same length each; shorter ones are padded with frames not seen.
+    """Parts of trials, the same length each; shorter ones are padded with frames not seen.
 
     `pose` and `rate` (per second) are the smoothed observation at the first frame and its time
     derivative, `pose_deviation` and `rate_deviation` their standard deviations, zero for what is
@@ -47,6 +58,15 @@ class Segments(eqx.Module):
         """Control periods of each piece."""
         return self.action.shape[1]
 
+    def moved(self, offset: Float[Array, "..."]) -> "Segments":
+        """Pose and rate at the start moved by (segments, 2, *observation) vague deviations, or by
+        (2, *observation), the same for all.
+        """
+        axis = -1 - len(self.pose.shape[1:])
+        pose, rate = (VAGUE * jnp.take(offset, i, axis=axis) for i in range(2))
+        begun = self.pose + pose * self.pose_deviation, self.rate + rate * self.rate_deviation
+        return eqx.tree_at(lambda s: (s.pose, s.rate), self, begun)
+
     def take(self, indices: np.ndarray | list[int] | slice) -> "Segments":
         """Some of the pieces."""
         chosen = indices if isinstance(indices, slice) else np.asarray(indices)
@@ -62,6 +82,111 @@ def known_start(
     return Segments(
         pose, rate, nothing, nothing, action, jnp.where(everything, target, 0.0), everything
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class SegmentSource:
+    """Cuts segments out of aligned trials, and smooths the states that they start in.
+
+    `starts`: the frames of each trial that end `START_FRAMES` in a row in which all is seen.
+    """
+
+    aligned: Aligned
+    model: Model
+    starts: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, aligned: Aligned, model: Model) -> "SegmentSource":
+        """Find the frames a segment may start at.
+
+        Raises `PalpateError` for a trial in which no two consecutive frames are complete.
+        """
+        starts = []
+        for index, length in enumerate(aligned.length):
+            flat = aligned.observation[index, :length].reshape(length, -1)
+            complete: np.ndarray = np.all(np.isfinite(flat), axis=1)
+            possible = 1 + np.flatnonzero(complete[: length - 2] & complete[1 : length - 1])
+            if not possible.size:
+                raise PalpateError(
+                    f"trial {index} has no two consecutive frames in which everything is seen, so "
+                    "no prediction can start there: repair or drop the trial"
+                )
+            starts.append(possible)
+        return cls(aligned, model, tuple(starts))
+
+    @property
+    def longest(self) -> int:
+        """The longest horizon, in control periods, that every trial offers from its first start."""
+        return int(min(self.aligned.length - 1 - [possible[0] for possible in self.starts]))
+
+    def whole(self, smoothed: bool = True) -> Segments:
+        """One segment for each trial, from its first possible start to the end of the longest.
+
+        Not `smoothed`, it starts as the first two frames alone say, and knows of none that follow.
+        """
+        horizon = int(max(self.aligned.length)) - START_FRAMES
+        first = [possible[0] for possible in self.starts]
+        return self.at(np.stack([np.arange(len(first)), first], axis=1), horizon, smoothed)
+
+    def tiles(self, horizon: int) -> Int[np.ndarray, "tiles 2"]:
+        """Trial and first frame of the segments of this horizon that are worth having at once.
+
+        Those that overlap by more than half tell little more than one.
+        """
+        rows = []
+        for trial, possible in enumerate(self.starts):
+            last = max(int(self.aligned.length[trial]) - 1 - horizon, int(possible[0]))
+            count = 1 + (last - int(possible[0])) // max(1, horizon // 2)
+            wanted = np.linspace(possible[0], last, count).round()
+            reached = possible[np.searchsorted(possible, wanted, side="right") - 1]
+            rows += [(trial, frame) for frame in dict.fromkeys(reached)]
+        return np.array(rows)
+
+    def sample(self, rng: np.random.Generator, batch: int, horizon: int) -> Segments:
+        """`batch` segments, or all that are worth having at once, at random starts.
+
+        Trials are drawn evenly, and starts leave room for the horizon.
+        """
+        count, batch = len(self.starts), min(batch, len(self.tiles(horizon)))
+        order = np.concatenate([rng.permutation(count) for _ in range(-(-batch // count))])[:batch]
+        rows = []
+        for trial in order:
+            possible = self.starts[trial]
+            last = max(int(self.aligned.length[trial]) - 1 - horizon, int(possible[0]))
+            rows.append((trial, rng.choice(possible[possible <= last])))
+        return self.at(np.array(rows), horizon)
+
+    def at(
+        self, rows: Int[np.ndarray, "segments 2"], horizon: int, smoothed: bool = True
+    ) -> Segments:
+        """Segments from these frames of these trials, over `horizon` control periods."""
+        pieces = []
+        for trial, first in np.asarray(rows).tolist():
+            length = int(self.aligned.length[trial])
+            observed, action = self.aligned.observation[trial, :length], self.aligned.action[trial]
+            if (trial, first, smoothed) not in self._begun:
+                start = _smoothed(observed, self.model, first, self.aligned.period, self._noise)
+                if start is None or not smoothed:
+                    start = self._two_frames(observed, first)
+                self._begun[trial, first, smoothed] = start
+            piece = _padded(observed, action, first, length - 1, horizon)
+            pieces.append((*self._begun[trial, first, smoothed], *piece))
+        return _joined(pieces)
+
+    def _two_frames(self, observed: np.ndarray, first: int) -> tuple[np.ndarray, ...]:
+        """Pose, rate and their deviations, from a frame and the one before."""
+        period, noise = self.aligned.period, np.broadcast_to(self._noise, observed.shape[1:])
+        rate = difference(self.model, observed[first], observed[first - 1]) / period
+        return observed[first], rate, noise, noise * np.sqrt(2.0) / period
+
+    @cached_property
+    def _noise(self) -> np.ndarray:
+        return noise_scale(self.aligned, self.model)
+
+    @cached_property
+    def _begun(self) -> dict[tuple[int, int, bool], tuple[np.ndarray, ...]]:
+        """Starts found so far."""
+        return {}
 
 
 def cut(
@@ -100,14 +225,13 @@ def cut(
         )
     if count is not None and len(pieces) > count:
         raise PalpateError(f"{len(pieces)} pieces do not fit into {count}: expected a larger count")
+    # Copies of the first piece in which nothing is seen: they can be computed and say nothing.
+    blind = (*pieces[0][:-1], np.zeros_like(pieces[0][-1]))
+    return _joined(pieces + [blind] * ((count or 0) - len(pieces)))
+
+
+def _joined(pieces: list[tuple[np.ndarray, ...]]) -> Segments:
     columns = [np.stack(column) for column in zip(*pieces, strict=True)]
-    if count is not None and len(pieces) < count:
-        missing = count - len(pieces)
-        # A copy of the first piece in which nothing is seen: it can be computed and says nothing.
-        columns = [
-            np.concatenate([c, np.repeat(c[:1] & False if c.dtype == bool else c[:1], missing, 0)])
-            for c in columns
-        ]
     return Segments(
         *(jnp.asarray(c, bool if c.dtype == bool else jnp.zeros(()).dtype) for c in columns)
     )
@@ -118,25 +242,30 @@ def noise_scale(aligned: Aligned, model: Model) -> Float[np.ndarray, " last"]:
 
     From the third differences of consecutive frames, in which smooth motion all but vanishes and
     white noise has 20 times its variance; by their median, so that jerks do not count (Gasser,
-    Sroka and Jennen-Steinmetz, Biometrika 73, 1986). Angles are differences of the model's.
+    Sroka and Jennen-Steinmetz, Biometrika 73, 1986). Where the sixth (924 times) show less than
+    half as much, it was motion that the third ones showed. Angles are differences of the model's.
     """
     last = model.observation_shape[-1]
-    thirds = []
-    for trial, length in enumerate(aligned.length):
-        observed = np.asarray(aligned.observation[trial, :length], np.float64)
-        if length < 4:
-            continue
-        change = difference(model, observed[1:], observed[:-1])
-        thirds.append(np.diff(change, n=2, axis=0).reshape(-1, last))
-    values = np.abs(np.concatenate(thirds)) if thirds else np.zeros((0, last))
-    size = np.nanmax(np.abs(aligned.observation), initial=0.0)
-    floor = 1e-5 * max(float(size), 1e-3)
-    scale = np.full(last, floor)
-    for index in range(last):
-        found = values[np.isfinite(values[:, index]), index]
-        if found.size:
-            scale[index] = max(float(np.median(found)) / 0.6745 / np.sqrt(20.0), floor)
-    return scale
+    floor = 1e-5 * max(float(np.nanmax(np.abs(aligned.observation), initial=0.0)), 1e-3)
+    changes = [
+        difference(model, observed[1:], observed[:-1])
+        for trial, length in enumerate(aligned.length)
+        for observed in [np.asarray(aligned.observation[trial, :length], np.float64)]
+    ]
+
+    def scale(order: int, growth: float) -> np.ndarray:
+        found = [
+            np.diff(change, n=order - 1, axis=0).reshape(-1, last)
+            for change in changes
+            if len(change) >= order
+        ]
+        values = np.abs(np.concatenate(found)) if found else np.zeros((0, last))
+        seen = [values[np.isfinite(values[:, index]), index] for index in range(last)]
+        medians = np.array([float(np.median(v)) if v.size else 0.0 for v in seen])
+        return np.maximum(medians / 0.6745 / np.sqrt(growth), floor)
+
+    third, sixth = scale(3, 20.0), scale(6, 924.0)
+    return np.where((sixth < 0.5 * third) & (sixth > floor), sixth, third)
 
 
 def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
@@ -145,30 +274,66 @@ def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.
 
 
 def _smoothed(
-    observed: np.ndarray, model: Model, first: int, period: float, spread: np.ndarray, still: bool
+    observed: np.ndarray,
+    model: Model,
+    first: int,
+    period: float,
+    spread: np.ndarray,
+    still: bool = False,
 ) -> tuple[np.ndarray, ...] | None:
-    """Pose, rate and their deviations at a frame; None where too little is seen around it."""
-    reach = max(ORDER, round(REACH / period))
-    low = first if still else max(0, first - reach)
-    high = min(len(observed), first + (max(1, round(STILL / period)) if still else reach + 1))
-    around = np.asarray(observed[low:high], np.float64)
-    complete = np.all(np.isfinite(around).reshape(len(around), -1), axis=1)
-    if complete.sum() < (1 if still else ORDER + 2):
-        return None
-    frames = np.flatnonzero(complete)
-    reference = around[frames[np.argmin(np.abs(frames + low - first))]]
-    offset = difference(model, around[frames], np.broadcast_to(reference, around[frames].shape))
-    time = (frames + low - first) * period
-    powers = time[:, None] ** np.arange(1 if still else ORDER + 1)
-    coefficients, *_ = np.linalg.lstsq(powers, offset.reshape(len(frames), -1), rcond=None)
-    covariance = np.linalg.inv(powers.T @ powers)
-    shape = observed.shape[1:]
-    zero, noise = np.zeros(shape), np.broadcast_to(spread, shape)
-    pose = reference + coefficients[0].reshape(shape)
+    """Pose, rate and their deviations at a frame; None where too little is seen around it.
+
+    Each channel from the longest reach over which the polynomial misses it by no more than noise
+    may; where it misses in all, the deviations grow by what it misses over the shortest.
+    """
+    noise = np.broadcast_to(spread, observed.shape[1:])
     if still:
-        return pose, zero, noise * np.sqrt(covariance[0, 0]), zero
-    rate = coefficients[1].reshape(shape)
-    return pose, rate, noise * np.sqrt(covariance[0, 0]), noise * np.sqrt(covariance[1, 1])
+        around = slice(first, first + max(1, round(STILL / period)))
+        found = _fitted(observed, model, first, around, 0, period)
+        if found is None:
+            return None
+        pose, deviation, *_ = found
+        return pose[0], np.zeros_like(noise), noise * deviation[0], np.zeros_like(noise)
+    best, reach = None, max(ORDER, round(REACH / period))
+    for within in sorted({reach, reach // 2, reach // 4}):
+        around = slice(max(0, first - within), first + within + 1)
+        found = _fitted(observed, model, first, around, ORDER, period)
+        if found is None:
+            continue
+        value, deviation, squares, freedom = found
+        missed = squares / np.square(noise)
+        start = (*value[:2], noise * deviation[0], noise * deviation[1])
+        if best is None:
+            grown = np.sqrt(np.maximum(1.0, missed / freedom))
+            best = (*start[:2], grown * start[2], grown * start[3])
+        good = missed <= chi2.isf(CHANCE, freedom)
+        best = tuple(np.where(good, new, old) for new, old in zip(start, best, strict=True))
+    return best
+
+
+def _fitted(
+    observed: np.ndarray, model: Model, first: int, around: slice, order: int, period: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int] | None:
+    """A polynomial in time about a frame, by least squares; None where too little is seen.
+
+    Its value and derivatives there, their deviations for noise of one, the sum of the squares that
+    it misses by for each channel, and how many degrees of freedom those have.
+    """
+    near = np.asarray(observed[around], np.float64)
+    frames = np.flatnonzero(np.all(np.isfinite(near).reshape(len(near), -1), axis=1))
+    if len(frames) < (order + 2 if order else 1):
+        return None
+    after = frames + around.start - first
+    reference = near[frames[np.argmin(np.abs(after))]]
+    offset = difference(model, near[frames], np.broadcast_to(reference, near[frames].shape))
+    powers = (after * period)[:, None] ** np.arange(order + 1)
+    flat = offset.reshape(len(frames), -1)
+    coefficients, *_ = np.linalg.lstsq(powers, flat, rcond=None)
+    squares = np.square(flat - powers @ coefficients).sum(axis=0).reshape(reference.shape)
+    value = coefficients.reshape(-1, *reference.shape)
+    value[0] += reference
+    deviation = np.sqrt(np.diag(np.linalg.inv(powers.T @ powers)))
+    return value, deviation, squares, len(frames) - order - 1
 
 
 def _padded(

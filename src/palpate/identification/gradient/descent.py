@@ -1,8 +1,9 @@
 """Identification by gradient descent through a model, with a growing horizon.
 
-Seed 1 (SPiD), Algorithm 1: predict open loop from a known start, compare with what was observed,
+Seed 1 (SPiD), Algorithm 1: predict open loop from a start, compare with what was observed,
 differentiate through the model, and lengthen the horizon once short predictions are good. Long
-horizons from the start meet a loss full of folds; short ones alone cannot see slow effects.
+horizons from the beginning meet a loss full of folds; short ones alone cannot see slow effects.
+Segments start in smoothed states; in the last stage these are fitted beside the parameters.
 """
 
 import dataclasses
@@ -17,8 +18,9 @@ import optax
 from jaxtyping import Array
 
 from palpate.errors import PalpateError
-from palpate.identification.data.prediction import Windows, WindowSource, observation_scale
-from palpate.identification.gradient.least_squares import NormalEquations, mean_loss
+from palpate.identification.data.prediction import observation_scale
+from palpate.identification.data.segments import Segments, SegmentSource
+from palpate.identification.gradient.least_squares import KNEE, Free, Objective
 from palpate.models.model import Model
 from palpate.numerics import devices
 from palpate.parameters import FreeParameters
@@ -27,16 +29,10 @@ from palpate.runs import Run
 from palpate.runs.progress import interruptible, progress
 
 SomeModel = TypeVar("SomeModel", bound=Model)
-Free = dict[str, Array]
-
-# The loss is quadratic for small errors and linear beyond: a few bad markers or a stretch that the
-# model cannot explain must not decide the fit. The knee is relative to how far things move.
-KNEE = 0.01
-
 # The gradient of a long prediction of an undamped model can be infinite although the prediction is
 # not: such an iteration changes nothing and the next look half as far ahead, until a few in a row
 # were finite and the horizon grows back by one doubling.
-MOST_HALVINGS = 6
+MAX_HALVINGS = 6
 RECOVERY = 10
 
 
@@ -44,8 +40,9 @@ RECOVERY = 10
 class Settings:
     """How to descend. Horizons are shares of the longest one that every trial offers.
 
-    `threshold` is the seed's epsilon, the loss (relative to how far things move) below which a
-    stage ends before its iterations are used up.
+    `windows` is how many segments an iteration looks at. `threshold` is the seed's epsilon, the
+    loss (relative to how far things move) below which a stage but the last ends before its
+    iterations are used up. `prior_weight` is the most that the prior counts per residual.
     """
 
     method: Literal["adam", "levenberg-marquardt"] = "adam"
@@ -77,6 +74,7 @@ class Descent(eqx.Module):
     """Where a descent stands: all that a resumed one needs."""
 
     free: Free
+    offset: Array  # of the starts of the last stage's segments, see `Segments.moved`
     optimiser: Any
     stage: int = 0
     within: int = 0  # iterations done in this stage
@@ -88,14 +86,18 @@ class Descent(eqx.Module):
 class Method(Protocol):
     """One way to go downhill."""
 
-    def start(self, free: Free) -> Any:
+    def start(self, free: Free, offset: Array) -> Any:
         """The method's own state."""
         ...
 
     def step(
-        self, free: Free, optimiser: Any, windows: Windows, remaining: float
-    ) -> tuple[Free, Any, Array]:
-        """New free values and state, and the loss before; `remaining` share of the last stage."""
+        self, descent: Descent, segments: Segments, rows: Array, remaining: float
+    ) -> tuple[Free, Array, Any, Array]:
+        """New free values, offsets and own state, and the loss before.
+
+        `rows`: which of the offsets those of the segments are, -1 for a start that is not fitted;
+        `remaining`: share of the last stage.
+        """
         ...
 
 
@@ -113,11 +115,16 @@ def identify(
     """
     check_shapes(model, aligned)
     coordinates = FreeParameters(model)
-    source = WindowSource.of(aligned)
+    source = SegmentSource.of(aligned, model)
     if settings.method not in METHODS:
         raise PalpateError(f"unknown method '{settings.method}'; there are: {', '.join(METHODS)}")
-    method = METHODS[settings.method](coordinates, observation_scale(aligned), settings)
-    descent = Descent(coordinates.initial, method.start(coordinates.initial))
+    scale = observation_scale(aligned, model)
+    objective = Objective(coordinates, scale, KNEE, settings.prior_weight)
+    method = METHODS[settings.method](objective, settings)
+    tiles = source.tiles(_horizon(source, settings.horizons[-1]))
+    offset = jnp.zeros((len(tiles), 2, *model.observation_shape))
+    free = coordinates.initial
+    descent = Descent(free, offset, method.start(free, offset))
     step = 0
     if run is not None:
         step, descent = run.restore(descent) or (0, descent)
@@ -126,9 +133,8 @@ def identify(
         ticks = iter(bar)
         while descent.stage < len(settings.horizons) and not stop:
             before = _position(descent, settings)
-            share = settings.horizons[descent.stage] / 2**descent.halvings
-            horizon = max(1, round(share * source.longest))
-            descent, loss = _iterate(descent, step, horizon, method, source, settings)
+            horizon = _horizon(source, settings.horizons[descent.stage] / 2**descent.halvings)
+            descent, loss = _iterate(descent, step, horizon, method, source, tiles, settings)
             step += 1
             for _ in range(_position(descent, settings) - before):
                 next(ticks, None)
@@ -140,30 +146,38 @@ def identify(
     return coordinates.build(jax.tree.map(jnp.asarray, jax.device_get(descent.free)))
 
 
+def _horizon(source: SegmentSource, share: float) -> int:
+    """Control periods of a share of the longest horizon."""
+    return max(1, round(share * source.longest))
+
+
 def _iterate(
     descent: Descent,
     step: int,
     horizon: int,
     method: Method,
-    source: WindowSource,
+    source: SegmentSource,
+    tiles: np.ndarray,
     settings: Settings,
 ) -> tuple[Descent, float]:
-    """One iteration on windows that depend on the seed and the step alone."""
-    windows = source.sample(
-        np.random.default_rng((settings.seed, step)),
-        min(settings.windows, source.distinct(horizon)),
-        horizon,
-    )
+    """One iteration on segments that depend on the seed and the step alone."""
+    rng = np.random.default_rng((settings.seed, step))
     last = descent.stage == len(settings.horizons) - 1
+    if last:
+        rows = np.sort(rng.permutation(len(tiles))[: settings.windows])
+        segments = source.at(tiles[rows], horizon)
+    else:
+        segments = source.sample(rng, settings.windows, horizon)
+        rows = np.full(segments.count, -1)
     remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
-    free, optimiser, loss = method.step(descent.free, descent.optimiser, windows, remaining)
+    free, offset, optimiser, loss = method.step(descent, segments, jnp.asarray(rows), remaining)
     loss = float(loss)
     halvings, finite = descent.halvings, descent.finite + 1
     if not np.isfinite(loss):
         halvings, finite = halvings + 1, 0
     elif halvings and finite >= RECOVERY:
         halvings, finite = halvings - 1, 0
-    if halvings > MOST_HALVINGS:
+    if halvings > MAX_HALVINGS:
         raise PalpateError(
             f"the loss or its gradient is not finite at iteration {step + 1}, however short the "
             f"horizon ({horizon} control periods): start from other parameters, or check the "
@@ -171,11 +185,11 @@ def _iterate(
         )
     within = descent.within + 1
     # What is easily met at a shortened horizon says nothing about the stage's own.
-    good = loss < settings.threshold and descent.halvings == 0
+    good = loss < settings.threshold and descent.halvings == 0 and not last
     ended = within >= settings.iterations[descent.stage] or good
     if ended:
-        return Descent(free, optimiser, descent.stage + 1), loss
-    return Descent(free, optimiser, descent.stage, within, halvings, finite), loss
+        return Descent(free, offset, optimiser, descent.stage + 1), loss
+    return Descent(free, offset, optimiser, descent.stage, within, halvings, finite), loss
 
 
 def _position(descent: Descent, settings: Settings) -> int:
@@ -186,62 +200,99 @@ def _position(descent: Descent, settings: Settings) -> int:
 class Adam:
     """Adam in whitened coordinates, the last stage's rate falling to zero along a cosine."""
 
-    def __init__(self, coordinates: FreeParameters, scale: float, settings: Settings) -> None:
-        self._rate = settings.learning_rate
-        self._transform = optax.chain(
-            optax.clip_by_global_norm(settings.clip), optax.scale_by_adam()
-        )
+    def __init__(self, objective: Objective, settings: Settings) -> None:
+        self._objective, self._settings = objective, settings
 
-        def loss_and_gradient(free: Free, windows: Windows) -> tuple[Array, Free]:
-            return jax.value_and_grad(
-                lambda free: (
-                    mean_loss(coordinates, free, windows, scale, KNEE)
-                    + settings.prior_weight * coordinates.penalty(free)
-                )
-            )(free)
+    def start(self, free: Free, offset: Array) -> Any:
+        """Adam's moments of the parameters, and of the starts."""
+        transform = _transform(self._settings.clip)
+        return transform.init(free), transform.init(offset)
 
-        divided = devices.data_parallel(loss_and_gradient)
-
-        def step(free: Free, optimiser: Any, windows: Windows, rate: Array):
-            loss, gradient = divided(free, windows)
-            finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
-            direction, moments = self._transform.update(gradient, optimiser)
-            moved = coordinates.project(jax.tree.map(lambda x, d: x - rate * d, free, direction))
-            free, optimiser = jax.tree.map(
-                lambda new, old: jnp.where(finite, new, old), (moved, moments), (free, optimiser)
-            )
-            return free, optimiser, jnp.where(finite, loss, jnp.nan)
-
-        self._step = jax.jit(step)
-
-    def start(self, free: Free) -> Any:
-        """Adam's moments."""
-        return self._transform.init(free)
-
-    def step(self, free: Free, optimiser: Any, windows: Windows, remaining: float):
+    def step(self, descent: Descent, segments: Segments, rows: Array, remaining: float):
         """One Adam update."""
-        rate = self._rate * 0.5 * (1.0 - np.cos(np.pi * remaining))
-        free, optimiser = devices.everywhere((free, optimiser))
-        return self._step(free, optimiser, windows, jnp.asarray(rate, jnp.zeros(()).dtype))
+        rate = self._settings.learning_rate * 0.5 * (1.0 - np.cos(np.pi * remaining))
+        state = devices.everywhere((descent.free, descent.offset, descent.optimiser))
+        rate = jnp.asarray(rate, descent.offset.dtype)
+        return _adam(self._objective, state, (segments, rows), rate, self._settings.clip)
+
+
+def _transform(clip: float) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(clip), optax.scale_by_adam())
+
+
+@eqx.filter_jit
+def _adam(
+    objective: Objective,
+    state: tuple[Free, Array, Any],
+    batch: tuple[Segments, Array],
+    rate: Array,
+    clip: float,
+) -> tuple[Free, Array, Any, Array]:
+    free, offset, (moments, start_moments) = state
+    visited = jnp.zeros(len(offset), bool).at[_inside(batch[1], offset)].set(True, mode="drop")
+
+    def loss_and_gradient(shared: tuple[Objective, Free, Array], batch: tuple[Segments, Array]):
+        objective, *point = shared
+        segments, rows = batch
+
+        def loss(point: list[Any]) -> tuple[Array, Array]:
+            return objective.loss(point[0], _chosen(point[1], rows), segments)
+
+        return jax.value_and_grad(loss, has_aux=True)(point)
+
+    (_, mean), slope = devices.data_parallel(loss_and_gradient)((objective, free, offset), batch)
+    finite = jnp.isfinite(mean) & jnp.isfinite(optax.tree.norm(slope))
+    transform = _transform(clip)
+    direction, moments_after = transform.update(slope[0], moments)
+    free_after = jax.tree.map(lambda x, d: x - rate * d, free, direction)
+    direction, start_moments_after = transform.update(slope[1], start_moments)
+
+    def where_visited(new: Array, old: Array) -> Array:
+        rows = visited.reshape(-1, *(1,) * (new.ndim - 1)) if new.ndim else jnp.any(visited)
+        return jnp.where(rows, new, old)
+
+    before = offset, start_moments
+    after = offset - rate * direction, start_moments_after
+    offset_after, start_moments_after = jax.tree.map(where_visited, after, before)
+    found = (
+        objective.coordinates.project(free_after),
+        offset_after,
+        (moments_after, start_moments_after),
+    )
+    free, offset, moments = jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, state)
+    return free, offset, moments, jnp.where(finite, mean, jnp.nan)
+
+
+def _inside(rows: Array, offset: Array) -> Array:
+    """The rows, those of starts that are not fitted past the end, where nothing is set."""
+    return jnp.where(rows < 0, len(offset), rows)
+
+
+def _chosen(offset: Array, rows: Array) -> Array:
+    """Offsets of these rows; of starts that are not fitted zero."""
+    return jnp.take(offset, _inside(rows, offset), axis=0, mode="fill", fill_value=0.0)
 
 
 class LevenbergMarquardt:
     """Damped Gauss-Newton steps; the damping falls when a step lowers the loss, else it rises."""
 
-    def __init__(self, coordinates: FreeParameters, scale: float, settings: Settings) -> None:
-        self._system = NormalEquations(coordinates, scale, KNEE)
-        self._weight = settings.prior_weight
+    def __init__(self, objective: Objective, settings: Settings) -> None:
+        self._objective = objective
 
-    def start(self, free: Free) -> Any:
+    def start(self, free: Free, offset: Array) -> Any:
         """The damping, relative to the curvature."""
         return jnp.asarray(1e-2)
 
-    def step(self, free: Free, optimiser: Any, windows: Windows, remaining: float):
-        """One accepted or refused step on these windows."""
-        return self._system.step(free, optimiser, windows, self._weight)
+    def step(self, descent: Descent, segments: Segments, rows: Array, remaining: float):
+        """One accepted or refused step on these segments."""
+        offset = descent.offset
+        free, moved, damping, loss = self._objective.step(
+            descent.free, _chosen(offset, rows), descent.optimiser, segments
+        )
+        return free, offset.at[_inside(rows, offset)].set(moved, mode="drop"), damping, loss
 
 
-METHODS: dict[str, Callable[[FreeParameters, float, Settings], Method]] = {
+METHODS: dict[str, Callable[[Objective, Settings], Method]] = {
     "adam": Adam,
     "levenberg-marquardt": LevenbergMarquardt,
 }

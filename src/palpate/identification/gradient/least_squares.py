@@ -1,11 +1,15 @@
 """Least squares through a model: normal equations by forward mode, damped steps, intervals.
 
-With few parameters and many residuals the Jacobian is taken column by column in forward mode and
-only J^T J is kept: memory does not grow with the recording.
+What is fitted are the parameters and, for each segment, the state that it starts in: a smoothed
+start is off, and a model held to it would bend its parameters to make up for that (errors in
+variables). A start's errors are whitened by its vague deviation (`Segments.moved`), and eliminated
+segment by segment.
+
+With few unknowns and many residuals the Jacobian is taken column by column in forward mode and only
+products of its columns are kept: memory does not grow with the recording.
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -15,133 +19,174 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from palpate.identification.data.prediction import Windows, WindowSource, residuals
+from palpate.identification.data.prediction import observation_scale, predict, residuals
+from palpate.identification.data.segments import Segments, SegmentSource
 from palpate.identification.verdicts import UNDECIDED, verdict
 from palpate.parameters import FreeParameters, value_of
 from palpate.recordings import Aligned
 
 Free = dict[str, Array]
 
-GROUP = 4  # windows whose Jacobians are held at a time
+GROUP = 4  # segments whose Jacobians are held at a time
 BLOCKS = 10  # pieces of a trial whose scores are taken as independent of one another
 QUANTILE = 1.6449  # of the normal distribution: 90 % within
+# The loss is quadratic for small errors and linear beyond: a few bad markers or a stretch that the
+# model cannot explain must not decide the fit. The knee is relative to how far things move.
+KNEE = 0.01
+# Residuals next to one another are not independent: the prior weighs in a fit as if one in so many
+# were, of the size that residuals have, but no more than `Settings.prior_weight`.
+DEPENDENT = 400.0
 
 
-class System(eqx.Module):
-    """Gauss-Newton quantities at some free values, in flat whitened coordinates."""
+class Objective(eqx.Module):
+    """Mean loss of the residuals over `scale` at parameters and errors of the segments' starts.
 
-    matrix: Float[Array, "free free"]  # J^T W J
-    gradient: Float[Array, " free"]  # J^T W r
-    scores: Float[Array, "blocks free"]  # J^T W r over each piece of each trial
-    squares: Float[Array, ""]  # sum of squared residuals
-    count: Float[Array, ""]  # residuals seen
-
-
-@dataclasses.dataclass(frozen=True)
-class NormalEquations:
-    """Normal equations of the residuals over `scale`, reweighted beyond `knee` (pseudo-Huber).
-
-    A `knee` of None gives plain least squares.
+    Half the square of a residual, less beyond `knee` (pseudo-Huber; None: nowhere less), beside
+    what priors say of the parameters and of the starts. These weigh as in a maximum a posteriori
+    estimate whose noise is of the size that the residuals have.
     """
 
     coordinates: FreeParameters
-    scale: float
-    knee: float | None = None
+    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    knee: float | None = eqx.field(static=True, default=None)
+    prior_weight: float = eqx.field(static=True, default=0.0)
 
-    def at(self, free: Free, windows: Windows) -> System:
-        """Assemble over all windows, a few at a time."""
-        flat, unravel = ravel_pytree(free)
-        parts = [
-            _assemble(
-                self.coordinates,
-                unravel,
-                flat,
-                jax.tree.map(lambda x, f=first: x[f : f + GROUP], windows),
-                self.scale,
-                self.knee,
-            )
-            for first in range(0, windows.start.shape[0], GROUP)
-        ]
-        return functools.reduce(_add, parts)
+    def loss(
+        self, free: Free, offset: Float[Array, "segments 2 ..."], segments: Segments
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """What is minimised, and of it the mean loss of the residuals."""
+        count = jnp.maximum(jnp.sum(segments.seen), 1)
+        mean = jnp.sum(pseudo_huber(self.relative(free, offset, segments), self.knee)) / count
+        variance = jax.lax.stop_gradient(2.0 * mean)
+        prior = self.weight(variance) * self.coordinates.penalty(free)
+        starts = 0.5 * variance * jnp.sum(jnp.square(offset)) / count
+        return mean + prior + starts, mean
 
-    def step(self, free: Free, damping: Array, windows: Windows, prior_weight: float):
-        """A damped Gauss-Newton step: new free values, new damping, and the loss before.
+    def weight(self, variance: Array) -> Array:
+        """Of the parameters' prior in a loss per residual, for relative residuals of a variance."""
+        return jnp.minimum(self.prior_weight, variance / DEPENDENT)
 
-        The prior counts `prior_weight` per residual, as in the loss. Refused steps return the old
-        free values and ten times the damping.
+    def relative(self, free: Free, offset: Array, segments: Segments) -> Array:
+        """Residuals over the scale."""
+        model = self.coordinates.build(free)
+        begun = segments.moved(offset)
+        return residuals(model, predict(model, begun), segments) / self.scale
+
+    def products(
+        self, free: Free, offset: Array, segments: Segments, parameters: bool = True
+    ) -> Float[np.ndarray, "segments blocks columns columns"]:
+        """Products of the weighted columns of the Jacobian and the residual, by tenth of a segment.
+
+        Columns: the free values in the order of `ravel_pytree` (not without `parameters`), the
+        errors of a segment's own start, the residual. A few segments at a time.
         """
-        system = self.at(free, windows)
+        parts = []
+        for first in range(0, segments.count, GROUP):
+            own = jax.tree.map(lambda x, f=first: x[f : f + GROUP], (offset, segments))
+            parts.append(np.asarray(_products(self, free, own, parameters)))
+        return np.concatenate(parts)
+
+    def step(
+        self, free: Free, offset: Array, damping: Array, segments: Segments
+    ) -> tuple[Free, Array, Array, Array]:
+        """A damped Gauss-Newton step: parameters, starts, damping, and the mean loss before.
+
+        Refused steps return what was given and ten times the damping.
+        """
         flat, unravel = ravel_pytree(free)
-        count = np.asarray(system.count, np.float64)
-        weight = prior_weight * count
-        matrix = np.asarray(system.matrix, np.float64) + weight * np.eye(flat.size)
-        gradient = np.asarray(system.gradient, np.float64) + weight * np.asarray(flat)
+        before, mean = _value(self, free, offset, segments)
+        count = float(jnp.sum(segments.seen))
+        variance = 2.0 * float(mean)
+        products = self.products(free, offset, segments).sum(axis=1, dtype=np.float64)
+        own = np.asarray(offset, np.float64).reshape(len(products), -1)
+        reduced = _eliminated(products, flat.size, variance, own)
+        weight = float(self.weight(jnp.asarray(variance))) * count
+        matrix = reduced.matrix + weight * np.eye(flat.size)
+        gradient = reduced.gradient + weight * np.asarray(flat)
         diagonal = np.diag(np.diag(matrix) + 1e-12)
         change = np.linalg.solve(matrix + float(damping) * diagonal, -gradient)
         proposal = self.coordinates.project(unravel(flat + jnp.asarray(change, flat.dtype)))
-        before = self._loss(free, windows, prior_weight)
-        after = self._loss(proposal, windows, prior_weight)
+        moved = own + reduced.start - reduced.slope @ change
+        starts = jnp.asarray(moved.reshape(offset.shape), offset.dtype)
+        after, _ = _value(self, proposal, starts, segments)
         if np.isfinite(after) and after < before:
-            return proposal, jnp.maximum(damping / 3.0, 1e-7), before
-        return free, jnp.minimum(damping * 10.0, 1e7), before
-
-    def _loss(self, free: Free, windows: Windows, prior_weight: float) -> Array:
-        mean = _loss(self.coordinates, free, windows, self.scale, self.knee)
-        return mean + prior_weight * self.coordinates.penalty(free)
-
-
-def pseudo_huber(relative: Array, knee: float) -> Array:
-    """Quadratic (1/2 r^2) for small residuals, linear beyond the knee."""
-    return knee * (jnp.sqrt(jnp.square(relative) + knee**2) - knee)
-
-
-def mean_loss(
-    coordinates: FreeParameters, free: Free, windows: Windows, scale: float, knee: float | None
-) -> Float[Array, ""]:
-    """Mean over what was seen of half the squared relative residual, pseudo-Huber with a knee."""
-    relative = residuals(coordinates.build(free), windows) / scale
-    each = 0.5 * jnp.square(relative) if knee is None else pseudo_huber(relative, knee)
-    return jnp.sum(each) / jnp.maximum(jnp.sum(windows.seen), 1)
-
-
-_loss = eqx.filter_jit(mean_loss)
+            return proposal, starts, jnp.maximum(damping / 3.0, 1e-7), mean
+        return free, offset, jnp.minimum(damping * 10.0, 1e7), mean
 
 
 @eqx.filter_jit
-def _assemble(coordinates, unravel, flat: Array, windows: Windows, scale, knee) -> System:
-    def relative(flat: Array) -> Array:
-        return residuals(coordinates.build(unravel(flat)), windows) / scale
+def _products(
+    objective: Objective, free: Free, starting: tuple[Array, Segments], parameters: bool
+) -> Array:
+    offset, segments = starting
+    flat, unravel = ravel_pytree(free)
+    unknowns, starts = flat.size, offset[0].size
 
-    residual = relative(flat)
-    _, push = jax.linearize(relative, flat)
-    columns = jax.vmap(push)(jnp.eye(flat.size, dtype=flat.dtype))
-    weight = jnp.ones_like(residual)
-    if knee is not None:
-        weight = knee / jnp.sqrt(jnp.square(residual) + knee**2)
-    weight = jnp.where(windows.seen, weight, 0.0)
-    count, time = residual.shape[:2]
-    weighted = (columns * weight).reshape(flat.size, -1)
-    pieces = jnp.pad(
-        columns * (weight * residual),
-        [(0, 0), (0, 0), (0, -time % BLOCKS)] + [(0, 0)] * (residual.ndim - 2),
-    ).reshape(flat.size, count * BLOCKS, -1)
-    return System(
-        matrix=weighted @ columns.reshape(flat.size, -1).T,
-        gradient=weighted @ residual.reshape(-1),
-        scores=pieces.sum(-1).T,
-        squares=jnp.sum(jnp.where(windows.seen, jnp.square(residual), 0.0)),
-        count=jnp.sum(windows.seen).astype(flat.dtype),
+    def relative(flat: Array, offset: Array) -> Array:
+        return objective.relative(unravel(flat), offset, segments)
+
+    residual, push = jax.linearize(relative, flat, offset)
+
+    def along(direction: Array) -> Array:
+        moved = jnp.broadcast_to(direction[unknowns:], (segments.count, starts))
+        return push(direction[:unknowns], moved.reshape(offset.shape))
+
+    directions = jnp.eye(unknowns + starts, dtype=flat.dtype)
+    columns = jax.vmap(along)(directions[0 if parameters else unknowns :])
+    columns = jnp.concatenate([columns, residual[None]])
+    weight = segments.seen.astype(flat.dtype)
+    if objective.knee is not None:
+        weight *= objective.knee / jnp.sqrt(jnp.square(residual) + objective.knee**2)
+    columns *= jnp.sqrt(weight)
+    time = -residual.shape[1] % BLOCKS
+    padded = jnp.pad(columns, [(0, 0), (0, 0), (0, time)] + [(0, 0)] * (columns.ndim - 3))
+    blocks = padded.reshape(len(columns), segments.count, BLOCKS, -1)
+    return jnp.einsum("isbt,jsbt->sbij", blocks, blocks)
+
+
+@eqx.filter_jit
+def _value(objective: Objective, free: Free, offset: Array, segments: Segments):
+    return objective.loss(free, offset, segments)
+
+
+@dataclasses.dataclass(frozen=True)
+class Reduced:
+    """Normal equations from which the segments' starts were eliminated, by segment where it says.
+
+    At a change x of the parameters the best change of a start is `start` - `slope` x.
+    """
+
+    matrix: Float[np.ndarray, "free free"]
+    gradient: Float[np.ndarray, " free"]
+    start: Float[np.ndarray, "segments starts"]
+    slope: Float[np.ndarray, "segments starts free"]
+
+
+def _eliminated(
+    products: Float[np.ndarray, "segments columns columns"],
+    free: int,
+    variance: float,
+    offset: Float[np.ndarray, "segments starts"],
+) -> Reduced:
+    """By Schur's complement; the starts' prior has the precision `variance` of the residuals."""
+    own = products[:, free:-1, free:-1] + variance * np.eye(offset.shape[1])
+    slope = np.linalg.solve(own, products[:, free:-1, :free])
+    pull = products[:, free:-1, -1] + variance * offset
+    start = -np.linalg.solve(own, pull[..., None])[..., 0]
+    across = products[:, :free, free:-1]
+    return Reduced(
+        matrix=(products[:, :free, :free] - across @ slope).sum(axis=0),
+        gradient=(products[:, :free, -1] + np.einsum("sij,sj->si", across, start)).sum(axis=0),
+        start=start,
+        slope=slope,
     )
 
 
-def _add(one: System, other: System) -> System:
-    return System(
-        one.matrix + other.matrix,
-        one.gradient + other.gradient,
-        jnp.concatenate([one.scores, other.scores]),
-        one.squares + other.squares,
-        one.count + other.count,
-    )
+def pseudo_huber(relative: Array, knee: float | None) -> Array:
+    """Quadratic (1/2 r^2) for small residuals, linear beyond the knee; None: quadratic always."""
+    if knee is None:
+        return 0.5 * jnp.square(relative)
+    return knee * (jnp.sqrt(jnp.square(relative) + knee**2) - knee)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,25 +206,43 @@ class Intervals:
 def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Intervals:
     """Gauss-Newton intervals of a fit, in the sandwich form that forgives correlated residuals.
 
-    With A = J^T J / s^2 + 1 (the prior's precision is one in whitened coordinates) and the scores
-    g_b = J^T r / s^2 over a tenth of a trial each, the covariance is A^-1 (sum g_b g_b^T + 1) A^-1
-    (Huber 1967; White 1982): residuals next to each other in time are not counted as independent
-    evidence. Never below the covariance A^-1 of independent noise.
+    With J the derivatives of the residuals by the parameters, the starts following as fits best,
+    A = J^T W J / s^2 + 1 (the prior's precision is one in whitened coordinates) and the scores
+    g_b = J^T W r / s^2 over a tenth of a trial each, the covariance is
+    A^-1 (sum g_b g_b^T + 1) A^-1 (Huber 1967; White 1982): residuals next to each other in time are
+    not counted as independent evidence. Never below the covariance A^-1 of independent noise. What
+    a descent that ended early has left to go, a Gauss-Newton step, widens them as an error of that
+    size.
     """
-    windows = WindowSource.of(aligned).whole()
-    system = NormalEquations(coordinates, 1.0).at(free, windows)
+    segments = SegmentSource.of(aligned, coordinates.reference).whole()
+    offset = jnp.zeros((segments.count, 2, *segments.pose.shape[1:]))
+    objective = Objective(coordinates, observation_scale(aligned, coordinates.reference), KNEE)
     flat, unravel = ravel_pytree(free)
-    noise = float(system.squares) / max(float(system.count) - flat.size, 1.0)
-    noise = max(noise, 1e-20)
-    identity = np.eye(flat.size)
-    information = np.asarray(system.matrix, np.float64) / noise
-    scores = np.asarray(system.scores, np.float64) / noise
-    precision = information + identity
-    inverse = np.linalg.inv(precision)
+    # The best starts first: about others the parameters' slope is a small difference of large sums.
+    alone = objective.products(free, offset, segments, False).sum(axis=1, dtype=np.float64)
+    freedom = int(np.sum(segments.seen)) - flat.size
+    nowhere = np.zeros((segments.count, offset[0].size))
+    own = _eliminated(alone, 0, _noise(alone, freedom), nowhere).start
+    offset = jnp.asarray(own.reshape(offset.shape), offset.dtype)
+    products = objective.products(free, offset, segments).astype(np.float64)
+    total = products.sum(axis=1)
+    noise = _noise(total[:, flat.size :, flat.size :], freedom)
+    reduced = _eliminated(total, flat.size, noise, own)
+    # From all columns to J, and to the residuals that are left at the best starts.
+    count, identity = segments.count, np.eye(flat.size)
+    itself, nothing = np.repeat(identity[None], count, axis=0), np.zeros((count, flat.size))
+    to_slope = np.concatenate([itself, -reduced.slope, nothing[:, None]], axis=1)
+    to_residual = np.concatenate([nothing, reduced.start, np.ones((count, 1))], axis=1)
+    scores = np.einsum("sif,sbij,sj->sbf", to_slope, products, to_residual) / noise
+    scores = scores.reshape(-1, flat.size)
+    information = reduced.matrix / noise
+    inverse = np.linalg.inv(information + identity)
     sandwich = inverse @ (scores.T @ scores + identity) @ inverse
     # Scores that a few blocks dominate can exceed what was believed before any data: no more than
     # the prior's variance, which is one.
-    variance = np.minimum(np.maximum(np.diag(sandwich), np.diag(inverse)), 1.0)
+    left = inverse @ (reduced.gradient / noise + np.asarray(flat))
+    spread = np.maximum(np.diag(sandwich), np.diag(inverse)) + np.square(left)
+    variance = np.minimum(spread, 1.0)
     deviation = unravel(jnp.asarray(np.sqrt(variance), flat.dtype))
     lower, upper, verdicts = {}, {}, {}
     for path, declaration in coordinates.declarations.items():
@@ -194,6 +257,23 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
         lower[path], upper[path] = low, high
         verdicts[path] = verdict(np.ravel(deviation[path]) > UNDECIDED)
     return Intervals(lower, upper, verdicts, _undecided(information, unravel))
+
+
+def _noise(products: Float[np.ndarray, "segments columns columns"], freedom: int) -> float:
+    """Variance of the residuals that are left at the best starts, which it weighs in turn.
+
+    Of products without parameters; `freedom` is how many residuals those leave.
+    """
+    values, vectors = np.linalg.eigh(products[:, :-1, :-1])
+    values = np.maximum(values, 0.0)
+    pulls = np.square(np.einsum("sij,si->sj", vectors, products[:, :-1, -1]))
+    squares, noise = products[:, -1, -1].sum(), products[:, -1, -1].sum() / max(freedom, 1)
+    for _ in range(100):
+        noise = max(float(noise), 1e-20)
+        explained = pulls * (values + 2.0 * noise) / np.square(values + noise)
+        left = max(freedom - np.sum(values / (values + noise)), 1.0)
+        noise = (squares - explained.sum()) / left
+    return max(float(noise), 1e-20)
 
 
 def _undecided(information: Float[np.ndarray, "free free"], unravel: Any) -> tuple[str, ...]:

@@ -20,15 +20,16 @@ from scipy.stats import t as student
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import (
     PredictionError,
-    Windows,
-    WindowSource,
+    motion,
     observation_scale,
+    predict,
     prediction_error,
     residuals,
 )
-from palpate.identification.gradient.descent import KNEE, check_shapes
-from palpate.identification.gradient.least_squares import pseudo_huber
-from palpate.models.model import Model, rollout
+from palpate.identification.data.segments import Segments, SegmentSource
+from palpate.identification.gradient.descent import check_shapes
+from palpate.identification.gradient.least_squares import KNEE, pseudo_huber
+from palpate.models.model import Model
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.numerics import devices
 from palpate.recordings import Aligned
@@ -128,14 +129,14 @@ def fit_residual(
     check_correctable(model, aligned)
     check_shapes(model, aligned)
     fitted, held_out = _split(aligned, settings)
-    source = WindowSource.of(_select(aligned, fitted))
+    source = SegmentSource.of(_select(aligned, fitted), model)
     judge = _select(aligned, held_out)
     physics = prediction_error(model, judge)
     network = _start(model, source, settings)
     found = _descend(model, network, source, judge, physics, settings, run)
     best = Residual(physics=model, network=found)
     corrected = prediction_error(best, judge)
-    size = float(_size(best, WindowSource.of(judge).whole()))
+    size = float(_size(best, SegmentSource.of(judge, model).whole()))
     kept, reason = _verdict(physics, corrected, size)
     return Correction(
         model=best if kept else model,
@@ -172,19 +173,19 @@ def _select(aligned: Aligned, trials: np.ndarray) -> Aligned:
     )
 
 
-def _start(model: Model, source: WindowSource, settings: ResidualSettings) -> SiteNetwork:
+def _start(model: Model, source: SegmentSource, settings: ResidualSettings) -> SiteNetwork:
     """A network that corrects nothing, scaled by how the physics moves the recorded trials."""
     physics = correctable(model)
-    windows = source.whole()
-    states = _motion(model, windows)
-    seen = np.asarray(windows.seen)
+    segments = source.whole()
+    states = eqx.filter_jit(motion)(model, segments)
+    seen = np.asarray(segments.seen)
     trial, time = np.nonzero(np.any(seen[:, 1:], axis=tuple(range(2, seen.ndim))))
     chosen = np.random.default_rng(settings.seed).permutation(len(trial))[:EXAMPLES]
     trial, time = trial[chosen], time[chosen]
     before = jax.tree.map(lambda leaf: leaf[trial, time], states)
     after = jax.tree.map(lambda leaf: leaf[trial, time + 1], states)
     change = physics.correction_between(before, after)
-    features = physics.residual_features(before, windows.action[trial, time + 1])
+    features = physics.residual_features(before, segments.action[trial, time + 1])
     bound = settings.share * jnp.sqrt(jnp.mean(jnp.square(change), axis=(0, 2)))
     return SiteNetwork.create(
         jax.random.key(settings.seed),
@@ -199,14 +200,14 @@ def _start(model: Model, source: WindowSource, settings: ResidualSettings) -> Si
 def _descend(
     model: Model,
     network: SiteNetwork,
-    source: WindowSource,
+    source: SegmentSource,
     judge: Aligned,
     physics: PredictionError,
     settings: ResidualSettings,
     run: Run | None,
 ) -> SiteNetwork:
     """The network that predicts the held-out trials best, of those that the descent looked at."""
-    scale = jnp.asarray(observation_scale(source.aligned), network.bound.dtype)
+    scale = jnp.asarray(observation_scale(source.aligned, model), network.bound.dtype)
     moments = _optimiser(settings).init(network)
     descent = Descent(network, moments, network, network, physics.mean_absolute)
     if run is not None:
@@ -217,13 +218,10 @@ def _descend(
         bar = progress(remaining, "fitting the correction", done=descent.iteration)
         for _ in bar:
             horizon = max(1, round(stages[descent.iteration] * source.longest))
-            windows = source.sample(
-                np.random.default_rng((settings.seed, descent.iteration)),
-                min(settings.windows, source.distinct(horizon)),
-                horizon,
-            )
+            rng = np.random.default_rng((settings.seed, descent.iteration))
+            segments = source.sample(rng, settings.windows, horizon)
             state = (descent.network, descent.optimiser, descent.average, model, scale)
-            *state, loss = _improved(devices.everywhere(state), windows, settings)
+            *state, loss = _improved(devices.everywhere(state), segments, settings)
             step = descent.iteration + 1
             looked = step % CHECK == 0 or step == len(stages)
             found = _look(model, state[-1], judge) if looked else None
@@ -257,7 +255,7 @@ def _weights_alone(network: SiteNetwork) -> SiteNetwork:
 @eqx.filter_jit
 def _improved(
     state: tuple[SiteNetwork, Any, SiteNetwork, Model, Array],
-    windows: Windows,
+    segments: Segments,
     settings: ResidualSettings,
 ) -> tuple[SiteNetwork, Any, SiteNetwork, Array]:
     """One iteration: network, the optimiser's moments, average, and the loss before.
@@ -266,16 +264,17 @@ def _improved(
     """
     network, moments, average, model, scale = state
 
-    def loss_and_gradient(shared: tuple[SiteNetwork, Model, Array], windows: Windows):
+    def loss_and_gradient(shared: tuple[SiteNetwork, Model, Array], segments: Segments):
         network, model, scale = shared
 
         def loss(network: SiteNetwork) -> Array:
-            relative = residuals(Residual(physics=model, network=network), windows) / scale
-            return jnp.sum(pseudo_huber(relative, KNEE)) / jnp.maximum(jnp.sum(windows.seen), 1)
+            corrected = Residual(physics=model, network=network)
+            relative = residuals(model, predict(corrected, segments), segments) / scale
+            return jnp.sum(pseudo_huber(relative, KNEE)) / jnp.maximum(jnp.sum(segments.seen), 1)
 
         return jax.value_and_grad(loss)(network)
 
-    loss, gradient = devices.data_parallel(loss_and_gradient)((network, model, scale), windows)
+    loss, gradient = devices.data_parallel(loss_and_gradient)((network, model, scale), segments)
     finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
     change, following = _optimiser(settings).update(gradient, moments, network)
     moved = optax.apply_updates(network, change)
@@ -336,17 +335,11 @@ def _verdict(physics: PredictionError, corrected: PredictionError, size: float) 
 
 
 @eqx.filter_jit
-def _motion(model: Model, windows: Windows) -> Any:
-    """The states after each action, open loop."""
-    return rollout(model, model.initial_state(windows.start), windows.action)
-
-
-@eqx.filter_jit
-def _size(model: Residual, windows: Windows) -> Array:
+def _size(model: Residual, segments: Segments) -> Array:
     """Root mean square of the correction over that of what the physics changes, open loop."""
-    states = _motion(model, windows)
+    states = motion(model, segments)
     before = jax.tree.map(lambda leaf: leaf[:, :-1].reshape(-1, *leaf.shape[2:]), states)
-    action = windows.action[:, 1:].reshape(-1, *windows.action.shape[2:])
+    action = segments.action[:, 1:].reshape(-1, *segments.action.shape[2:])
     after = model.physics.step(before, action)
     change = correctable(model.physics).correction_between(before, after)
     correction = model.correction(before, action)

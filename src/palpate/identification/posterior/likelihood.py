@@ -9,7 +9,7 @@ piece, plus
   An s and a w for each unit of each body;
 - what errors of the initial pose and rate become: linear in them, with the derivatives of a model
   nearby (`linearised`), and marginalised in closed form. The smoothed start has seen the piece's
-  own frames, so its deviation is taken `VAGUE` times as wide, and the piece decides.
+  own frames, so its deviation is widened (`Segments.moved`), and the piece decides.
 
 The scales s and w are inferred beside the parameters. The covariance of the discrepancy has the
 same eigenvectors whatever its scale, so that all but the rollout is elementwise.
@@ -23,15 +23,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
+from palpate.identification.data.prediction import predict, residuals
 from palpate.identification.data.segments import Segments
 from palpate.identification.posterior.discrepancy import eigenvectors
 from palpate.identification.samplers.target import Target
-from palpate.models.model import Model, rollout
+from palpate.models.model import Model
 from palpate.numerics.devices import compiled_at_once
 from palpate.numerics.small_systems import cholesky, solve_lower
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
 
-VAGUE = 3.0  # by which the start's deviation is widened in the likelihood
 NOISE_SPREAD = 0.7  # standard deviation of the logarithm of s about what the sensor seems to have
 GROWTH_RATIO, GROWTH_SPREAD = 3.0, 1.5  # median of w over that of s (after 1 s), and its spread
 
@@ -318,23 +318,11 @@ def _from_starts(
     """As `from_start`, by models with these values, whose first axis is a batch."""
     batch = next(iter(values.values())).shape[0]
 
-    def tiled(array: Array) -> Array:
-        return jnp.tile(array, (batch, *(1,) * (array.ndim - 1)))
-
     # A copy for each piece: derivatives by what all pieces share take minutes to compile.
     copies = {path: jnp.repeat(value, segments.count, axis=0) for path, value in values.items()}
-    model = with_values(model, copies)
-    before = segments.pose - model.control_period * segments.rate
-    state = model.initial_state(tiled(jnp.stack([before, segments.pose], axis=1)))
-    observed = model.observe(rollout(model, state, tiled(segments.action)))
+    tiled = jax.tree.map(lambda x: jnp.tile(x, (batch, *(1,) * (x.ndim - 1))), segments)
+    observed = predict(with_values(model, copies), tiled)
     return observed.reshape(batch, segments.count, *observed.shape[1:])
-
-
-def residuals(
-    model: Model, predicted: Float[Array, "segments time ..."], segments: Segments
-) -> Float[Array, "segments time ..."]:
-    """Prediction minus observation, angles wrapped, zero where nothing was seen."""
-    return jnp.where(segments.seen, model.difference(predicted, segments.target), 0.0)
 
 
 def parameter_names(coordinates: FreeParameters) -> tuple[str, ...]:
@@ -361,19 +349,10 @@ def _legal_values(target: MotionPosterior, position: Array) -> dict[str, Array]:
 def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     """Derivatives of rotated residuals by the start's errors in vague standard deviations."""
     segments, model = target.segments, target.model(position)
-    shape = segments.pose.shape[1:]
 
     def moved(error: Array) -> Array:
-        pose, rate = (part.reshape(shape) * VAGUE for part in jnp.split(error, 2))
-        start = eqx.tree_at(
-            lambda s: (s.pose, s.rate),
-            segments,
-            (
-                segments.pose + pose * segments.pose_deviation,
-                segments.rate + rate * segments.rate_deviation,
-            ),
-        )
-        return residuals(model, from_start(model, start), segments)
+        begun = segments.moved(error.reshape(2, *segments.pose.shape[1:]))
+        return residuals(model, from_start(model, begun), segments)
 
     size = 2 * segments.pose[0].size
     slope = jax.jacfwd(moved)(jnp.zeros(size, position.dtype))

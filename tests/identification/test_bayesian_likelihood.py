@@ -9,16 +9,15 @@ from scipy.stats import multivariate_normal
 
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
-from palpate.identification.data.segments import Segments, cut, known_start, noise_scale
+from palpate.identification.data.prediction import residuals
+from palpate.identification.data.segments import VAGUE, Segments, cut, known_start, noise_scale
 from palpate.identification.posterior.discrepancy import MEMORY, discrepancy_covariance
 from palpate.identification.posterior.likelihood import (
-    VAGUE,
     from_start,
     inferred_scales,
     initial_position,
     known_scales,
     motion_posterior,
-    residuals,
 )
 from palpate.identification.posterior.predictive import Predicted, predict, score
 from palpate.models.model import rollout

@@ -154,6 +154,18 @@ def test_a_rope_whose_ends_meet_has_finite_derivatives():
     assert np.all(np.isfinite(jax.grad(moved)(closed)))
 
 
+def test_it_subtracts_observations_and_names_units_as_the_physics_does():
+    class Wrapped(CorrectablePendulum):
+        observation_units = ("rad",)
+
+        def difference(self, predicted, observed):
+            return jnp.sin(predicted - observed)
+
+    corrected = Residual(Wrapped(1.0, 0.2), network(MODELS["pendulum"]))
+    assert corrected.observation_units == ("rad",)
+    assert float(corrected.difference(jnp.ones(1), jnp.zeros(1))[0]) == pytest.approx(np.sin(1.0))
+
+
 def test_its_parameters_are_those_of_the_physics_and_stay_legal():
     corrected = Residual(rope(), network(rope()))
     declared = parameters_of(corrected)

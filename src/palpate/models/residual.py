@@ -194,6 +194,15 @@ class Residual(Model):
         """That of the physics."""
         return self.physics.observation_shape
 
+    @property
+    def observation_units(self) -> tuple[str, ...]:
+        """Those of the physics."""
+        return self.physics.observation_units
+
+    def difference(self, predicted: Array, observed: Array) -> Array:
+        """See `Model.difference`."""
+        return self.physics.difference(predicted, observed)
+
     def correction(self, state: Any, action: Array) -> Float[Array, "*batch sites axes"]:
         """What the network adds to the velocities of this state."""
         return self.network(correctable(self.physics).residual_features(state, action))

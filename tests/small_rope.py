@@ -3,7 +3,8 @@
 import numpy as np
 
 from palpate.networks import Channel
-from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
+from palpate.trials.controller import Controller
+from palpate.worlds.rope.rope import RopeConfiguration, RopeObservation, RopeWorld
 
 STILL = np.zeros(3)
 SMALL = {"bodies": 10, "markers": 11}  # ten bodies instead of forty: a twentieth of the time
@@ -14,3 +15,18 @@ FREE = {"joint_damping": 0.0, "air_density": 0.0, "air_viscosity": 0.0}
 
 def rope(**constants) -> RopeWorld:
     return RopeWorld(RopeConfiguration(**{**SMALL, **QUIET, **constants}))
+
+
+def seen(markers: np.ndarray, gripper_position: np.ndarray, time: float = 0.0) -> RopeObservation:
+    """What several ropes (worlds, markers, 3), (worlds, 3) show side by side; grippers at rest."""
+    return RopeObservation(time, markers, gripper_position, np.zeros_like(gripper_position))
+
+
+def commands(controller: Controller, observations, goal=None) -> list[np.ndarray]:
+    """What a controller decides as it sees one observation after the other, from rest on."""
+    carry = controller.initial_carry(np.zeros_like(observations[0].gripper_position))
+    decided = []
+    for observation in observations:
+        carry, command = controller(carry, observation, goal, None)
+        decided.append(command)
+    return decided

@@ -16,7 +16,7 @@ from palpate.report.evidence import read_evidence
 from palpate.runs import Run
 from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
-from palpate.trials.rope.trials import Trial
+from palpate.trials.rope.trials import StabilizationTrial
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import SMALL, VELOCITY
 
@@ -44,7 +44,7 @@ def small(monkeypatch):
 
 
 def test_the_start_is_that_of_the_true_rope():
-    trial = Trial(BASE, "shaken", 3)
+    trial = StabilizationTrial(BASE, "shaken", 3)
     state = start_state(trial, 6)
     world = RopeWorld(BASE)
     world.reset(3, start="shaken")
@@ -68,7 +68,7 @@ def test_a_replay_without_knots_is_the_controller_again(small, tmp_path, monkeyp
         return found
 
     monkeypatch.setattr(rope_bound, "search", search)
-    trials = [Trial(BASE, start, 1) for start in ("straight", "shaken")]
+    trials = [StabilizationTrial(BASE, start, 1) for start in ("straight", "shaken")]
     with Run.open(tmp_path, {}) as run:
         done = rope_bound.bounded(small, untrained(), trials, 80, 0, run)
     replayed = done["replayed_energy"][:, WARM]

@@ -17,10 +17,10 @@ from palpate.networks import CommandPolicy
 from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
 from palpate.tasks.rope import RopeStabilization
+from palpate.trials.controller import HeldStill
 from palpate.trials.rope import evaluation as rope_evaluation
-from palpate.trials.rope.baselines import HeldStill
 from palpate.worlds.rope.rope import RopeConfiguration
-from small_rope import SMALL, VELOCITY
+from small_rope import SMALL, VELOCITY, commands, seen
 
 TINY = Work(rope_dagger.QUICK, Training(iterations=1, starts=20), 1, 2, 2, {"everything": 1})
 MODEL = Rope.from_rest_lengths(np.full(5, 0.2), 0.1, drive="velocity", substeps=4)
@@ -120,16 +120,14 @@ def test_who_is_no_follower_takes_over_as_well():
     class Counting(HeldStill):
         asked = 0
 
-        def command(self, seen):
+        def __call__(self, *arguments):
             self.asked += 1
-            return super().command(seen)
+            return super().__call__(*arguments)
 
     controller = Counting()
     episodes = TakeOver(controller, np.full((1, 3, 3), 0.1))
-    seen = rope_dagger.Seen(np.zeros((1, 6, 3)), np.zeros((1, 3)))
-    episodes.begin(seen)
-    commands = [episodes.command(seen) for _ in range(5)]
-    assert [float(command.max()) for command in commands] == [0.1, 0.1, 0.1, 0.0, 0.0]
+    decided = commands(episodes, [seen(np.zeros((1, 6, 3)), np.zeros((1, 3)))] * 5)
+    assert [float(command.max()) for command in decided] == [0.1, 0.1, 0.1, 0.0, 0.0]
     assert controller.asked == 2
 
 

@@ -11,7 +11,9 @@ from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.parameters import parameters_of
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.trials import LearnedController, Trial, run_trials
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import StabilizationTrial
+from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import RopeConfiguration
 
 TASK = RopeStabilization(duration=0.2)
@@ -87,6 +89,6 @@ def test_an_actor_does_as_a_controller_what_it_does_in_the_environment(
         command = following
     single, _ = wild(command[0], features[0])
     np.testing.assert_allclose(single, wild(command, features)[0][0], atol=1e-6)
-    trials = [Trial(RopeConfiguration(bodies=9, markers=10), "straight", 0)]
+    trials = [StabilizationTrial(RopeConfiguration(bodies=9, markers=10), "straight", 0)]
     done = run_trials(trials, LearnedController(wild, TASK), 10)
     assert done.gripper_speed[0, -1] == pytest.approx(1.0, abs=0.2)

@@ -11,7 +11,9 @@ from palpate.experiments.rope.nominal import BASE, shipped_policy
 from palpate.models.rope import Rope
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope.evaluation import summarise
-from palpate.trials.rope.trials import Episodes, LearnedController, Trial, run_trials
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.trials.trial import run_trials
 
 TASK = RopeStabilization()
 MODEL = Rope.uniform(BASE.length, BASE.mass, 11, driven=(0,), drive="velocity", substeps=4)
@@ -55,7 +57,7 @@ def test_after_a_push_one_percent_is_of_what_it_gave():
     energy[0, 60:110] = 2e-3  # less than 1 % of the start, not of what the push gave
     energy[0, 40] = 0.05
     episodes = Episodes(energy, np.zeros_like(energy), np.empty((0,)), {})
-    trial = [Trial(BASE, "straight", 0)]
+    trial = [StabilizationTrial(BASE, "straight", 0)]
     settled = summarise(trial, study._after_push(row, episodes))
     assert settled.time == pytest.approx(0.7)
     assert summarise(trial, episodes).time == pytest.approx(0.6)  # without a push
@@ -65,7 +67,7 @@ def test_a_rope_seen_ten_times_a_second_and_late_comes_to_rest():
     """With the policy as it is used otherwise it does not, in the same trials."""
     policy, _ = shipped_policy()
     rope = dataclasses.replace(ROWS["10 Hz"].base, length=0.8)
-    trials = [Trial(rope, start, 5) for start in ("straight", "half_circle")]
+    trials = [StabilizationTrial(rope, start, 5) for start in ("straight", "half_circle")]
     observed = ObservedController(policy, TASK, MODEL, rope.observation_noise)
     left = {
         name: (episodes.energy[:, -1] / episodes.energy[:, 0]).max()

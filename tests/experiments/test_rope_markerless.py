@@ -12,7 +12,7 @@ from palpate.models.rope import Rope, RopeState
 from palpate.runs.run import RESULT
 from palpate.trials.rope import filming as rope_filming
 from palpate.trials.rope.filming import film
-from palpate.trials.rope.trials import Trial
+from palpate.trials.rope.trials import StabilizationTrial
 from palpate.worlds.camera import Sensor
 from palpate.worlds.rope.rope import RopeConfiguration
 
@@ -20,7 +20,7 @@ MODEL = Rope.uniform(nodes=11, substeps=4, bend_stiffness=2e-3, bend_damping=5e-
 
 
 def test_a_trial_is_kept_beside_what_it_is_compared_with():
-    trial = Trial(RopeConfiguration(), "straight", 3)
+    trial = StabilizationTrial(RopeConfiguration(), "straight", 3)
     kept = film(
         trial, model=MODEL, policy=None, steps=8, background="plain",
         sensor=Sensor(sub_frames=2), shaken=False,
@@ -45,7 +45,7 @@ def test_a_simulation_that_diverges_leaves_nan(monkeypatch):
 
     monkeypatch.setattr(rope_filming.FilmedRope, "step", diverge)
     kept = film(
-        Trial(RopeConfiguration(), "straight", 3), model=MODEL, policy=None, steps=2,
+        StabilizationTrial(RopeConfiguration(), "straight", 3), model=MODEL, policy=None, steps=2,
         background="plain", sensor=Sensor(sub_frames=1), shaken=False,
     )  # fmt: skip
     assert np.isfinite(kept.energy).tolist() == [True, False, False]

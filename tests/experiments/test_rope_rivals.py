@@ -19,11 +19,16 @@ from palpate.networks import CommandPolicy
 from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
 from palpate.tasks.rope.tracking import hanging_rope
+from palpate.trials.controller import HeldStill
 from palpate.trials.rope import evaluation as rope_evaluation
-from palpate.trials.rope.baselines import HeldStill
-from palpate.trials.rope.followers import as_of_model
-from palpate.trials.rope.planners import PlannedStabiliser, energy_and_speed, stabilising_planner
-from palpate.trials.rope.trials import Trial, run_trials
+from palpate.trials.rope.planners import (
+    PlannedStabiliser,
+    as_of_model,
+    energy_and_speed,
+    stabilising_planner,
+)
+from palpate.trials.rope.trials import StabilizationTrial
+from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL, VELOCITY
 
@@ -78,7 +83,7 @@ def test_the_loss_counts_energy_and_speed() -> None:
 @pytest.mark.parametrize(("method", "size"), [("gradient", 1), ("mppi", 96)])
 def test_planners_calm_a_rope_that_is_not_quite_the_models(method, size) -> None:
     configuration = RopeConfiguration(**SMALL, length=1.05)
-    trials, steps = [Trial(configuration, "straight", 0)], 60
+    trials, steps = [StabilizationTrial(configuration, "straight", 0)], 60
     planned = PlannedStabiliser(stabilising_planner(method, small_model(), size), 0)
     energy = run_trials(trials, planned, steps).energy
     still = run_trials(trials, HeldStill(), steps).energy
@@ -189,6 +194,6 @@ def test_a_part_of_the_episodes_keeps_its_failures() -> None:
     whole = rope_evaluation.Episodes(
         energy, -energy, np.zeros((1, 2, 11, 3)), {2: "lost", 3: "too"}
     )
-    part = rope_rivals._part(whole, [0, 2])
+    part = rope_evaluation.part_of(whole, [0, 2])
     np.testing.assert_array_equal(part.energy, energy[[0, 2]])
     assert part.failures == {1: "lost"}

@@ -93,7 +93,7 @@ def test_finished_stages_are_not_done_again(calls, tmp_path, monkeypatch):
     first = rope_stabilization.reproduce(tmp_path, quick=True)
     assert len(calls) == 2
     monkeypatch.setattr(nominal, "record_rope", None)
-    monkeypatch.setattr(rope_evaluation, "run_trials", None)
+    monkeypatch.setattr("palpate.trials.trial.run_trials", None)
     second = rope_stabilization.reproduce(tmp_path, quick=True)
     assert len(calls) == 2
     assert second.figures == first.figures

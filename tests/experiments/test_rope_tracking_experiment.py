@@ -21,19 +21,20 @@ from palpate.runs.storage import write_json
 from palpate.tasks.rope import RopeTracking
 from palpate.tasks.rope.paths import CURVES
 from palpate.tasks.rope.tracking import PREVIEW
-from palpate.trials.rope import tracking as rope_tracking_trials
-from palpate.trials.rope.followers import (
-    LearnedFollower,
-    OpenLoop,
-    PlannedFollower,
-    RopeObserver,
-    blind_followers,
-    planner,
+from palpate.trials import trial as trial_module
+from palpate.trials.rope.learned import LearnedController, RopeObserver
+from palpate.trials.rope.planners import PlannedFollower, following_planner
+from palpate.trials.rope.tracking import (
+    Followed,
+    PathTrial,
+    blind_controllers,
+    path_trials,
+    summarise,
+    table,
 )
-from palpate.trials.rope.tracking import Followed, follow, path_trials, summarise, table
-from palpate.trials.rope.trials import Seen
+from palpate.trials.trial import evaluate_trials
 from palpate.worlds.rope.rope import RopeConfiguration
-from small_rope import SMALL, VELOCITY
+from small_rope import SMALL, VELOCITY, commands, seen
 
 BASE = RopeConfiguration(**SMALL)
 FEATURES = 30 + 3 * len(PREVIEW)  # of six nodes
@@ -64,14 +65,14 @@ def test_trials_are_drawn_by_their_seed_and_begin_at_the_tip() -> None:
     trials = path_trials(BASE, 2, 5)
     assert [trial.name for trial in trials] == [name for name in CURVES for _ in range(2)]
     for trial in trials:
-        tip = [0.0, 0.0, 1.5 - trial.trial.configuration.length]
+        tip = [0.0, 0.0, 1.5 - trial.configuration.length]
         np.testing.assert_allclose(trial.path[0], tip, atol=1e-9)
         assert 400 <= trial.steps <= 600
         assert len(trial.path) == trial.steps + 1 + 80
     again, other = path_trials(BASE, 2, 5), path_trials(BASE, 2, 6)
     np.testing.assert_array_equal(again[3].path, trials[3].path)
     assert other[3].steps != trials[3].steps
-    assert trials[0].trial.configuration == trials[2].trial.configuration  # the same ropes
+    assert trials[0].configuration == trials[2].configuration  # the same ropes
 
 
 def test_a_file_is_a_path_too(tmp_path) -> None:
@@ -84,7 +85,7 @@ def test_a_file_is_a_path_too(tmp_path) -> None:
 
 def test_grippers_without_eyes_do_what_was_laid_down() -> None:
     trials = brief(path_trials(BASE, 1, 0, ["egg"]), 120)
-    followed = follow(blind_followers(BASE), trials)
+    followed = evaluate_trials(blind_controllers(BASE), trials)
     mean = {name: summarise(trials, whole).mean for name, whole in followed.items()}
     assert mean["as a chain"] < mean["as the path"] < mean["held still"]
     assert mean["as a chain"] < 3.0
@@ -93,25 +94,19 @@ def test_grippers_without_eyes_do_what_was_laid_down() -> None:
 
 def test_a_planner_follows_better_than_not_looking() -> None:
     trials = brief(path_trials(BASE, 1, 0, ["egg"]), 120)
-    plans = planner("mppi", small_model(), 48)
-    made = []
-
-    def make(paths):
-        made.append(PlannedFollower(plans, paths, 0))
-        return made[-1]
-
-    followers = {"planned": make} | blind_followers(BASE)
-    followed = follow(followers, trials)
+    planned = PlannedFollower(following_planner("mppi", small_model(), 48), 0)
+    followers = {"planned": planned} | blind_controllers(BASE)
+    followed = evaluate_trials(followers, trials)
     assert summarise(trials, followed["planned"]).mean < 4.0
     assert summarise(trials, followed["held still"]).mean > 5.0
-    assert len(made[0].spent) == 120
+    assert len(planned.spent) == 120
 
 
 def test_the_learned_follower_sees_what_it_was_trained_on() -> None:
     """The features of a rope that hangs still, at the start and some periods later."""
     trial = path_trials(BASE, 1, 0, ["sine"])[0]
-    down = np.linspace(0, 1, 11)[:, None] * [0.0, 0.0, -trial.trial.configuration.length]
-    seen = Seen((down + np.array([0, 0, 1.5]))[None], np.array([[0.0, 0.0, 1.5]]))
+    down = np.linspace(0, 1, 11)[:, None] * [0.0, 0.0, -trial.configuration.length]
+    hanging = seen((down + np.array([0, 0, 1.5]))[None], np.array([[0.0, 0.0, 1.5]]))
     noted = []
 
     class Noting(RopeTracking):
@@ -120,10 +115,8 @@ def test_the_learned_follower_sees_what_it_was_trained_on() -> None:
             jax.debug.callback(lambda values: noted.append(np.asarray(values)[0]), features)
             return features
 
-    follower = LearnedFollower(untrained(), Noting(), trial.path[None])
-    follower.begin(seen)
-    for _ in range(4):
-        command = follower.command(seen)
+    follower = LearnedController(untrained(), Noting())
+    for command in commands(follower, [hanging] * 4, PathTrial.goals([trial])):
         assert command.shape == (1, 3)
     jax.effects_barrier()
     np.testing.assert_allclose(noted[0][:15].reshape(5, 3), down[2::2], atol=1e-6)
@@ -138,14 +131,14 @@ def test_the_observer_finds_velocities_and_takes_the_encoders_word() -> None:
     observer = RopeObserver(5, 0.01)
     markers = np.zeros((2, 11, 3))
     for step in range(8):
-        seen = Seen(markers + 0.005 * step, np.full((2, 3), 7.0))
+        shown = seen(markers + 0.005 * step, np.full((2, 3), 7.0))
         if step == 0:
-            observer.begin(seen)
-        state = observer.state(seen)
+            window = observer.start(shown)
+        window, state = observer.update(window, shown)
     np.testing.assert_allclose(state.velocity[:, 1:], 0.5, rtol=1e-3)
     np.testing.assert_array_equal(state.position[:, 0], 7.0)
     with pytest.raises(PalpateError, match="needs a multiple of 5 markers"):
-        observer.begin(Seen(np.zeros((2, 12, 3)), np.zeros((2, 3))))
+        observer.start(seen(np.zeros((2, 12, 3)), np.zeros((2, 3))))
 
 
 def test_errors_are_distances_in_time_and_divergence_counts() -> None:
@@ -165,11 +158,11 @@ def test_errors_are_distances_in_time_and_divergence_counts() -> None:
 
 def test_trials_that_were_cut_off_go_on(tmp_path, monkeypatch) -> None:
     trials = brief(path_trials(BASE, 2, 0, ["egg", "sine"]), 10)
-    monkeypatch.setattr(rope_tracking_trials, "SIDE_BY_SIDE", 2)
-    followers = {"still": blind_followers(BASE)["held still"]}
-    whole = follow(followers, trials)["still"]
+    monkeypatch.setattr(PathTrial, "side_by_side", 2)
+    followers = {"still": blind_controllers(BASE)["held still"]}
+    whole = evaluate_trials(followers, trials)["still"]
     calls = []
-    run_trials = rope_tracking_trials.run_trials
+    run_trials = trial_module.run_trials
 
     def cut_off(*arguments):
         calls.append(1)
@@ -177,11 +170,11 @@ def test_trials_that_were_cut_off_go_on(tmp_path, monkeypatch) -> None:
             raise KeyboardInterrupt
         return run_trials(*arguments)
 
-    monkeypatch.setattr(rope_tracking_trials, "run_trials", cut_off)
+    monkeypatch.setattr(trial_module, "run_trials", cut_off)
     with Run.open(tmp_path, {}) as run, pytest.raises(KeyboardInterrupt):
-        follow(followers, trials, run)
+        evaluate_trials(followers, trials, run)
     with Run.open(tmp_path, {}) as run:
-        resumed = follow(followers, trials, run)["still"]
+        resumed = evaluate_trials(followers, trials, run)["still"]
     assert len(calls) == 3
     np.testing.assert_array_equal(resumed.tips, whole.tips)
     np.testing.assert_array_equal(resumed.markers, whole.markers)
@@ -228,9 +221,8 @@ def test_stages_hand_on_what_they_made(tmp_path, monkeypatch) -> None:
 
 
 def test_open_loop_velocities_lead_where_they_should() -> None:
-    gripper = np.cumsum(np.random.default_rng(0).normal(0, 1e-3, (2, 6, 3)), axis=1)
-    follower = OpenLoop(gripper, 0.01)
-    seen = Seen(np.zeros((2, 11, 3)), np.zeros((2, 3)))
-    follower.begin(seen)
-    moved = sum(0.01 * follower.command(seen) for _ in range(5))
-    np.testing.assert_allclose(moved, gripper[:, -1] - gripper[:, 0], atol=1e-12)
+    (trial,) = path_trials(BASE, 1, 0, ["egg"])
+    shown = seen(np.zeros((1, 11, 3)), np.zeros((1, 3)))
+    follower = blind_controllers(BASE)["as the path"]
+    moved = sum(0.01 * one for one in commands(follower, [shown] * 50, PathTrial.goals([trial])))
+    np.testing.assert_allclose(moved[0], trial.path[50] - trial.path[0], atol=1e-12)

@@ -8,7 +8,8 @@ from palpate.deployment.deployment import deployment_of
 from palpate.errors import PalpateError
 from palpate.families.rope.deployment import RopeDecision
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.trials import LearnedController, Seen
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.trial import stacked
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import SMALL
 
@@ -23,11 +24,11 @@ def test_a_rope_world_gets_the_commands_of_the_trials(nodes):
     ours.see({"gripper": np.ones(3), "markers": np.ones((11, 3))})
     ours.forget()  # what was seen before a fault is not part of a velocity
     seen, command = world.reset(0, start="straight"), np.zeros(3, np.float32)
-    theirs.begin(Seen(seen.markers[None], seen.gripper_position[None]))
+    carry = theirs.initial_carry(np.zeros((1, 3), np.float32))
     for _ in range(100):
         ours.see({"gripper": seen.gripper_position, "markers": seen.markers})
         command = ours.decide(command)
-        expected = theirs.command(Seen(seen.markers[None], seen.gripper_position[None]))[0]
+        carry, (expected,) = theirs(carry, stacked([seen]), None, None)
         np.testing.assert_allclose(command, expected, atol=1e-5)
         seen = world.step(command)
     assert np.linalg.norm(command) > 0.1

@@ -6,18 +6,19 @@ import pytest
 from palpate.errors import PalpateError
 from palpate.report.evidence import read_evidence
 from palpate.runs import Run
+from palpate.trials import trial as trial_module
 from palpate.trials.rope import evaluation as rope_evaluation
 from palpate.trials.rope.evaluation import (
     by_pose,
     evaluate,
     evaluation_trials,
     figures,
-    one_of_each_pose,
     summarise,
     table,
     write_trial_evidence,
 )
-from palpate.trials.rope.trials import Episodes, Seen, Trial, run_trials
+from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.trials.trial import first_of_each_group, run_trials
 from palpate.worlds.rope.rope import START_POSES, RopeConfiguration
 from small_rope import SMALL
 
@@ -32,16 +33,16 @@ class Slide:
     def __init__(self, speed: float):
         self.speed = speed
 
-    def begin(self, seen: Seen) -> None:
-        pass
+    def initial_carry(self, command):
+        return np.full_like(command, [self.speed, 0.0, 0.0])
 
-    def command(self, seen: Seen) -> np.ndarray:
-        return np.tile([self.speed, 0.0, 0.0], (len(seen.markers), 1))
+    def __call__(self, carry, observation, goal, key):
+        return carry, carry
 
 
-def four_trials() -> list[Trial]:
+def four_trials() -> list[StabilizationTrial]:
     return [
-        Trial(BASE, start, seed)
+        StabilizationTrial(BASE, start, seed)
         for start, seed in (("straight", 1), ("straight", 2), ("helix", 3), ("helix", 4))
     ]
 
@@ -53,7 +54,7 @@ CONTROLLERS = {"slow": Slide(0.1), "fast": Slide(0.4)}
 def short(monkeypatch):
     """Trials of a few steps, three at a time."""
     monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.03)
-    monkeypatch.setattr(rope_evaluation, "SIDE_BY_SIDE", 3)
+    monkeypatch.setattr(StabilizationTrial, "side_by_side", 3)
 
 
 def test_every_rope_starts_in_every_pose():
@@ -71,7 +72,7 @@ def test_chunks_give_what_one_batch_gives(short):
     evaluated = evaluate(CONTROLLERS, trials)
     steps = evaluated["slow"].energy.shape[1] - 1
     assert steps == np.ceil(0.03 * trials[0].period / BASE.control_period)
-    whole = run_trials(trials, CONTROLLERS["fast"], steps, kept=one_of_each_pose(trials))
+    whole = run_trials(trials, CONTROLLERS["fast"], steps, drawn=first_of_each_group(trials))
     np.testing.assert_array_equal(evaluated["fast"].energy, whole.energy)
     np.testing.assert_array_equal(evaluated["fast"].gripper_speed, whole.gripper_speed)
     np.testing.assert_array_equal(evaluated["fast"].markers, whole.markers)
@@ -92,7 +93,7 @@ def test_what_was_cut_off_goes_on_to_the_same_result(short, tmp_path, monkeypatc
             episodes.failures[0] = "diverged"
         return episodes
 
-    monkeypatch.setattr(rope_evaluation, "run_trials", dies_at_the_fourth)
+    monkeypatch.setattr(trial_module, "run_trials", dies_at_the_fourth)
     with Run.open(tmp_path, {}) as run, pytest.raises(RuntimeError):
         evaluate(CONTROLLERS, trials, run)
     with Run.open(tmp_path, {}) as run:
@@ -115,11 +116,11 @@ def test_what_was_cut_off_goes_on_to_the_same_result(short, tmp_path, monkeypatc
 def test_ropes_that_cannot_go_side_by_side_are_refused():
     other = RopeConfiguration(**SMALL, control_period=0.02)
     with pytest.raises(PalpateError, match="one control_period"):
-        evaluate(CONTROLLERS, [*four_trials(), Trial(other, "straight", 0)])
+        evaluate(CONTROLLERS, [*four_trials(), StabilizationTrial(other, "straight", 0)])
 
 
 def test_a_controller_for_another_period_is_refused_before_the_first_is_tried(monkeypatch):
-    monkeypatch.setattr(rope_evaluation, "run_trials", None)
+    monkeypatch.setattr(trial_module, "run_trials", None)
     slow = Slide(0.1)
     slow.period = 0.02
     with pytest.raises(PalpateError, match=r"decides every 0.02 s"):
@@ -166,7 +167,7 @@ def test_a_rope_that_rises_again_is_counted():
 
 def test_periods_are_each_ropes_own():
     short = RopeConfiguration(**SMALL, length=0.25)
-    trials = [Trial(BASE, "straight", 0), Trial(short, "straight", 0)]
+    trials = [StabilizationTrial(BASE, "straight", 0), StabilizationTrial(short, "straight", 0)]
     summary = summarise(trials, episodes_of(50, 50))
     assert trials[1].period == pytest.approx(0.5 * trials[0].period)
     assert summary.periods == pytest.approx(1.5 * 0.5 / trials[0].period)

@@ -11,20 +11,15 @@ from palpate.errors import PalpateError
 from palpate.models.rope import RopeState
 from palpate.networks import Channel, CommandPolicy
 from palpate.tasks.rope import RopeStabilization
+from palpate.trials.controller import HeldStill, check_period
 from palpate.trials.rope import trials as rope_trials
-from palpate.trials.rope.baselines import TUNED, Gains, HeldStill, SwingDamper
-from palpate.trials.rope.trials import (
-    LearnedController,
-    Seen,
-    Trial,
-    check_period,
-    run_trials,
-    settling_time,
-    wilson_interval,
-)
+from palpate.trials.rope.baselines import TUNED, Gains, SwingDamper
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import StabilizationTrial, settling_time
+from palpate.trials.trial import run_trials, wilson_interval
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from palpate.worlds.world import DivergedError
-from small_rope import QUIET, SMALL
+from small_rope import QUIET, SMALL, commands, seen
 
 SMALL_ROPE = RopeConfiguration(**SMALL, **QUIET)
 PERIOD = SMALL_ROPE.control_period
@@ -37,13 +32,14 @@ class Constant:
 
     def __init__(self, velocities: np.ndarray):
         self.velocities = velocities
+        self.seen = []
 
-    def begin(self, seen: Seen) -> None:
-        self.seen = [seen]
+    def initial_carry(self, command):
+        return command
 
-    def command(self, seen: Seen) -> np.ndarray:
-        self.seen.append(seen)
-        return self.velocities
+    def __call__(self, carry, observation, goal, key):
+        self.seen.append(observation)
+        return carry, self.velocities
 
 
 def energy(*spells: tuple[int, float]) -> np.ndarray:
@@ -114,17 +110,21 @@ def test_wilson_interval_of_the_textbook():
 
 
 def test_period_is_that_of_a_hanging_chain():
-    trial = Trial(dataclasses.replace(SMALL_ROPE, length=0.7), "straight", 0)
+    trial = StabilizationTrial(dataclasses.replace(SMALL_ROPE, length=0.7), "straight", 0)
     assert trial.period == pytest.approx(2 * np.pi / (2.4048 / 2 * np.sqrt(9.81 / 0.7)), rel=1e-4)
 
 
 def test_trials_side_by_side_are_those_run_alone():
     long = dataclasses.replace(SMALL_ROPE, length=1.1)
-    trials = [Trial(SMALL_ROPE, "straight", 3), Trial(long, "helix", 4), Trial(long, "straight", 5)]
+    trials = [
+        StabilizationTrial(SMALL_ROPE, "straight", 3),
+        StabilizationTrial(long, "helix", 4),
+        StabilizationTrial(long, "straight", 5),
+    ]
     velocities = np.array([[0.1, 0, 0], [0, -0.2, 0], [0, 0, 0.0]])
-    together = run_trials(trials, Constant(velocities), 12, kept=[2, 1])
+    together = run_trials(trials, Constant(velocities), 12, drawn=[2, 1])
     for index, trial in enumerate(trials):
-        alone = run_trials([trial], Constant(velocities[index : index + 1]), 12, kept=[0])
+        alone = run_trials([trial], Constant(velocities[index : index + 1]), 12, drawn=[0])
         np.testing.assert_array_equal(together.energy[index], alone.energy[0])
         np.testing.assert_array_equal(together.gripper_speed[index], alone.gripper_speed[0])
         if index > 0:
@@ -137,14 +137,17 @@ def test_trials_side_by_side_are_those_run_alone():
 
 
 def test_controller_sees_what_the_worlds_show():
-    trials = [Trial(SMALL_ROPE, "straight", 3), Trial(SMALL_ROPE, "hanging", 4)]
+    trials = [
+        StabilizationTrial(SMALL_ROPE, "straight", 3),
+        StabilizationTrial(SMALL_ROPE, "hanging", 4),
+    ]
     controller = Constant(np.array([[0.1, 0, 0], [0, 0, 0.0]]))
-    episodes = run_trials(trials, controller, 5, kept=[0, 1])
-    assert len(controller.seen) == 6  # begin, then one before each step
+    episodes = run_trials(trials, controller, 5, drawn=[0, 1])
+    assert len(controller.seen) == 5  # one before each step
     frames = np.moveaxis(episodes.markers, 1, 0)[:-1]
-    for seen, frame in zip(controller.seen[1:], frames, strict=True):
-        np.testing.assert_allclose(seen.markers, frame, atol=1e-6)
-        np.testing.assert_allclose(seen.gripper_position, frame[:, 0], atol=1e-6)
+    for observation, frame in zip(controller.seen, frames, strict=True):
+        np.testing.assert_allclose(observation.markers, frame, atol=1e-6)
+        np.testing.assert_allclose(observation.gripper_position, frame[:, 0], atol=1e-6)
 
 
 def test_a_diverged_world_is_a_failure_and_stops_no_other(monkeypatch):
@@ -155,7 +158,10 @@ def test_a_diverged_world_is_a_failure_and_stops_no_other(monkeypatch):
             return super().step(action)
 
     monkeypatch.setattr(rope_trials, "RopeWorld", Fragile)
-    trials = [Trial(SMALL_ROPE, "straight", 0), Trial(SMALL_ROPE, "straight", 1)]
+    trials = [
+        StabilizationTrial(SMALL_ROPE, "straight", 0),
+        StabilizationTrial(SMALL_ROPE, "straight", 1),
+    ]
     episodes = run_trials(trials, Constant(np.array([[0.1, 0, 0], [0, 0, 0.0]])), 10)
     assert episodes.failures == {0: "the rope's simulation diverged"}
     assert np.isfinite(episodes.energy[1]).all()
@@ -174,21 +180,27 @@ class FragileWhenShaken(RopeWorld):
 
 def test_a_world_that_diverges_before_its_start_is_a_failure_and_stops_no_other(monkeypatch):
     monkeypatch.setattr(rope_trials, "RopeWorld", FragileWhenShaken)
-    trials = [Trial(SMALL_ROPE, "shaken", 0), Trial(SMALL_ROPE, "straight", 1)]
+    trials = [
+        StabilizationTrial(SMALL_ROPE, "shaken", 0),
+        StabilizationTrial(SMALL_ROPE, "straight", 1),
+    ]
     controller = Constant(np.array([[0.1, 0, 0], [0, 0, 0.0]]))
-    episodes = run_trials(trials, controller, 10, kept=[0, 1])
+    episodes = run_trials(trials, controller, 10, drawn=[0, 1])
     assert episodes.failures == {0: "the rope's simulation diverged"}
     assert np.isnan(episodes.energy[0]).all()
     assert np.isnan(episodes.gripper_speed[0]).all()
     assert np.isnan(episodes.markers[0]).all()
     assert np.isfinite(episodes.energy[1]).all()
-    assert all(np.isfinite(seen.markers).all() for seen in controller.seen)
+    assert all(np.isfinite(one.markers).all() for one in controller.seen)
     alone = run_trials(trials[1:], Constant(np.zeros((1, 3))), 10)
     np.testing.assert_array_equal(episodes.energy[1], alone.energy[0])
 
 
 def test_a_start_that_does_not_exist_is_no_failed_trial():
-    trials = [Trial(SMALL_ROPE, "helyx", 0), Trial(SMALL_ROPE, "straight", 1)]
+    trials = [
+        StabilizationTrial(SMALL_ROPE, "helyx", 0),
+        StabilizationTrial(SMALL_ROPE, "straight", 1),
+    ]
     with pytest.raises(PalpateError, match="unknown start 'helyx'"):
         run_trials(trials, HeldStill(), 3)
 
@@ -215,40 +227,26 @@ def test_policy_is_fed_the_features_it_was_trained_on(nodes):
     rate = np.linspace([0.1, 0, 0], [0.4, -0.3, 0.2], 11)  # constant: any estimator finds it
     frames = start + time[:, None, None] * rate
     frames = np.stack([frames, frames[:, :, [1, 0, 2]]], axis=1)  # two worlds
-    for index, markers in enumerate(frames):
-        noisy = markers.copy()
-        noisy[:, 0] += 0.1  # of the gripper the encoder is believed, not the marker
-        seen = Seen(noisy, markers[:, 0])
-        if index == 0:
-            controller.begin(seen)
-        command = controller.command(seen)
-    carry = jnp.asarray(np.zeros((2, 1, 3)), jnp.float32)
+    noisy = frames.copy()
+    noisy[:, :, 0] += 0.1  # of the gripper the encoder is believed, not the marker
+    shown = [seen(one, markers[:, 0]) for one, markers in zip(noisy, frames, strict=True)]
+    before, command = commands(controller, shown)[-2:]
     every = 10 // (nodes - 1)
     state = RopeState(
         jnp.asarray(frames[-1][:, ::every], jnp.float32),
         jnp.asarray(np.stack([rate, rate[:, [1, 0, 2]]])[:, ::every], jnp.float32),
     )
     # The command in force is what the controller carried into its last decision.
-    carry = controller_carry_before_last(policy, task, frames, every)
+    carry = jnp.asarray(before[:, None], jnp.float32)
     _, expected = policy(carry, task.features(state, None), None, None)
     np.testing.assert_allclose(command, expected[:, 0], atol=1e-5)
     assert np.abs(command).max() > 1e-3
 
 
-def controller_carry_before_last(policy, task, frames, every):
-    controller = LearnedController(policy, task)
-    for index, markers in enumerate(frames[:-1]):
-        seen = Seen(markers, markers[:, 0])
-        if index == 0:
-            controller.begin(seen)
-        command = controller.command(seen)
-    return jnp.asarray(command[:, None], jnp.float32)
-
-
 def test_policy_for_other_nodes_is_refused():
     controller = LearnedController(policy_for(8), RopeStabilization())
     with pytest.raises(PalpateError, match="8 nodes needs a multiple of 7 markers and one more"):
-        controller.begin(Seen(np.zeros((1, 11, 3)), np.zeros((1, 3))))
+        commands(controller, [seen(np.zeros((1, 11, 3)), np.zeros((1, 3)))])
 
 
 def test_a_controller_for_another_control_period_is_refused_before_anything_moves(monkeypatch):
@@ -259,22 +257,29 @@ def test_a_controller_for_another_control_period_is_refused_before_anything_move
         SwingDamper(SMALL_ROPE),
     ):
         with pytest.raises(PalpateError, match=r"decides every 0.01 s .* period of 0.02 s"):
-            run_trials([Trial(SMALL_ROPE, "straight", 0), Trial(slow, "helix", 0)], controller, 3)
+            run_trials(
+                [
+                    StabilizationTrial(SMALL_ROPE, "straight", 0),
+                    StabilizationTrial(slow, "helix", 0),
+                ],
+                controller,
+                3,
+            )
 
 
 def test_a_period_read_off_a_clock_is_the_same(monkeypatch):
     near = dataclasses.replace(policy_for(11), period=1.0003 * PERIOD)
-    check_period(LearnedController(near, RopeStabilization()), [Trial(SMALL_ROPE, "helix", 0)])
-    check_period(HeldStill(), [Trial(SMALL_ROPE, "helix", 0)])
+    check_period(LearnedController(near, RopeStabilization()), PERIOD)
+    check_period(HeldStill(), PERIOD)
 
 
 def test_held_still_keeps_the_gripper():
-    episodes = run_trials([Trial(SMALL_ROPE, "straight", 0)], HeldStill(), 20)
+    episodes = run_trials([StabilizationTrial(SMALL_ROPE, "straight", 0)], HeldStill(), 20)
     assert episodes.gripper_speed.max() < 0.02
 
 
 def test_swing_damper_damps_and_brings_the_gripper_to_rest():
-    trials = [Trial(SMALL_ROPE, "straight", 0)]
+    trials = [StabilizationTrial(SMALL_ROPE, "straight", 0)]
     steps = 300
     still = run_trials(trials, HeldStill(), steps)
     damper = SwingDamper(SMALL_ROPE, TUNED)
@@ -290,7 +295,8 @@ def test_swing_damper_commands_what_its_formula_says():
     markers = np.zeros((1, 11, 3))
     markers[:, 1:6] = [0.4, -0.2, -0.5]
     markers[:, 6:] = 9.0  # the far half is not watched
-    damper.begin(Seen(markers, np.zeros((1, 3))))
-    command = damper.command(Seen(markers, np.array([[0.1, 0.0, 0.0]])))
+    gripper = np.zeros((1, 3)), np.array([[0.1, 0.0, 0.0]])
+    carry = damper.start(np.zeros((1, 3)), seen(markers, gripper[0]), None)
+    _, command = damper(carry, seen(markers, gripper[1]), None, None)
     # offset (0.3, -0.2), away (0.1, 0): x'' = 0.5 * 0.3 - 0.25 * 0.1, y'' = -0.5 * 0.2
     np.testing.assert_allclose(command, [[0.125 * PERIOD, -0.1 * PERIOD, 0.0]], atol=1e-9)

@@ -27,7 +27,7 @@ from palpate.runs.progress import interruptible, progress
 from palpate.runs.result import two_standard_errors
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json
-from palpate.trials.rope.trials import wilson_interval
+from palpate.trials.trial import wilson_interval
 
 
 @dataclasses.dataclass

@@ -33,7 +33,8 @@ from palpate.trials.rope.evaluation import (
     table,
     write_trial_evidence,
 )
-from palpate.trials.rope.trials import Episodes, LearnedController, Trial
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import Episodes, StabilizationTrial
 
 NAME = "rope-ablation"
 FIGURE = "ablation.png"
@@ -102,7 +103,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
 
 
-def draw(path: Path, trials: list[Trial], evaluated: dict[str, Episodes]) -> None:
+def draw(path: Path, trials: list[StabilizationTrial], evaluated: dict[str, Episodes]) -> None:
     """A PNG: the energy with and without each part of the training, success rates and times.
 
     Energies are medians over all trials with the band in which nine in ten lie, on a log scale.

@@ -11,6 +11,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +36,11 @@ from palpate.runs import Figure, Result, Run
 from palpate.tasks.rope import RopeStabilization
 from palpate.tasks.rope.stabilization import STABILISED, STAY
 from palpate.tasks.task import Start
+from palpate.trials.controller import Controller, OpenLoop
 from palpate.trials.rope.evaluation import TRIAL_PERIODS
-from palpate.trials.rope.trials import LearnedController, Seen, Trial, run_trials, settling_time
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import StabilizationTrial, settling_time
+from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import START_POSES, RopeWorld
 
 NAME = "rope-bound"
@@ -76,37 +80,19 @@ _ALLOWED = STABILISED * np.array([restart.aim for restart in RESTARTS])
 REPLAYED = (0, 1, 3, 7)
 
 
-class Replay:
-    """Gripper velocities given beforehand, (worlds, steps, 3) in m/s."""
-
-    def __init__(self, commands: np.ndarray, period: float):
-        self._commands, self.period = commands, period
-
-    def begin(self, seen: Seen) -> None:
-        """See `Controller.begin`."""
-        self._step = 0
-
-    def command(self, seen: Seen) -> np.ndarray:
-        """See `Controller.command`."""
-        self._step += 1
-        return self._commands[:, self._step - 1]
-
-
 class Noted:
     """A controller whose commands are kept, (worlds, 3) of each step."""
 
-    def __init__(self, controller: LearnedController):
+    def __init__(self, controller: Controller):
         self._controller, self.period = controller, controller.period
+        self.initial_carry = controller.initial_carry
         self.commands: list[np.ndarray] = []
 
-    def begin(self, seen: Seen) -> None:
-        """See `Controller.begin`."""
-        self._controller.begin(seen)
-
-    def command(self, seen: Seen) -> np.ndarray:
-        """See `Controller.command`."""
-        self.commands.append(self._controller.command(seen))
-        return self.commands[-1]
+    def __call__(self, carry: Any, observation: Any, goal: Any, key: Any) -> tuple[Any, np.ndarray]:
+        """See `Controller`."""
+        carry, command = self._controller(carry, observation, goal, key)
+        self.commands.append(command)
+        return carry, command
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
@@ -122,7 +108,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     policy, about = shipped_policy()
     model = identified_rope(experiment, size)
     first = experiment.uses(SEEDS)
-    trials = [Trial(BASE, start, first) for start in START_POSES]
+    trials = [StabilizationTrial(BASE, start, first) for start in START_POSES]
     rollouts = ROLLOUTS // 20 if quick else ROLLOUTS
     configuration = {"stage": "search", "seed": seed, "policy": about, "rollouts": rollouts}
     with experiment.stage("search", configuration) as stage:
@@ -152,7 +138,12 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
 
 def bounded(
-    model: Rope, policy: CommandPolicy, trials: list[Trial], rollouts: int, seed: int, run: Run
+    model: Rope,
+    policy: CommandPolicy,
+    trials: list[StabilizationTrial],
+    rollouts: int,
+    seed: int,
+    run: Run,
 ) -> dict[str, np.ndarray]:
     """What the controller and the sequences found do in MuJoCo, and the latter in the model.
 
@@ -210,7 +201,7 @@ def bounded(
     return done
 
 
-def start_state(trial: Trial, nodes: int) -> RopeState:
+def start_state(trial: StabilizationTrial, nodes: int) -> RopeState:
     """Where the true rope's nodes are, and how fast, when the trial begins."""
     world = RopeWorld(trial.configuration)
     world.reset(trial.seed, start=trial.start)
@@ -254,7 +245,7 @@ def _replay(
     found: list[Found],
     reference: np.ndarray,
     sequence: CommandSequence,
-    trial: Trial,
+    trial: StabilizationTrial,
     done: dict[str, np.ndarray],
     place: int,
 ) -> None:
@@ -269,7 +260,7 @@ def _replay(
         return
     restarts, replays, knots = (np.stack(column) for column in zip(*chosen, strict=True))
     commands = jax.jit(sequence.commands)(knots, reference[restarts])
-    replay = Replay(np.asarray(commands), sequence.period)
+    replay = OpenLoop(np.asarray(commands), sequence.period)
     episodes = run_trials([trial] * len(chosen), replay, sequence.steps)
     done["replayed_energy"][place, restarts, replays] = episodes.energy
     done["replayed_speed"][place, restarts, replays] = episodes.gripper_speed

@@ -43,25 +43,19 @@ from palpate.runs import Figure, Result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.baselines import TUNED, HeldStill, SwingDamper
+from palpate.trials.controller import Controller, FeedbackController, HeldStill
+from palpate.trials.rope.baselines import TUNED, SwingDamper
 from palpate.trials.rope.evaluation import (
-    SIDE_BY_SIDE,
     TRIAL_PERIODS,
     Summary,
     evaluation_trials,
     figures,
-    settling_times,
     summarise,
 )
-from palpate.trials.rope.trials import (
-    Controller,
-    Episodes,
-    LearnedController,
-    Seen,
-    Trial,
-    run_trials,
-)
-from palpate.worlds.rope.rope import RopeConfiguration, sample_configurations
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import Episodes, StabilizationTrial, settling_times
+from palpate.trials.trial import run_trials
+from palpate.worlds.rope.rope import RopeConfiguration, RopeObservation, sample_configurations
 
 NAME = "rope-dagger"
 WHIRL = 3.7  # rad/s of the circling gripper, in sqrt(g / L)
@@ -111,14 +105,16 @@ class Situation:
     `whirl`: its velocities (trials, steps before, 3) in m/s.
     """
 
-    trials: list[Trial]
+    trials: list[StabilizationTrial]
     whirl: np.ndarray
 
     @property
     def steps(self) -> int:
         """Control periods from the take-over on: four periods of the longest rope drawn."""
         longest = dataclasses.replace(BASE, length=1.1 * BASE.length)
-        return math.ceil(TRIAL_PERIODS * Trial(longest, "", 0).period / BASE.control_period)
+        return math.ceil(
+            TRIAL_PERIODS * StabilizationTrial(longest, "", 0).period / BASE.control_period
+        )
 
     def part(self, chosen: np.ndarray) -> "Situation":
         """Only the trials with these numbers."""
@@ -137,7 +133,7 @@ def whirled(ropes: int, seed: int) -> Situation:
     configurations = sample_configurations(BASE, ropes, seed)
     seeds = random.integers(2**31, size=ropes)
     trials = [
-        Trial(configuration, "hanging", int(own))
+        StabilizationTrial(configuration, "hanging", int(own))
         for configuration, own in zip(configurations, seeds, strict=True)
     ]
     return Situation(trials, np.stack([_whirl(rope, random) for rope in configurations]))
@@ -159,64 +155,71 @@ class Follower(LearnedController):
     While others move the gripper it estimates velocities and knows the command in force.
     """
 
-    def begin(self, seen: Seen) -> None:
-        """See `Controller.begin`."""
-        super().begin(seen)
+    def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
+        """See `FeedbackController.start`."""
         self._seen: list[np.ndarray] = []
         self._commands: list[np.ndarray] = []
+        return super().start(command, observation, goal)
 
-    def follow(self, seen: Seen, command: np.ndarray) -> None:
-        """Somebody else commands (worlds, 3) m/s for one control period."""
-        positions = self._positions(seen)
-        self._window, _ = jax.vmap(self._estimator.update)(self._window, positions)
-        self._carry = self._policy.initial_carry(jnp.asarray(command, jnp.float32)[:, None])
-        self._keep(positions, command)
+    def follow(self, carry: Any, observation: RopeObservation, command: np.ndarray) -> Any:
+        """The next carry while somebody else commands (worlds, 3) m/s for one control period."""
+        window, _, step = carry
+        window, _ = self.observer.update(window, observation)
+        self._keep(observation, command)
+        memory = self.policy.initial_carry(jnp.asarray(command, jnp.float32)[:, None])
+        return window, memory, step + 1
 
-    def command(self, seen: Seen) -> np.ndarray:
-        """See `Controller.command`."""
-        command = super().command(seen)
-        self._keep(self._positions(seen), command)
-        return command
+    def decide(
+        self, carry: Any, observation: RopeObservation, goal: None
+    ) -> tuple[Any, np.ndarray]:
+        """See `FeedbackController.decide`."""
+        carry, command = super().decide(carry, observation, goal)
+        self._keep(observation, command)
+        return carry, command
 
     def observed(self, after: int) -> Observed:
         """What was seen after so many control periods, velocities as the policy estimates them."""
         positions = np.stack(self._seen, axis=1)
         commands = np.stack(self._commands, axis=1)[:, :, None]
-        frames = self._estimator.frames
+        frames = self.observer.estimator.frames
         padded = np.pad(positions, ((0, 0), (frames - 1, 0), (0, 0), (0, 0)), mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, frames, axis=1)
-        velocities = windows @ self._estimator.weights
+        velocities = windows @ self.observer.estimator.weights
         before = commands[:, after - 1] if after else np.zeros_like(commands[:, 0])
         kept = positions[:, after:], velocities[:, after:], commands[:, after:], before
         position, velocity, actions, command = (jnp.asarray(part, jnp.float32) for part in kept)
         return Observed(RopeState(position, velocity), actions, command)
 
-    def _keep(self, positions: jax.Array, command: np.ndarray) -> None:
-        self._seen.append(np.asarray(positions))
+    def _keep(self, observation: RopeObservation, command: np.ndarray) -> None:
+        self._seen.append(self.observer.positions(observation))
         self._commands.append(np.asarray(command))
 
 
-class TakeOver:
+class TakeOver(FeedbackController):
     """First the gripper whirls, then the controller has it."""
 
     def __init__(self, controller: Controller, whirl: np.ndarray):
         self._controller, self._whirl = controller, whirl
         self.period = controller.period
 
-    def begin(self, seen: Seen) -> None:
-        """See `Controller.begin`."""
-        self._controller.begin(seen)
-        self._step = 0
-
-    def command(self, seen: Seen) -> np.ndarray:
-        """See `Controller.command`."""
-        self._step += 1
-        if self._step > self._whirl.shape[1]:
-            return self._controller.command(seen)
-        command = self._whirl[:, self._step - 1]
+    def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
+        """How many periods have passed, and what the controller carries."""
         if isinstance(self._controller, Follower):
-            self._controller.follow(seen, command)
-        return command
+            return 0, self._controller.start(command, observation, goal)
+        return 0, self._controller.initial_carry(command)
+
+    def decide(
+        self, carry: Any, observation: RopeObservation, goal: None
+    ) -> tuple[Any, np.ndarray]:
+        """See `FeedbackController.decide`."""
+        step, inner = carry
+        if step >= self._whirl.shape[1]:
+            inner, command = self._controller(inner, observation, goal, None)
+        else:
+            command = self._whirl[:, step]
+            if isinstance(self._controller, Follower):
+                inner = self._controller.follow(inner, observation, command)
+        return (step + 1, inner), command
 
 
 def tried(controller: Controller, situation: Situation) -> Episodes:
@@ -334,9 +337,12 @@ def _evaluated(
 ) -> dict[str, Summary]:
     """How each controller does in its situation, in a stage that saves after every few trials."""
     work = [
-        (name, np.arange(first, min(first + SIDE_BY_SIDE, len(situation.trials))))
+        (
+            name,
+            np.arange(first, min(first + StabilizationTrial.side_by_side, len(situation.trials))),
+        )
         for name, (_, situation) in tries.items()
-        for first in range(0, len(situation.trials), SIDE_BY_SIDE)
+        for first in range(0, len(situation.trials), StabilizationTrial.side_by_side)
     ]
     done = {
         name: np.full((2, len(situation.trials), situation.steps + 1), np.nan, np.float32)

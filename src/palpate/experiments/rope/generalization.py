@@ -42,8 +42,9 @@ from palpate.trials.rope.evaluation import (
     summarise,
     write_trial_evidence,
 )
-from palpate.trials.rope.trials import Episodes, LearnedController, Seen, Trial
-from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration, RopeObservation
 
 NAME = "rope-generalization"
 SUCCESS_BAR, TIME_BAR = 0.95, 1.3
@@ -105,29 +106,28 @@ class ObservedController(LearnedController):
 
         self._decide_alike = decide
 
-    def begin(self, seen: Seen) -> None:
-        """See `Controller.begin`."""
-        positions = self._positions(seen)
+    def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
+        """See `FeedbackController.start`."""
+        positions = jnp.asarray(self.observer.positions(observation))
         length = jnp.sum(jnp.linalg.norm(jnp.diff(positions, axis=1), axis=-1), axis=1)
-        self._size = length / jnp.sum(self._model.rest_length)
-        rest_length = self._model.rest_length * self._size[:, None]
+        size = length / jnp.sum(self._model.rest_length)
+        rest_length = self._model.rest_length * size[:, None]
         models = eqx.tree_at(lambda rope: rope.rest_length, self._model, rest_length).constrain()
-        self._observer = MarkerObserver(models, self._noise)
-        self._observer.begin(positions, seen.time)
-        self._command = None
-        self._carry = self._policy.initial_carry(jnp.zeros((len(positions), 1, 3)))
+        memory = self.policy.initial_carry(jnp.asarray(command, jnp.float32)[:, None])
+        return MarkerObserver(models, self._noise), size, None, memory
 
-    def command(self, seen: Seen) -> np.ndarray:
-        """See `Controller.command`."""
-        positions = self._positions(seen)
-        if self._command is None:
-            state = self._observer.begin(positions, seen.time)
+    def decide(
+        self, carry: Any, observation: RopeObservation, goal: None
+    ) -> tuple[Any, np.ndarray]:
+        """See `FeedbackController.decide`."""
+        observer, size, command, memory = carry
+        positions = jnp.asarray(self.observer.positions(observation))
+        if command is None:
+            state = observer.begin(positions, observation.time)
         else:
-            state = self._observer.step(self._command, positions, seen.time)
-        self._carry, self._command = self._decide_alike(
-            self._policy, self._carry, state, self._size
-        )
-        return np.asarray(self._command)[:, 0]
+            state = observer.step(command, positions, observation.time)
+        memory, command = self._decide_alike(self.policy, memory, state, size)
+        return (observer, size, command, memory), np.asarray(command)[:, 0]
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
@@ -177,7 +177,7 @@ def _changed(row: Row) -> dict[str, Any]:
     return changes | ({} if row.pushed is None else {"pushed_at_s": row.pushed})
 
 
-def _trials(row: Row, ropes: int, seed: int) -> list[Trial]:
+def _trials(row: Row, ropes: int, seed: int) -> list[StabilizationTrial]:
     """Sampled ropes from each start pose, each pushed from a side and at a place of its own."""
     trials = evaluation_trials(row.base, ropes, seed)
     if row.pushed is None:
@@ -198,7 +198,7 @@ def _evaluated(
     experiment: Experiment,
     name: str,
     row: Row,
-    trials: list[Trial],
+    trials: list[StabilizationTrial],
     shipped: tuple[CommandPolicy, dict[str, Any]],
     model: Rope,
 ) -> tuple[Summary, Summary]:

@@ -33,10 +33,12 @@ from palpate.report.evidence import write_evidence
 from palpate.runs import Figure, Result, Run
 from palpate.runs.result import two_standard_errors
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.baselines import HeldStill
+from palpate.trials.controller import HeldStill
 from palpate.trials.rope.evaluation import TRIAL_PERIODS, evaluation_trials, summarise
 from palpate.trials.rope.filming import Filming, film, frame_times
-from palpate.trials.rope.trials import Episodes, LearnedController, Trial, run_trials
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.trials.trial import run_trials
 from palpate.worlds.camera import Sensor
 from palpate.worlds.rope.filmed import TRIPOD, Background
 from palpate.worlds.rope.rope import START_POSES
@@ -131,7 +133,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
 
 
-def _trials(row: Row, counts: dict[str, int], seed: int) -> list[Trial]:
+def _trials(row: Row, counts: dict[str, int], seed: int) -> list[StabilizationTrial]:
     """Sampled ropes where there is control, else the nominal one; from each pose, or hanging."""
     poses = counts["poses"]
     if row.controlled:
@@ -139,18 +141,23 @@ def _trials(row: Row, counts: dict[str, int], seed: int) -> list[Trial]:
         return evaluation_trials(BASE, ropes, seed)[: poses * ropes]
     starts = ("hanging",) * poses if row.shaken else START_POSES[:poses]
     return [
-        Trial(BASE, start, seed + 100 * repeat + place)
+        StabilizationTrial(BASE, start, seed + 100 * repeat + place)
         for repeat in range(counts["swinging"])
         for place, start in enumerate(starts)
     ]
 
 
-def _steps(trials: list[Trial]) -> int:
+def _steps(trials: list[StabilizationTrial]) -> int:
     return math.ceil(TRIAL_PERIODS * max(trial.period for trial in trials) / BASE.control_period)
 
 
 def _filmed(
-    run: Run, name: str, row: Row, trials: list[Trial], model: Rope, policy: CommandPolicy
+    run: Run,
+    name: str,
+    row: Row,
+    trials: list[StabilizationTrial],
+    model: Rope,
+    policy: CommandPolicy,
 ) -> dict[str, np.ndarray]:
     """What happened in the trials of a row: arrays as in `Filming`, (trials, ...)."""
     steps = _steps(trials) if row.controlled else round(SWINGING / BASE.control_period)

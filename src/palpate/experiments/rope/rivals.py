@@ -41,24 +41,27 @@ from palpate.runs import Figure, Result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json, write_json
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.baselines import TUNED, HeldStill, SwingDamper
+from palpate.trials.controller import Controller, HeldStill
+from palpate.trials.rope.baselines import TUNED, SwingDamper
 from palpate.trials.rope.evaluation import (
     evaluate,
     evaluation_trials,
     figures,
-    one_of_each_pose,
+    part_of,
     summarise,
     table,
     write_trial_evidence,
 )
-from palpate.trials.rope.followers import decision_times
+from palpate.trials.rope.learned import LearnedController
 from palpate.trials.rope.planners import (
     TUNING,
     PlannedStabiliser,
     decision_about,
+    decision_times,
     stabilising_planner,
 )
-from palpate.trials.rope.trials import Controller, Episodes, LearnedController, Trial
+from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.trials.trial import first_of_each_group
 
 NAME = "rope-rivals"
 BUDGET = 0.01  # s, a decision of a planner in a hurry
@@ -105,8 +108,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     unhurried = _planned(model, more, "unhurried", seed)
     first = experiment.uses(EVALUATION_SEEDS)
     trials = evaluation_trials(BASE, size.ropes, first)
-    trials = [trials[index] for index in one_of_each_pose(trials)[:POSES]] if quick else trials
-    chosen = one_of_each_pose(trials)[: SLOW_POSES if quick else None]
+    trials = [trials[index] for index in first_of_each_group(trials)[:POSES]] if quick else trials
+    chosen = first_of_each_group(trials)[: SLOW_POSES if quick else None]
     some = [trials[index] for index in chosen]
     settings = {
         "quick": quick,
@@ -133,7 +136,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         free[SAC], free_about = _model_free(experiment, model, size, rounds, trials)
     unknown = [] if installed else [f"{SAC:28s} {NOT_RUN}"]
     print("\n".join([*table(trials, whole | free), *unknown, *table(some, slow)]))
-    same = {name: _part(whole[name], chosen) for name in (SHIPPED, *hurried)}
+    same = {name: part_of(whole[name], chosen) for name in (SHIPPED, *hurried)}
     return experiment.result(
         [
             *(row for name in whole for row in _rows(trials, whole[name], name)),
@@ -201,7 +204,11 @@ def _sizes_within(experiment: Experiment, model: Rope) -> dict[str, int]:
 
 
 def _model_free(
-    experiment: Experiment, model: Rope, size: Size, rounds: int, trials: Sequence[Trial]
+    experiment: Experiment,
+    model: Rope,
+    size: Size,
+    rounds: int,
+    trials: Sequence[StabilizationTrial],
 ) -> tuple[Episodes, dict[str, Any]]:
     """What SAC does after so many rounds of training, and how it was trained."""
     from palpate.experiments.rivals.soft_actor_critic import Sac, trained_actor
@@ -217,7 +224,9 @@ def _model_free(
     return evaluated[SAC], about
 
 
-def _model_free_rows(trials: Sequence[Trial], episodes: Episodes | None) -> list[Figure]:
+def _model_free_rows(
+    trials: Sequence[StabilizationTrial], episodes: Episodes | None
+) -> list[Figure]:
     if episodes is None:  # not run
         return [Figure(f"success_rate.{suffix(SAC)}", None, "", better="higher")]
     return _rows(trials, episodes, SAC)
@@ -255,7 +264,7 @@ def _evaluated(
     folder: str,
     configuration: dict[str, Any],
     controllers: Mapping[str, Controller],
-    trials: Sequence[Trial],
+    trials: Sequence[StabilizationTrial],
 ) -> tuple[dict[str, Episodes], dict[str, list[float]]]:
     """What each controller does in a stage, and how long planners take to decide, ms."""
     configuration = configuration | {"controllers": list(controllers)}
@@ -263,23 +272,10 @@ def _evaluated(
         evaluated = evaluate(controllers, trials, stage.run)
         if not stage.finished:
             write_trial_evidence(stage.run, trials, evaluated, tuple(controllers))
-            planned = {n: [c] for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
+            planned = {n: c for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
             stage.content = {"decision_ms": decision_times(planned)}
     return evaluated, read_json(stage.path / RESULT)["decision_ms"]
 
 
-def _part(episodes: Episodes, chosen: Sequence[int]) -> Episodes:
-    """Of some of the trials, in this order; without markers."""
-    failures = {
-        place: episodes.failures[trial]
-        for place, trial in enumerate(chosen)
-        if trial in episodes.failures
-    }
-    chosen = list(chosen)
-    return Episodes(
-        episodes.energy[chosen], episodes.gripper_speed[chosen], episodes.markers[:0], failures
-    )
-
-
-def _rows(trials: Sequence[Trial], episodes: Episodes, name: str) -> list[Figure]:
+def _rows(trials: Sequence[StabilizationTrial], episodes: Episodes, name: str) -> list[Figure]:
     return figures(summarise(trials, episodes), f".{suffix(name)}")

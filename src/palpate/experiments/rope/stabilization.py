@@ -27,7 +27,8 @@ from palpate.families.rope.recording import constants
 from palpate.networks import CommandPolicy
 from palpate.runs import Figure, Result
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.baselines import TUNED, HeldStill, SwingDamper
+from palpate.trials.controller import HeldStill
+from palpate.trials.rope.baselines import TUNED, SwingDamper
 from palpate.trials.rope.evaluation import (
     TRIAL_PERIODS,
     by_pose,
@@ -38,7 +39,8 @@ from palpate.trials.rope.evaluation import (
     table,
     write_trial_evidence,
 )
-from palpate.trials.rope.trials import Episodes, LearnedController, Trial
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.trials import Episodes, StabilizationTrial
 from palpate.worlds.rope.rope import START_POSES
 
 NAME = "rope-stabilization"
@@ -97,7 +99,10 @@ def reproduce(
 
 
 def _evaluated(
-    experiment: Experiment, policy: CommandPolicy, about: dict[str, Any], trials: list[Trial]
+    experiment: Experiment,
+    policy: CommandPolicy,
+    about: dict[str, Any],
+    trials: list[StabilizationTrial],
 ) -> dict[str, Episodes]:
     controllers = {
         CONTROLLED: LearnedController(policy, RopeStabilization()),
@@ -120,7 +125,7 @@ def _evaluated(
     return evaluated
 
 
-def _figures(trials: list[Trial], evaluated: dict[str, Episodes]) -> list[Figure]:
+def _figures(trials: list[StabilizationTrial], evaluated: dict[str, Episodes]) -> list[Figure]:
     summaries = {name: summarise(trials, episodes) for name, episodes in evaluated.items()}
     own = summaries[CONTROLLED]
     rivals = figures(summaries[DAMPER])
@@ -145,7 +150,7 @@ def _figures(trials: list[Trial], evaluated: dict[str, Episodes]) -> list[Figure
     return rows
 
 
-def _left_when_still(trials: list[Trial], episodes: Episodes) -> Figure:
+def _left_when_still(trials: list[StabilizationTrial], episodes: Episodes) -> Figure:
     """Of all ropes held still, the least share of its energy that one has after three periods."""
     shares = [
         energy[math.floor(3.0 * trial.period / trial.configuration.control_period)] / energy[0]

@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from palpate.experiments.experiment import Experiment, decision_figures, ratio, suffix
 from palpate.experiments.rope.nominal import (
@@ -35,28 +34,23 @@ from palpate.runs.storage import read_json, write_json
 from palpate.tasks.rope import RopeTracking
 from palpate.tasks.rope.paths import CURVES
 from palpate.tasks.rope.tracking import hanging_rope
-from palpate.trials.rope.followers import (
-    LearnedFollower,
-    PlannedFollower,
-    blind_followers,
-    decision_times,
-    planner,
-)
+from palpate.trials.controller import Controller
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.planners import PlannedFollower, decision_times, following_planner
 from palpate.trials.rope.tracking import (
     DURATIONS,
     SIZES,
     TILTS,
     Followed,
-    Follower,
     PathTrial,
-    by_path,
+    blind_controllers,
     figures,
-    follow,
     path_trials,
     summarise,
     table,
     write_path_evidence,
 )
+from palpate.trials.trial import evaluate_trials, groups
 
 NAME = "rope-tracking"
 ERROR_BAR, RATIO_BAR = 3.0, 1.0  # cm
@@ -95,18 +89,20 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     samples = _planner_samples(experiment, model)
     first = experiment.uses(EVALUATION_SEEDS)
     trials = path_trials(BASE, size.ropes, first)
-    some = [trials[i] for of in by_path(trials).values() for i in of[:SLOW_ROPES]]
+    some = [trials[i] for of in groups(trials).values() for i in of[:SLOW_ROPES]]
     work = {"seed": seed, "ropes": size.ropes, "policy": about, "samples": samples}
-    planners = _Planners(model, seed)
-    followers: dict[str, Follower] = {
-        TRAINED: lambda paths: LearnedFollower(policy, task, paths),
-        **blind_followers(BASE),
-        MPPI_10: planners.follower(MPPI_10, "mppi", samples["mppi"]),
-        CEM_10: planners.follower(CEM_10, "cem", samples["cem"]),
+    planned = {
+        MPPI_10: PlannedFollower(following_planner("mppi", model, samples["mppi"]), seed),
+        CEM_10: PlannedFollower(following_planner("cem", model, samples["cem"]), seed),
     }
-    unhurried = {MPPI_MORE: planners.follower(MPPI_MORE, "mppi", *UNHURRIED)}
-    followed, times = _followed(experiment, "evaluate", work, followers, trials, planners)
-    slow, more = _followed(experiment, "evaluate-unhurried", work, unhurried, some, planners)
+    controllers = {
+        TRAINED: LearnedController(policy, task),
+        **blind_controllers(BASE),
+        **planned,
+    }
+    unhurried = {MPPI_MORE: PlannedFollower(following_planner("mppi", model, *UNHURRIED), seed)}
+    followed, times = _followed(experiment, "evaluate", work, controllers, trials)
+    slow, more = _followed(experiment, "evaluate-unhurried", work, unhurried, some)
     print("\n".join([*table(trials, followed), *table(some, slow)]))
     return experiment.result(
         _figures(trials, followed, some, slow, times | more),
@@ -143,7 +139,9 @@ def _planner_samples(experiment: Experiment, model: Rope) -> dict[str, int]:
             for method in ("mppi", "cem"):
                 samples[method], _ = samples_within(
                     BUDGET,
-                    lambda count, method=method: _decision(planner(method, model, count), model),
+                    lambda count, method=method: _decision(
+                        following_planner(method, model, count), model
+                    ),
                 )
             write_json(file, samples)
             stage.content = {"samples": samples}
@@ -157,40 +155,21 @@ def _decision(planner: SamplingPlanner, model: Rope) -> Callable[[], Any]:
     return lambda: planner(plan, state, goals)
 
 
-@dataclasses.dataclass
-class _Planners:
-    """Planners through one model; those that were `made` say how long they took to decide."""
-
-    model: Rope
-    seed: int
-    made: dict[str, list[PlannedFollower]] = dataclasses.field(default_factory=dict)
-
-    def follower(self, name: str, method: str, count: int, iterations: int | None = None):
-        """What makes a follower of given paths."""
-        chosen = planner(method, self.model, count, iterations)
-
-        def make(paths: np.ndarray) -> PlannedFollower:
-            self.made.setdefault(name, []).append(PlannedFollower(chosen, paths, self.seed))
-            return self.made[name][-1]
-
-        return make
-
-
 def _followed(
     experiment: Experiment,
     folder: str,
     work: dict[str, Any],
-    followers: Mapping[str, Follower],
+    controllers: Mapping[str, Controller],
     trials: list[PathTrial],
-    planners: _Planners,
 ) -> tuple[dict[str, Followed], dict[str, list[float]]]:
-    """What all followers do in a stage, and how long planners took to decide, ms."""
+    """What all controllers do in a stage, and how long planners took to decide, ms."""
     configuration = work | {"stage": folder, "trials": len(trials)}
     with experiment.stage(folder, configuration) as stage:
-        followed = follow(followers, trials, stage.run)
+        followed = evaluate_trials(controllers, trials, stage.run)
         if not stage.finished:
-            write_path_evidence(stage.run, trials, followed, next(iter(followers)))
-            stage.content = {"decision_ms": decision_times(planners.made)}
+            write_path_evidence(stage.run, trials, followed, next(iter(controllers)))
+            planned = {n: c for n, c in controllers.items() if isinstance(c, PlannedFollower)}
+            stage.content = {"decision_ms": decision_times(planned)}
     return followed, read_json(stage.path / "result.json")["decision_ms"]
 
 
@@ -206,11 +185,11 @@ def _figures(
     rows = figures(own, bar=ERROR_BAR)
     rows[0] = dataclasses.replace(rows[0], rival=rival.mean)
     rows.append(Figure("ratio_to_mppi_10ms", ratio(own.mean, rival.mean), "", bar=RATIO_BAR))
-    same = [index for of in by_path(trials).values() for index in of[:SLOW_ROPES]]
+    same = [index for of in groups(trials).values() for index in of[:SLOW_ROPES]]
     here, more = summarise(trials, followed[TRAINED], same), summarise(some, slow[MPPI_MORE])
     rows.append(Figure("ratio_to_mppi_unhurried", ratio(here.mean, more.mean), ""))
     rows.append(Figure("ratio_to_chain", ratio(own.mean, summaries[CHAIN].mean), ""))
-    for path, chosen in by_path(trials).items():
+    for path, chosen in groups(trials).items():
         rows += figures(summarise(trials, followed[TRAINED], chosen), f".{path}")
     for name, summary in (summaries | {MPPI_MORE: more}).items():
         if name != TRAINED:

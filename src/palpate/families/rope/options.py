@@ -236,10 +236,11 @@ class EvaluateRopeStabilization(Evaluate):
         """See `rope_evaluation.evaluate`."""
         from palpate.families.rope.recording import constants
         from palpate.tasks.rope import RopeStabilization
+        from palpate.trials.controller import HeldStill
         from palpate.trials.rope import evaluation as rope_evaluation
-        from palpate.trials.rope.baselines import HeldStill, SwingDamper
+        from palpate.trials.rope.baselines import SwingDamper
+        from palpate.trials.rope.learned import LearnedController
         from palpate.trials.rope.rendering import render_trial
-        from palpate.trials.rope.trials import LearnedController
         from palpate.worlds.rope.configuration import RopeConfiguration
 
         base = RopeConfiguration()
@@ -324,17 +325,19 @@ class EvaluateRopeTracking(Evaluate):
         _check_simulated(policy, self.ropes)
 
     def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
-        """See `rope_tracking_trials.follow`."""
+        """See `palpate.trials.trial.evaluate_trials`."""
         from palpate.families.rope.recording import constants
         from palpate.tasks.rope import RopeTracking
         from palpate.trials.rope import tracking
-        from palpate.trials.rope.followers import LearnedFollower, blind_followers
+        from palpate.trials.rope.learned import LearnedController
+        from palpate.trials.trial import evaluate_trials
         from palpate.worlds.rope.configuration import RopeConfiguration
 
-        base, task = RopeConfiguration(), RopeTracking()
+        base = RopeConfiguration()
         trials = tracking.path_trials(base, self.ropes, self.seed, self.paths)
-        followers = {"controlled": lambda paths: LearnedFollower(policy, task, paths)}
-        followed = tracking.follow(followers | blind_followers(base), trials, run)
+        controllers = {"controlled": LearnedController(policy, RopeTracking())}
+        controllers |= tracking.blind_controllers(base)
+        followed = evaluate_trials(controllers, trials, run)
         tracking.write_path_evidence(run, trials, followed, "controlled")
         figures = []
         for name, whole in followed.items():

@@ -40,7 +40,7 @@ class DesiredPath(eqx.Module):
     What comes after the last sample is the last sample.
     """
 
-    position: Float[Array, "*batch samples 3"]
+    position: Float[Array, "*batch samples 3"] | Float[np.ndarray, "*batch samples 3"]
     period: float = eqx.field(static=True)  # s
 
     def ahead(self, steps: Array, first: Array | int = 0) -> Float[Array, "*batch steps 3"]:

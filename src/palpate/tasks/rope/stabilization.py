@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -43,6 +43,7 @@ class RopeStabilization(Task):
     """
 
     name: ClassVar[str] = "rope-stabilization"
+    goal_features: ClassVar[int] = 0  # of `features`: what is seen of the goal
     action_name: ClassVar[str] = "gripper velocity"
     action_unit: ClassVar[str] = "m/s"
     outcome_units: ClassVar[Mapping[str, str]] = {
@@ -195,6 +196,12 @@ class RopeStabilization(Task):
             Channel("node position relative to the gripper", shape, "m"),
             Channel("node velocity", shape, "m/s"),
         )
+
+    @staticmethod
+    def measure(observation: Any, truth: Any) -> dict[str, float]:
+        """What a `RopeTruth` is judged by: "energy" (J) and "gripper_speed" (m/s)."""
+        speed = float(np.linalg.norm(truth.gripper_velocity))
+        return {"energy": truth.energy, "gripper_speed": speed}
 
     def loss(
         self, models: Rope, start: Start, states: RopeState, actions: Array

@@ -4,7 +4,7 @@ SPiD (Long et al., arXiv 2602.03623), the talk's second task.
 """
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -45,6 +45,7 @@ class RopeTracking(Task):
     """
 
     name: ClassVar[str] = "rope-tracking"
+    goal_features: ClassVar[int] = 3 * len(PREVIEW)
     action_name: ClassVar[str] = "gripper velocity"
     action_unit: ClassVar[str] = "m/s"
     outcome_units: ClassVar[Mapping[str, str]] = {
@@ -142,6 +143,11 @@ class RopeTracking(Task):
         instants = ", ".join(f"{instant:g}" for instant in PREVIEW)
         ahead = f"desired tip position relative to the gripper, {instants} s ahead"
         return (*_ROPE.feature_channels(model), Channel(ahead, (len(PREVIEW), 3), "m"))
+
+    @staticmethod
+    def measure(observation: Any, truth: Any) -> dict[str, np.ndarray]:
+        """What a `RopeObservation` is judged by: the place of the tip, (3,) m, with noise."""
+        return {"tips": observation.markers[-1]}
 
     def loss(
         self, models: Rope, start: Start, states: RopeState, actions: Array

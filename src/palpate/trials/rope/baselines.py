@@ -1,29 +1,24 @@
-"""What a learned controller of a rope is compared with: nothing, and the textbook swing damper."""
+"""The textbook swing damper, which learned controllers of a rope are compared with."""
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from palpate.perception.velocity import VelocityEstimator
 from palpate.runs.progress import progress
-from palpate.trials.rope.trials import Seen, Trial, run_trials, settling_time
-from palpate.worlds.rope.rope import START_POSES, RopeConfiguration, sample_configurations
+from palpate.trials.controller import FeedbackController
+from palpate.trials.rope.trials import StabilizationTrial, settling_time
+from palpate.trials.trial import run_trials
+from palpate.worlds.rope.rope import (
+    START_POSES,
+    RopeConfiguration,
+    RopeObservation,
+    sample_configurations,
+)
 
 TUNING_STEPS = 500  # control periods of each trial: 5 s
-
-
-class HeldStill:
-    """The gripper never moves: what the rope's own damping does."""
-
-    period = None
-
-    def begin(self, seen: Seen) -> None:
-        """See `Controller.begin`."""
-
-    def command(self, seen: Seen) -> np.ndarray:
-        """Zero for every world."""
-        return np.zeros_like(seen.gripper_position)
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,7 @@ class Gains:
 TUNED = Gains(offset=1.58, rate=18.0, position=0.0245, velocity=1.18, part=0.197)
 
 
-class SwingDamper:
+class SwingDamper(FeedbackController):
     """State feedback on the rope, taken for a pendulum whose pivot is moved.
 
     For the pivot's horizontal place x and the centre of the watched part at x + d,
@@ -50,6 +45,7 @@ class SwingDamper:
 
     so `rate` damps the swing, `offset` makes it stiffer, and the rest brings the gripper back. The
     acceleration is limited as the gripper's is and integrated to the velocity that is commanded.
+    What is carried: x0, the command in force, and a window of d.
     """
 
     def __init__(self, base: RopeConfiguration, gains: Gains = TUNED):
@@ -57,31 +53,33 @@ class SwingDamper:
         self._speed_limit, self._acceleration_limit = base.speed_limit, base.acceleration_limit
         self._estimator = VelocityEstimator(base.control_period)
 
-    def begin(self, seen: Seen) -> None:
-        """See `Controller.begin`."""
-        self._home = seen.gripper_position[:, :2].copy()
-        self._command = np.zeros((len(self._home), 2))
-        self._window = np.repeat(self._offset(seen)[None], self._estimator.frames, axis=0)
+    def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
+        """See `FeedbackController.start`."""
+        window = np.repeat(self._offset(observation)[None], self._estimator.frames, axis=0)
+        return observation.gripper_position[:, :2], command[:, :2], window
 
-    def command(self, seen: Seen) -> np.ndarray:
-        """See `Controller.command`."""
-        gains, offset = self._gains, self._offset(seen)
-        self._window = np.concatenate([self._window[1:], offset[None]])
-        rate = np.tensordot(self._estimator.weights, self._window, axes=1)
-        away = seen.gripper_position[:, :2] - self._home
+    def decide(
+        self, carry: Any, observation: RopeObservation, goal: None
+    ) -> tuple[Any, np.ndarray]:
+        """See `FeedbackController.decide`."""
+        home, command, window = carry
+        gains, offset = self._gains, self._offset(observation)
+        window = np.concatenate([window[1:], offset[None]])
+        rate = np.tensordot(self._estimator.weights, window, axes=1)
+        away = observation.gripper_position[:, :2] - home
         acceleration = (
             gains.offset * offset
             + gains.rate * rate
             - gains.position * away
-            - gains.velocity * self._command
+            - gains.velocity * command
         )
-        self._command = _shortened(
-            self._command + self.period * _shortened(acceleration, self._acceleration_limit),
+        command = _shortened(
+            command + self.period * _shortened(acceleration, self._acceleration_limit),
             self._speed_limit,
         )
-        return np.pad(self._command, ((0, 0), (0, 1)))
+        return (home, command, window), np.pad(command, ((0, 0), (0, 1)))
 
-    def _offset(self, seen: Seen) -> np.ndarray:
+    def _offset(self, seen: RopeObservation) -> np.ndarray:
         """Centre of the watched markers relative to the gripper, horizontally: (worlds, 2) m."""
         last = max(1, round(min(1.0, self._gains.part) * (seen.markers.shape[1] - 1)))
         return (seen.markers[:, 1 : last + 1].mean(1) - seen.gripper_position)[:, :2]
@@ -114,7 +112,7 @@ def tune(
     """
     random = np.random.default_rng(seed)
     trials = [
-        Trial(configuration, pose, seed + index)
+        StabilizationTrial(configuration, pose, seed + index)
         for index, configuration in enumerate(sample_configurations(base, ropes, seed))
         for pose in START_POSES
     ]

@@ -1,4 +1,4 @@
-"""Controllers on the same trials of the MuJoCo rope: run, resumed, summed up and drawn."""
+"""How often and how fast controllers bring MuJoCo ropes to rest: run, summed up and drawn."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,120 +9,45 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.report.evidence import write_evidence
 from palpate.runs import Figure, Run
-from palpate.runs.progress import interruptible, progress
 from palpate.tasks.rope.stabilization import STABILISED, STAY
-from palpate.trials.rope.trials import (
-    Controller,
-    Episodes,
-    Trial,
-    check_period,
-    run_trials,
-    settling_time,
-    wilson_interval,
-)
+from palpate.trials.controller import Controller
+from palpate.trials.rope.trials import Episodes, StabilizationTrial, settling_times
+from palpate.trials.trial import evaluate_trials, first_of_each_group, groups, wilson_interval
 from palpate.worlds.rope.rope import START_POSES, RopeConfiguration, sample_configurations
 
 TRIAL_PERIODS = 4.0  # length of a trial, in first periods of the longest rope
-SIDE_BY_SIDE = 20  # trials; a run that was cut off repeats at most these
 
 
-def evaluation_trials(base: RopeConfiguration, ropes: int, seed: int) -> list[Trial]:
+def evaluation_trials(base: RopeConfiguration, ropes: int, seed: int) -> list[StabilizationTrial]:
     """Each of `ropes` sampled ropes from each start pose, sorted by pose; all drawn by `seed`."""
     configurations = sample_configurations(base, ropes, seed)
     seeds = np.random.default_rng((seed, 1)).integers(2**31, size=(len(START_POSES), ropes))
     return [
-        Trial(configuration, start, int(seeds[pose, rope]))
+        StabilizationTrial(configuration, start, int(seeds[pose, rope]))
         for pose, start in enumerate(START_POSES)
         for rope, configuration in enumerate(configurations)
     ]
 
 
-def one_of_each_pose(trials: Sequence[Trial]) -> list[int]:
-    """The first trial of every start pose: those that are drawn."""
-    starts = [trial.start for trial in trials]
-    return [starts.index(start) for start in dict.fromkeys(starts)]
-
-
 def evaluate(
-    controllers: Mapping[str, Controller], trials: Sequence[Trial], run: Run | None = None
+    controllers: Mapping[str, Controller],
+    trials: Sequence[StabilizationTrial],
+    run: Run | None = None,
 ) -> dict[str, Episodes]:
-    """What each controller does in all trials, which last four periods of the longest rope.
-
-    Markers are kept of `one_of_each_pose`. With a `run`, finished trials are saved and logged
-    there, and one that was cut off goes on. The caller opens the run and finishes it.
+    """`evaluate_trials` for four first periods of the longest rope.
 
     Raises `PalpateError` when the ropes' control periods or markers differ, or a controller decides
     in another period.
     """
-    configuration = trials[0].configuration
     for name in ("control_period", "markers"):
         found = {getattr(trial.configuration, name) for trial in trials}
         if len(found) > 1:
             raise PalpateError(
                 f"trials run side by side with one {name}, not {sorted(found)}: evaluate apart"
             )
-    for controller in controllers.values():
-        check_period(controller, trials)
-    steps = math.ceil(
-        TRIAL_PERIODS * max(trial.period for trial in trials) / configuration.control_period
-    )
-    drawn = one_of_each_pose(trials)
-    done = {
-        name: Episodes.empty(len(trials), steps + 1, len(drawn), configuration.markers)
-        for name in controllers
-    }
-    work = [
-        (name, np.arange(first, min(first + SIDE_BY_SIDE, len(trials))))
-        for name in controllers
-        for first in range(0, len(trials), SIDE_BY_SIDE)
-    ]
-    step = _restore(run, done)
-    bar = progress(work[step:], "evaluating", done=step)
-    with interruptible() as stop:
-        for name, chosen in bar:
-            kept = [place for place, trial in enumerate(chosen) if trial in drawn]
-            part = run_trials([trials[i] for i in chosen], controllers[name], steps, kept)
-            whole = done[name]
-            whole.energy[chosen], whole.gripper_speed[chosen] = part.energy, part.gripper_speed
-            whole.markers[[drawn.index(chosen[place]) for place in kept]] = part.markers
-            failures = {int(chosen[place]): reason for place, reason in part.failures.items()}
-            whole.failures.update(failures)
-            step += 1
-            settled = np.isfinite(settling_times([trials[i] for i in chosen], part)).mean()
-            bar.show(settled=settled)
-            if run is not None:
-                reasons = {str(trial): reason for trial, reason in failures.items()}
-                run.log(step, controller=name, success_rate=float(settled), failures=reasons)
-                run.save(step, _arrays(done))
-            if stop:
-                break
-    return done
-
-
-def _restore(run: Run | None, done: dict[str, Episodes]) -> int:
-    """Fill in what an earlier process evaluated; the number of chunks of trials that was."""
-    restored = None if run is None else run.restore(_arrays(done))
-    if run is None or restored is None:
-        return 0
-    step, arrays = restored
-    for name, parts in arrays.items():
-        for part, array in parts.items():
-            getattr(done[name], part)[:] = array
-    for line in run.metrics():
-        failures = {int(trial): reason for trial, reason in line["failures"].items()}
-        done[line["controller"]].failures.update(failures)
-    return step
-
-
-def _arrays(done: Mapping[str, Episodes]) -> dict[str, dict[str, np.ndarray]]:
-    parts = ("energy", "gripper_speed", "markers")
-    return {name: {part: getattr(whole, part) for part in parts} for name, whole in done.items()}
-
-
-def settling_times(trials: Sequence[Trial], episodes: Episodes, first: bool = False) -> np.ndarray:
-    """When each rope came to rest, (trials,) in s; see `settling_time`."""
-    period = trials[0].configuration.control_period
-    return settling_time(episodes.energy, episodes.gripper_speed, period, first)
+    longest = max(trial.period for trial in trials)
+    steps = math.ceil(TRIAL_PERIODS * longest / trials[0].control_period)
+    return evaluate_trials(controllers, trials, run, steps)
 
 
 @dataclass(frozen=True)
@@ -172,12 +97,12 @@ class Summary:
         )
 
 
-def summarise(trials: Sequence[Trial], episodes: Episodes) -> Summary:
+def summarise(trials: Sequence[StabilizationTrial], episodes: Episodes) -> Summary:
     """Success rate and times of these trials."""
     time = settling_times(trials, episodes)
     period = np.array([trial.period for trial in trials])
     settled = np.isfinite(time)
-    step = trials[0].configuration.control_period
+    step = trials[0].control_period
     length = (episodes.energy.shape[1] - 1) * step
     successes = int(settled.sum())
 
@@ -206,29 +131,35 @@ def summarise(trials: Sequence[Trial], episodes: Episodes) -> Summary:
     )
 
 
-def _last_above(trials: Sequence[Trial], episodes: Episodes) -> np.ndarray:
+def _last_above(trials: Sequence[StabilizationTrial], episodes: Episodes) -> np.ndarray:
     """The last instant (trials,) in s at which the energy is not below 1 % of the start's."""
     above = ~(episodes.energy < STABILISED * episodes.energy[:, :1])
     last = above.shape[1] - 1 - above[:, ::-1].argmax(1)
-    return last * trials[0].configuration.control_period
+    return last * trials[0].control_period
 
 
-def by_pose(trials: Sequence[Trial], episodes: Episodes) -> dict[str, Summary]:
+def by_pose(trials: Sequence[StabilizationTrial], episodes: Episodes) -> dict[str, Summary]:
     """A summary for each start pose."""
-    summaries = {}
-    for start in dict.fromkeys(trial.start for trial in trials):
-        chosen = [index for index, trial in enumerate(trials) if trial.start == start]
-        part = Episodes(
-            episodes.energy[chosen],
-            episodes.gripper_speed[chosen],
-            episodes.markers,
-            {trial: why for trial, why in episodes.failures.items() if trial in chosen},
-        )
-        summaries[start] = summarise([trials[index] for index in chosen], part)
-    return summaries
+    return {
+        start: summarise([trials[index] for index in chosen], part_of(episodes, chosen))
+        for start, chosen in groups(trials).items()
+    }
 
 
-def table(trials: Sequence[Trial], evaluated: Mapping[str, Episodes]) -> list[str]:
+def part_of(episodes: Episodes, chosen: Sequence[int]) -> Episodes:
+    """Of some of the trials, in this order; without markers."""
+    failures = {
+        place: episodes.failures[trial]
+        for place, trial in enumerate(chosen)
+        if trial in episodes.failures
+    }
+    chosen = list(chosen)
+    return Episodes(
+        episodes.energy[chosen], episodes.gripper_speed[chosen], episodes.markers[:0], failures
+    )
+
+
+def table(trials: Sequence[StabilizationTrial], evaluated: Mapping[str, Episodes]) -> list[str]:
     """Lines for a person: every controller, over all trials and from each start pose."""
     lines = []
     for name, episodes in evaluated.items():
@@ -268,18 +199,21 @@ def figures(
 
 
 def write_trial_evidence(
-    run: Run, trials: Sequence[Trial], evaluated: Mapping[str, Episodes], shown: Sequence[str]
+    run: Run,
+    trials: Sequence[StabilizationTrial],
+    evaluated: Mapping[str, Episodes],
+    shown: Sequence[str],
 ) -> None:
     """Leave for the report the energy of all trials and, of one for each pose, how the rope moved.
 
     `shown`: the controllers whose motion is drawn.
     """
     some = next(iter(evaluated.values()))
-    time = np.arange(some.energy.shape[1]) * trials[0].configuration.control_period
+    time = np.arange(some.energy.shape[1]) * trials[0].control_period
     arrays = {"energy.time": time}
     for name, episodes in evaluated.items():
         arrays[f"energy.{name}"] = episodes.energy / episodes.energy[:, :1]
-    for place, trial in enumerate(one_of_each_pose(trials)):
+    for place, trial in enumerate(first_of_each_group(trials)):
         if trial in some.failures and np.isnan(some.markers[place]).all():
             continue  # it diverged while it was shaken: there is nothing to draw
         group = f"motion/{trials[trial].start}"

@@ -15,7 +15,7 @@ from palpate.perception.rope.centre_line import FEWEST, centre_lines, line_point
 from palpate.perception.rope.segmentation import Appearance, segment
 from palpate.perception.rope.tracking import REACH, RopeTracker
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.trials import Trial
+from palpate.trials.rope.trials import StabilizationTrial
 from palpate.worlds.camera import Sensor
 from palpate.worlds.excitation import excitation
 from palpate.worlds.rope.filmed import ROPE_COLOUR, Background, FilmedObservation, FilmedRope
@@ -59,7 +59,7 @@ class Filming:
 
 
 def film(
-    trial: Trial,
+    trial: StabilizationTrial,
     *,
     model: Rope,
     policy: CommandPolicy | None,
@@ -78,7 +78,7 @@ def film(
 
 def _run(
     world: FilmedRope,
-    trial: Trial,
+    trial: StabilizationTrial,
     kept: Filming,
     model: Rope,
     policy: CommandPolicy | None,

@@ -2,42 +2,133 @@
 
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 
 from palpate.report.evidence import write_evidence
 from palpate.report.style import STYLES
 from palpate.runs import Figure, Run
-from palpate.runs.progress import interruptible, progress
 from palpate.runs.storage import write_bytes
-from palpate.tasks.rope.paths import CURVES, named_path, read_path
-from palpate.tasks.rope.tracking import PREVIEW
-from palpate.trials.rope.trials import Controller, Trial, run_trials
-from palpate.worlds.rope.rope import GRIPPER_START, RopeConfiguration, sample_configurations
+from palpate.tasks.rope import RopeTracking
+from palpate.tasks.rope.paths import CURVES, DesiredPath, named_path, read_path
+from palpate.tasks.rope.tracking import PREVIEW, grip_of_chain
+from palpate.trials.controller import Controller, HeldStill, OpenLoop
+from palpate.trials.rope.trials import RopeTrial
+from palpate.trials.trial import Record, first_of_each_group, groups
+from palpate.worlds.rope.rope import (
+    GRIPPER_START,
+    RopeConfiguration,
+    RopeObservation,
+    RopeTruth,
+    sample_configurations,
+)
 
 # World constants, written down before the first evaluation.
 SIZES, DURATIONS = (0.4, 0.8), (4.0, 6.0)  # m and s; about 1 to 2 m of path, as in the seed's code
 TILTS = (0.0, math.pi / 6)  # rad, of a path's plane from the horizontal
 DRAWN = SIZES, DURATIONS, TILTS
-SIDE_BY_SIDE = 15  # trials; a run that was cut off repeats at most these
 
-Follower = Callable[[np.ndarray], Controller]  # of paths (worlds, samples, 3): see `rope_followers`
+
+@dataclass(frozen=True)
+class Followed(Record):
+    """What the tips of ropes did in trials on paths; see `Record`.
+
+    `tips` (trials, times, 3) and, of the first trial on each path, `markers` (paths, times,
+    markers, 3), in m as seen with the camera's noise.
+    """
+
+    observed: ClassVar[str] = "markers"
+    tips: np.ndarray
+    markers: np.ndarray
+    failures: dict[int, str]
+
+    def errors(self, trials: Sequence["PathTrial"]) -> np.ndarray:
+        """Distance of each tip from where it should be, (trials, times) in m; NaN as above."""
+        desired = np.full(self.tips.shape, np.nan)
+        for index, trial in enumerate(trials):
+            path = trial.path[1 : min(trial.steps + 1, self.tips.shape[1])]
+            desired[index, 1 : len(path) + 1] = path
+        return np.linalg.norm(self.tips - desired, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
-class PathTrial:
+class PathTrial(RopeTrial[Followed]):
     """One rope and one path: `path` (samples, 3) in m, world frame, from the hanging tip on.
 
     `steps` are the control periods that count. The path goes on beyond them.
     """
 
-    trial: Trial
+    side_by_side: ClassVar[int] = 15
     name: str
     path: np.ndarray
     steps: int
+
+    @property
+    def group(self) -> str:
+        """See `Trial`: the path."""
+        return self.name
+
+    def measure(self, observation: RopeObservation, truth: RopeTruth) -> Mapping[str, Any]:
+        """See `Trial`."""
+        return RopeTracking.measure(observation, truth)
+
+    @classmethod
+    def goals(cls, trials: Sequence["PathTrial"]) -> DesiredPath:
+        """See `Trial`: the paths, whose ends are held for as long as any lasts."""
+        longest = max(len(trial.path) for trial in trials)
+        paths = [
+            np.pad(trial.path, ((0, longest - len(trial.path)), (0, 0)), mode="edge")
+            for trial in trials
+        ]
+        return DesiredPath(np.stack(paths), trials[0].control_period)
+
+    @classmethod
+    def record(cls, trials: Sequence["PathTrial"], steps: int, drawn: int) -> Followed:
+        """See `Trial`."""
+        tips = np.full((len(trials), steps + 1, 3), np.nan, np.float32)
+        markers = drawn, steps + 1, trials[0].configuration.markers, 3
+        return Followed(tips, np.full(markers, np.nan, np.float32), {})
+
+    @classmethod
+    def score(cls, trials: Sequence["PathTrial"], record: Followed) -> dict[str, float]:
+        """See `Trial`."""
+        return {"mean_tip_error_cm": 100 * float(np.nanmean(record.errors(trials)))}
+
+
+class PathOpenLoop(OpenLoop):
+    """The gripper moves as the path does, or as suits a limp chain; it looks at nothing.
+
+    Moving as the path does, a rope's length above it, is right for a path that takes forever; how a
+    chain of that `length` (m) without damping is led says `grip_of_chain`.
+    """
+
+    def __init__(self, period: float, length: float | None = None):
+        self._length, self.period = length, period
+
+    def start(
+        self, command: np.ndarray, observation: RopeObservation, goal: DesiredPath
+    ) -> tuple[np.ndarray, int]:
+        """See `OpenLoop.start`."""
+        gripper = np.asarray(goal.position)
+        if self._length is not None:
+            away = jnp.asarray(gripper - gripper[:, :1], jnp.float32)
+            gripper = np.asarray(grip_of_chain(away, self._length, 9.81, goal.period))
+        return np.diff(gripper, axis=1) / goal.period, 0
+
+
+def blind_controllers(base: RopeConfiguration) -> dict[str, Controller]:
+    """What needs no eyes, by name: nothing at all, and two ways of laying a motion down."""
+    period = base.control_period
+    return {
+        "held still": HeldStill(),
+        "as the path": PathOpenLoop(period),
+        "as a chain": PathOpenLoop(period, base.length),
+    }
 
 
 def path_trials(
@@ -70,112 +161,11 @@ def path_trials(
                 )
             hanging = np.array(GRIPPER_START) - [0, 0, configuration.length]
             steps = len(path) - 1 - round(beyond / period)
-            trial = Trial(configuration, "hanging", int(random.integers(2**31)))
-            trials.append(PathTrial(trial, Path(name).stem, hanging + path, steps))
+            own = int(random.integers(2**31))
+            trials.append(
+                PathTrial(configuration, "hanging", own, Path(name).stem, hanging + path, steps)
+            )
     return trials
-
-
-@dataclass(frozen=True)
-class Followed:
-    """What the ropes of some trials did, sampled once per control period from the start on.
-
-    `tips` (trials, times, 3) and, of the first trial on each path, `markers` (paths, times,
-    markers, 3), in m as seen with the camera's noise; NaN after a trial's end and once its
-    simulation has diverged. `failures` say why one did.
-    """
-
-    tips: np.ndarray
-    markers: np.ndarray
-    failures: dict[int, str]
-
-    def errors(self, trials: Sequence[PathTrial]) -> np.ndarray:
-        """Distance of each tip from where it should be, (trials, times) in m; NaN as above."""
-        desired = np.full(self.tips.shape, np.nan)
-        for index, trial in enumerate(trials):
-            desired[index, 1 : trial.steps + 1] = trial.path[1 : trial.steps + 1]
-        return np.linalg.norm(self.tips - desired, axis=-1)
-
-
-def first_on_each_path(trials: Sequence[PathTrial]) -> list[int]:
-    """The trials that are drawn."""
-    names = [trial.name for trial in trials]
-    return [names.index(name) for name in dict.fromkeys(names)]
-
-
-def follow(
-    followers: Mapping[str, Follower], trials: Sequence[PathTrial], run: Run | None = None
-) -> dict[str, Followed]:
-    """What each follower's ropes do in all trials.
-
-    With a `run`, finished trials are saved and logged there, and one that was cut off goes on. The
-    caller opens the run and finishes it.
-    """
-    times = max(trial.steps for trial in trials) + 1
-    drawn = first_on_each_path(trials)
-    tips = np.full((len(trials), times, 3), np.nan, np.float32)
-    shape = len(drawn), times, trials[0].trial.configuration.markers, 3
-    markers = np.full(shape, np.nan, np.float32)
-    done = {name: Followed(tips.copy(), markers.copy(), {}) for name in followers}
-    work = [
-        (name, np.arange(first, min(first + SIDE_BY_SIDE, len(trials))))
-        for name in followers
-        for first in range(0, len(trials), SIDE_BY_SIDE)
-    ]
-    step = _restore(run, done)
-    bar = progress(work[step:], "following", done=step)
-    with interruptible() as stop:
-        for name, chosen in bar:
-            some, whole = [trials[index] for index in chosen], done[name]
-            lasts = max(trial.steps for trial in some)
-            ropes = [trial.trial for trial in some]
-            follower = followers[name](_side_by_side(some))
-            episodes = run_trials(ropes, follower, lasts, range(len(some)))
-            for place, index in enumerate(chosen.tolist()):
-                seen = episodes.markers[place, : trials[index].steps + 1]
-                whole.tips[index, : len(seen)] = seen[:, -1]
-                if index in drawn:
-                    whole.markers[drawn.index(index), : len(seen)] = seen
-            failures = {int(chosen[place]): why for place, why in episodes.failures.items()}
-            whole.failures.update(failures)
-            step += 1
-            error = 100 * float(np.nanmean(whole.errors(trials)[chosen]))
-            bar.show(error_cm=error)
-            if run is not None:
-                reasons = {str(trial): why for trial, why in failures.items()}
-                run.log(step, controller=name, mean_tip_error_cm=error, failures=reasons)
-                run.save(step, _arrays(done))
-            if stop:
-                break
-    return done
-
-
-def _side_by_side(trials: Sequence[PathTrial]) -> np.ndarray:
-    """The paths of several trials, (trials, samples, 3); ends are held for as long as any lasts."""
-    longest = max(len(trial.path) for trial in trials)
-    return np.stack(
-        [
-            np.pad(trial.path, ((0, longest - len(trial.path)), (0, 0)), mode="edge")
-            for trial in trials
-        ]
-    )
-
-
-def _restore(run: Run | None, done: dict[str, Followed]) -> int:
-    """Fill in what an earlier process did; the number of chunks of trials that it was."""
-    restored = None if run is None else run.restore(_arrays(done))
-    if run is None or restored is None:
-        return 0
-    step, arrays = restored
-    for name, (tips, markers) in arrays.items():
-        done[name].tips[:], done[name].markers[:] = tips, markers
-    for line in run.metrics():
-        failures = {int(trial): reason for trial, reason in line["failures"].items()}
-        done[line["controller"]].failures.update(failures)
-    return step
-
-
-def _arrays(done: Mapping[str, Followed]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    return {name: (whole.tips, whole.markers) for name, whole in done.items()}
 
 
 @dataclass(frozen=True)
@@ -224,18 +214,12 @@ def summarise(
     )
 
 
-def by_path(trials: Sequence[PathTrial]) -> dict[str, list[int]]:
-    """The trials on each path."""
-    names = dict.fromkeys(trial.name for trial in trials)
-    return {name: [i for i, trial in enumerate(trials) if trial.name == name] for name in names}
-
-
 def table(trials: Sequence[PathTrial], followed: Mapping[str, Followed]) -> list[str]:
     """Lines for a person: every controller, over all trials and on each path."""
     lines = []
     for name, whole in followed.items():
         lines.append(summarise(trials, whole).line(name))
-        for path, chosen in by_path(trials).items():
+        for path, chosen in groups(trials).items():
             lines.append(summarise(trials, whole, chosen).line(f"  {path}"))
         lines += [f"  trial {trial}: {why}" for trial, why in sorted(whole.failures.items())]
     return lines
@@ -261,8 +245,8 @@ def write_path_evidence(
 
     The picture, `tracking.png`, has the tips of all followers on it.
     """
-    period, arrays = trials[0].trial.configuration.control_period, {}
-    for place, index in enumerate(first_on_each_path(trials)):
+    period, arrays = trials[0].control_period, {}
+    for place, index in enumerate(first_of_each_group(trials)):
         trial, group = trials[index], f"motion/{trials[index].name}"
         arrays[f"{group}.time"] = np.arange(trial.steps + 1) * period
         arrays[f"{group}.{shown}"] = followed[shown].markers[place, : trial.steps + 1]
@@ -278,14 +262,14 @@ def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followe
     """
     from matplotlib.figure import Figure as Canvas
 
-    drawn = first_on_each_path(trials)
+    drawn = first_of_each_group(trials)
     canvas = Canvas(figsize=(4 * len(drawn), 7.5), layout="constrained")
     axes = canvas.subplots(2, len(drawn), squeeze=False)
     for index, above, below in zip(drawn, *axes, strict=True):
         trial = trials[index]
         path = trial.path[: trial.steps + 1]
         above.plot(path[:, 0], path[:, 1], color="black", linewidth=4, alpha=0.25, label="desired")
-        time = np.arange(trial.steps + 1) * trial.trial.configuration.control_period
+        time = np.arange(trial.steps + 1) * trial.control_period
         for style, (name, whole) in zip(STYLES, followed.items(), strict=False):
             look = {"color": style.light, "linestyle": (0, style.dash), "linewidth": 1}
             tips = whole.tips[index, : trial.steps + 1]

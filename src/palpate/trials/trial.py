@@ -1,0 +1,286 @@
+"""A controller in worlds, judged by a task: the runner of closed loops of every family.
+
+A trial is one world, how it begins, and what is asked for in it. Many run side by side, so that a
+learned controller is asked once per control period for all of them. Nobody but the task is shown
+the truth.
+"""
+
+import dataclasses
+import functools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.numerics import devices
+from palpate.runs import Run
+from palpate.runs.progress import interruptible, progress
+from palpate.trials.controller import Controller, check_period
+from palpate.worlds.world import DivergedError, World
+
+
+class Record:
+    """A dataclass of what happened in trials, once per control period from the start on.
+
+    Fields that are arrays lead with (trials, times) and hold what the task measures; the one named
+    `observed` leads with (drawn trials, times) and is that part of the observations, of the trials
+    that are drawn. All are NaN after a trial's end and once its simulation has diverged; `failures`
+    say by trial why it did.
+    """
+
+    observed: ClassVar[str]
+    failures: dict[int, str]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+
+RecordType = TypeVar("RecordType", bound=Record)
+
+
+class Trial(ABC, Generic[RecordType]):
+    """One world, how it begins, what is asked for in it, and what is kept of it.
+
+    `seed` draws the world's randomness; `steps` are the control periods that it lasts (None: as
+    many as all). `side_by_side`: how many run at once; a run that was cut off repeats at most
+    these.
+    """
+
+    side_by_side: ClassVar[int] = 20
+    seed: int
+    steps: int | None = None
+
+    @property
+    @abstractmethod
+    def control_period(self) -> float:
+        """Of its world, s."""
+
+    @property
+    @abstractmethod
+    def group(self) -> str:
+        """The row of a table that it belongs to; one trial of each group is drawn."""
+
+    @property
+    @abstractmethod
+    def reset_options(self) -> Mapping[str, Any]:
+        """Options of the world's `reset`."""
+
+    @property
+    @abstractmethod
+    def command(self) -> np.ndarray:
+        """The action in force before the first decision."""
+
+    @abstractmethod
+    def world(self) -> World:
+        """The world, not yet reset."""
+
+    @abstractmethod
+    def measure(self, observation: Any, truth: Any) -> Mapping[str, Any]:
+        """What the task measures at one instant: entries of the record's arrays."""
+
+    @classmethod
+    def goals(cls, trials: Sequence[Any]) -> Any:
+        """What is asked for in trials that run side by side; None where nothing varies."""
+        return None
+
+    @classmethod
+    @abstractmethod
+    def record(cls, trials: Sequence[Any], steps: int, drawn: int) -> RecordType:
+        """Of trials that have yet to be run, all NaN."""
+
+    @classmethod
+    @abstractmethod
+    def score(cls, trials: Sequence[Any], record: RecordType) -> dict[str, float]:
+        """What is shown and logged while trials are run."""
+
+
+def run_trials(
+    trials: Sequence[Trial[RecordType]],
+    controller: Controller,
+    steps: int | None = None,
+    drawn: Sequence[int] = (),
+    watch: Callable[[int, Sequence[World]], None] | None = None,
+) -> RecordType:
+    """Run all trials side by side for `steps` control periods, on as many threads as cores.
+
+    Without `steps`, for as long as any of them lasts. The trials numbered in `drawn` are kept for
+    drawing. A simulation that diverges ends its own trial and no other. `watch` is called at the
+    start (0) and after every control period with its number and the worlds. Raises `PalpateError`
+    when the controller decides in another period.
+    """
+    for period in {trial.control_period for trial in trials}:
+        check_period(controller, period)
+    steps = _longest(trials, steps)
+    loop = _Loop(trials, steps, drawn)
+    carry = controller.initial_carry(np.stack([trial.command for trial in trials]))
+    goals = type(trials[0]).goals(trials)
+    shares = np.array_split(np.arange(len(trials)), devices.cores())
+    with ThreadPoolExecutor(devices.cores()) as threads:
+        for step in range(steps + 1):
+            if step:
+                carry, actions = controller(carry, stacked(loop.latest), goals, None)
+                advance = functools.partial(loop.advance, step, actions)
+                list(threads.map(advance, shares))  # MuJoCo lets the other threads run meanwhile
+            if watch is not None:
+                watch(step, loop.worlds)
+    return loop.record
+
+
+def _longest(trials: Sequence[Trial], steps: int | None) -> int:
+    return max(trial.steps or 0 for trial in trials) if steps is None else steps
+
+
+class _Loop(Generic[RecordType]):
+    """Worlds, the last observation of each, and what is kept of them."""
+
+    def __init__(self, trials: Sequence[Trial[RecordType]], steps: int, drawn: Sequence[int]):
+        self._trials = trials
+        self.worlds = [trial.world() for trial in trials]
+        self._drawn = {trial: place for place, trial in enumerate(drawn)}
+        self.record = type(trials[0]).record(trials, steps, len(drawn))
+        self.latest = [self._reset(index, trial) for index, trial in enumerate(trials)]
+        for index in range(len(trials)):
+            if index not in self.record.failures:
+                self._keep(index, 0)
+
+    def _reset(self, index: int, trial: Trial) -> Any:
+        try:
+            return self.worlds[index].reset(trial.seed, **trial.reset_options)
+        except DivergedError as error:  # before it began, as a rope that is shaken
+            self.record.failures[index] = str(error)
+            return self.worlds[index].reset(trial.seed)  # something to see for who sees all worlds
+
+    def advance(self, step: int, actions: Any, share: np.ndarray) -> None:
+        for index in share.tolist():
+            last = self._trials[index].steps
+            if index in self.record.failures or (last is not None and step > last):
+                continue
+            try:
+                self.latest[index] = self.worlds[index].step(actions[index])
+                self._keep(index, step)
+            except PalpateError as error:
+                self.record.failures[index] = str(error)
+
+    def _keep(self, index: int, step: int) -> None:
+        observation = self.latest[index]
+        measured = self._trials[index].measure(observation, self.worlds[index].truth())
+        for name, value in measured.items():
+            getattr(self.record, name)[index, step] = value
+        if index in self._drawn:
+            observed = self.record.observed
+            array = getattr(self.record, observed)
+            array[self._drawn[index], step] = getattr(observation, observed)
+
+
+def stacked(observations: Sequence[Any]) -> Any:
+    """The observations of several worlds as one, whose arrays lead with the worlds.
+
+    The `time` is that of the newest.
+    """
+    first = observations[0]
+    if isinstance(first, float):
+        return max(observations)
+    if not dataclasses.is_dataclass(first):
+        return None if first is None else np.stack(observations)
+    columns = {
+        field.name: stacked([getattr(one, field.name) for one in observations])
+        for field in dataclasses.fields(first)
+    }
+    return dataclasses.replace(first, **columns)  # type: ignore[type-var]
+
+
+def first_of_each_group(trials: Sequence[Trial]) -> list[int]:
+    """The trials that are drawn."""
+    return [chosen[0] for chosen in groups(trials).values()]
+
+
+def groups(trials: Sequence[Trial]) -> dict[str, list[int]]:
+    """The trials of each group, in the order in which the groups come."""
+    found: dict[str, list[int]] = {}
+    for index, trial in enumerate(trials):
+        found.setdefault(trial.group, []).append(index)
+    return found
+
+
+def evaluate_trials(
+    controllers: Mapping[str, Controller],
+    trials: Sequence[Trial[RecordType]],
+    run: Run | None = None,
+    steps: int | None = None,
+) -> dict[str, RecordType]:
+    """What each controller does in all trials; `steps` as in `run_trials`.
+
+    The first of each group is kept for drawing. With a `run`, finished trials are saved and logged
+    there, and one that was cut off goes on. The caller opens the run and finishes it.
+
+    Raises `PalpateError` when a controller decides in another period.
+    """
+    kind, drawn = type(trials[0]), first_of_each_group(trials)
+    for controller in controllers.values():
+        for period in {trial.control_period for trial in trials}:
+            check_period(controller, period)
+    longest = _longest(trials, steps)
+    done = {name: kind.record(trials, longest, len(drawn)) for name in controllers}
+    work = list(_chunks(controllers, len(trials), kind.side_by_side))
+    step = _restore(run, done)
+    bar = progress(work[step:], "trials", done=step)
+    with interruptible() as stop:
+        for name, chosen in bar:
+            some = [trials[index] for index in chosen]
+            places = [place for place, index in enumerate(chosen) if index in drawn]
+            part = run_trials(some, controllers[name], steps, places)
+            rows = [drawn.index(chosen[place]) for place in places]
+            for field, values in part.arrays().items():
+                whole = getattr(done[name], field)
+                whole[rows if field == part.observed else chosen, : values.shape[1]] = values
+            failures = {chosen[place]: why for place, why in part.failures.items()}
+            done[name].failures.update(failures)
+            step += 1
+            score = kind.score(some, part)
+            bar.show(**score)
+            if run is not None:
+                reasons = {str(trial): why for trial, why in failures.items()}
+                run.log(step, controller=name, **score, failures=reasons)
+                run.save(step, _arrays(done))
+            if stop:
+                break
+    return done
+
+
+def _chunks(names: Mapping[str, Any], count: int, size: int) -> Iterator[tuple[str, list[int]]]:
+    for name in names:
+        for first in range(0, count, size):
+            yield name, list(range(first, min(first + size, count)))
+
+
+def _restore(run: Run | None, done: Mapping[str, Record]) -> int:
+    """Fill in what an earlier process did; the number of chunks of trials that it was."""
+    restored = None if run is None else run.restore(_arrays(done))
+    if run is None or restored is None:
+        return 0
+    step, arrays = restored
+    for name, parts in arrays.items():
+        for part, array in parts.items():
+            getattr(done[name], part)[:] = array
+    for line in run.metrics():
+        failures = {int(trial): why for trial, why in line["failures"].items()}
+        done[line["controller"]].failures.update(failures)
+    return step
+
+
+def _arrays(done: Mapping[str, Record]) -> dict[str, dict[str, np.ndarray]]:
+    return {name: record.arrays() for name, record in done.items()}
+
+
+def wilson_interval(successes: int, count: int) -> tuple[float, float]:
+    """95 % interval of a success rate (Wilson 1927, J. Am. Stat. Assoc. 22:209-212)."""
+    z = 1.959964
+    rate = successes / count
+    centre = (rate + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * math.sqrt(rate * (1 - rate) / count + (z / (2 * count)) ** 2)
+    return max(0.0, centre - half), min(1.0, centre + half)

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from correctable_toys import CorrectableCart
 from palpate.commands import identify, identify_data
 from palpate.errors import PalpateError
 from palpate.families.options import Identify
@@ -20,6 +19,7 @@ from palpate.recordings import Channel, Recording, Role, Trial
 from palpate.recordings.files import write_recording
 from palpate.report import read_evidence
 from palpate.runs.result import read_result
+from toys import Cart
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,10 +36,10 @@ class IdentifyCart(Identify):
         return "motor"
 
     def start(self, aligned):
-        return CorrectableCart(1.0, 0.2)
+        return Cart(1.0, 0.2)
 
 
-class StickyCart(CorrectableCart):
+class StickyCart(Cart):
     """With friction that grows with the square of its speed, which the model lacks."""
 
     def step(self, state, action):
@@ -49,7 +49,7 @@ class StickyCart(CorrectableCart):
 
 @pytest.fixture
 def recording(tmp_path, monkeypatch):
-    monkeypatch.setitem(files.MODELS, "cart", CorrectableCart)
+    monkeypatch.setitem(files.MODELS, "cart", Cart)
     few = {"horizons": (0.5,), "iterations": (60,), "windows": 8, "width": 8}
     monkeypatch.setattr(
         identify,

@@ -10,6 +10,8 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.models.files import load_model, save_model
+from palpate.models.planar import PlanarState, furniture
+from palpate.models.planar.shapes import rectangle
 from palpate.models.residual import Residual, SiteNetwork
 from palpate.models.rope import Rope, RopeState
 
@@ -20,7 +22,7 @@ def corrected() -> Residual:
     rope = Rope.uniform(length=0.4, mass=0.03, nodes=5, driven=(0, 4), drive="position")
     key = jax.random.key(0)
     features = jax.random.normal(key, (20, 5, 11))
-    network = SiteNetwork.create(key, features, jnp.full(5, 0.03), 3, width=4, depth=1)
+    network = SiteNetwork.create(key, features, jnp.full(5, 0.03), 3, 3, width=4, depth=1)
     weights = tuple(weight + 0.1 for weight in network.weights)
     return Residual(rope, eqx.tree_at(lambda n: n.weights, network, weights))
 
@@ -43,6 +45,20 @@ def test_a_corrected_model_comes_back_as_it_was_saved(file):
     assert np.any(model.correction(state, action))
     np.testing.assert_array_equal(
         model.correction(state, action), corrected().correction(state, action)
+    )
+
+
+def test_corrected_furniture_comes_back_too(tmp_path):
+    model = furniture([rectangle(0.6, 0.4), rectangle(0.5, 0.5)])
+    features = jax.random.normal(jax.random.key(0), (20, 2, 6))
+    network = SiteNetwork.create(jax.random.key(1), features, jnp.full(2, 0.03), 3, 1, width=4)
+    network = eqx.tree_at(lambda n: n.weights[-1], network, jnp.full((4, 3), 0.1))
+    save_model(tmp_path / "model.json", Residual(model, network))
+    loaded, _ = load_model(tmp_path / "model.json")
+    state, action = PlanarState(jnp.ones((2, 3)), jnp.ones((2, 3))), jnp.ones((2, 3))
+    assert np.any(loaded.correction(state, action))
+    np.testing.assert_array_equal(
+        loaded.correction(state, action), Residual(model, network).correction(state, action)
     )
 
 
@@ -80,8 +96,8 @@ def test_the_physics_alone_is_written_as_ever(file, tmp_path):
         (("weights",), [], "FILE is damaged: a correction needs means (sites, features), places "
          "(sites, numbers) and at least one layer, got (5, 11), (5, 4) and 0"),
         (("biases", 1), [0.0], "FILE is damaged: a layer of a correction that takes 4 numbers of "
-         "each of 3 sites needs weights (12, outputs) and biases (outputs,), got (12, 3) and "
-         "(1,)"),
+         "each of 3 groups of sites needs weights (12, outputs) and biases (outputs,), got (12, 3) "
+         "and (1,)"),
     ],
 )  # fmt: skip
 def test_a_damaged_correction_is_named(file, place, to, text):

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from correctable_toys import CorrectableCart, CorrectablePendulum
 from palpate.errors import PalpateError
-from palpate.models.model import rollout
-from palpate.models.residual import Residual, SiteNetwork
+from palpate.models.model import Model, rollout
+from palpate.models.planar import Planar, PlanarState, furniture
+from palpate.models.planar.shapes import rectangle
+from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.models.rope import Rope, RopeState
 from palpate.parameters import parameters_of, with_values
-from toys import Cart
+from toys import Cart, Pendulum
 
 BOUND = 0.05
 
@@ -22,10 +23,11 @@ BOUND = 0.05
 def network(model, trained: bool = True, key: int = 0) -> SiteNetwork:
     """With random weights in every layer, or as it starts."""
     state, actions = motion(model, batch=50)
-    features = model.residual_features(state, actions[:, 0])
-    sites, axes = model.correction_shape
+    physics = correctable(model)
+    features = physics.residual_features(state, actions[:, 0])
+    (sites, axes), groups = physics.correction_shape, physics.correction_neighbours.shape[1]
     created = SiteNetwork.create(
-        jax.random.key(key), features, jnp.full(sites, BOUND), axes, width=8
+        jax.random.key(key), features, jnp.full(sites, BOUND), axes, groups, width=8
     )
     if not trained:
         return created
@@ -54,9 +56,16 @@ def rope(**fields) -> Rope:
     return Rope.uniform(length=0.4, mass=0.03, nodes=6, **fields)
 
 
+def bodies(**fields) -> Planar:
+    box = rectangle(0.6, 0.4)
+    return furniture([box, 0.5 * box, 2.0 * box], **fields)
+
+
 MODELS = {
-    "cart": CorrectableCart(1.0, 0.2),
-    "pendulum": CorrectablePendulum(1.0, 0.2),
+    "cart": Cart(1.0, 0.2),
+    "pendulum": Pendulum(1.0, 0.2),
+    "bodies": bodies(),
+    "bodies, one of them bolted": bodies(bolted=[1], poses=np.zeros((3, 3))),
     "rope held at both ends": rope(),
     "rope held at one end": rope(driven=(0,)),
     "rope that is accelerated": rope(driven=(5,), drive="acceleration"),
@@ -90,9 +99,9 @@ def test_untrained_it_moves_as_the_physics_does(kind):
 def test_a_batch_is_its_members(model):
     state, actions = motion(model)
     corrected = Residual(model, network(model))
-    together = model.corrected(state, corrected.correction(state, actions[:, 0]))
+    together = correctable(model).corrected(state, corrected.correction(state, actions[:, 0]))
     member = jax.tree.map(lambda x: x[1], state)
-    alone = model.corrected(member, corrected.correction(member, actions[1, 0]))
+    alone = correctable(model).corrected(member, corrected.correction(member, actions[1, 0]))
     for batch, single in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(batch[1], single, rtol=1e-4, atol=1e-6)
 
@@ -100,10 +109,14 @@ def test_a_batch_is_its_members(model):
 def test_what_is_corrected_is_what_lies_between(model):
     state, actions = motion(model)
     correction = Residual(model, network(model)).correction(state, actions[:, 0])
-    assert correction.shape == (3, *model.correction_shape)
+    assert correction.shape == (3, *correctable(model).correction_shape)
     assert np.max(np.abs(correction)) > 0.1 * BOUND
-    found = model.correction_between(state, model.corrected(state, correction))
-    free = np.ones(model.correction_shape)
+    found = correctable(model).correction_between(
+        state, correctable(model).corrected(state, correction)
+    )
+    free = np.ones(correctable(model).correction_shape)
+    if isinstance(model, Planar):
+        free -= np.asarray(model.bolted)[:, None]
     if isinstance(model, Rope):
         free[list(model.driven)] = 0.0
         # Where the ends are near each other the axes are shorter than one, both ways.
@@ -130,7 +143,7 @@ def test_turned_and_moved_it_does_the_same_turned_and_moved(driven):
     corrected = Residual(model, network(model))
 
     def kicked(state, action):
-        return model.corrected(state, corrected.correction(state, action)).velocity
+        return correctable(model).corrected(state, corrected.correction(state, action)).velocity
 
     turned = RopeState(state.position @ turn.T + away, state.velocity @ turn.T)
     action = actions[:, 0]
@@ -149,21 +162,148 @@ def test_a_rope_whose_ends_meet_has_finite_derivatives():
         correction = Residual(model, network(model)).correction(
             RopeState(position, state.velocity), actions[:, 0]
         )
-        return jnp.sum(model.corrected(state, correction).velocity)
+        return jnp.sum(correctable(model).corrected(state, correction).velocity)
 
     assert np.all(np.isfinite(jax.grad(moved)(closed)))
 
 
-def test_it_subtracts_observations_and_names_units_as_the_physics_does():
-    class Wrapped(CorrectablePendulum):
-        observation_units = ("rad",)
+def test_bodies_turned_and_moved_are_corrected_the_same_turned_and_moved():
+    model = bodies()
+    state, actions = motion(model)
+    corrected, action = Residual(model, network(model)), actions[:, 0]
+    sine, cosine = np.sin(2.1), np.cos(2.1)
+    turn = jnp.asarray([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], jnp.float32)
+    away = jnp.asarray([0.3, -0.2, 2.1], jnp.float32)
+    turned = PlanarState(state.pose @ turn.T + away, state.velocity @ turn.T)
+    here = corrected._kicked(state, action).velocity - state.velocity
+    there = corrected._kicked(turned, action @ turn.T).velocity - turned.velocity
+    np.testing.assert_allclose(there, here @ turn.T, atol=1e-5)
+    assert np.min(np.max(np.abs(here), axis=(0, 2))) > 0.1 * BOUND
 
-        def difference(self, predicted, observed):
-            return jnp.sin(predicted - observed)
 
-    corrected = Residual(Wrapped(1.0, 0.2), network(MODELS["pendulum"]))
-    assert corrected.observation_units == ("rad",)
-    assert float(corrected.difference(jnp.ones(1), jnp.zeros(1))[0]) == pytest.approx(np.sin(1.0))
+def test_a_body_is_corrected_by_what_itself_does():
+    model = bodies()
+    state, actions = motion(model)
+    corrected = Residual(model, network(model))
+    faster = PlanarState(state.pose, state.velocity.at[:, 1].multiply(3.0))
+    change = corrected.correction(faster, actions[:, 0]) - corrected.correction(
+        state, actions[:, 0]
+    )
+    assert np.all(np.any(np.asarray(change) != 0.0, axis=(0, 2)) == [False, True, False])
+
+
+def test_in_a_chain_a_layer_sees_the_site_before_the_site_and_the_one_after():
+    """What files of version 2 were written for: weights in this order, zeros beyond the ends."""
+    model = MODELS["rope held at one end"]
+    state, actions = motion(model)
+    net = network(model)
+    features = model.residual_features(state, actions[:, 0])
+    x = (features - net.mean) / net.deviation
+    x = jnp.concatenate([x, jnp.broadcast_to(net.place, (*x.shape[:-1], 4))], axis=-1)
+    for weight, bias in zip(net.weights, net.biases, strict=True):
+        nothing = jnp.zeros_like(x[..., :1, :])
+        before = jnp.concatenate([nothing, x[..., :-1, :]], axis=-2)
+        after = jnp.concatenate([x[..., 1:, :], nothing], axis=-2)
+        x = jnp.tanh(jnp.concatenate([before, x, after], axis=-1) @ weight + bias)
+    found = net(features, model.correction_neighbours)
+    np.testing.assert_array_equal(found, net.bound[:, None] * x)
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "seen"),
+    [
+        ([[[0, -1], [1, 2]], [[1, -1], [0, 2]], [[2, -1], [0, 1]]], [[1, 5], [2, 4.5], [8, 1.5]]),
+        (
+            [
+                [[-1, -1], [0, -1], [1, 2]],
+                [[0, -1], [1, -1], [-1, -1]],
+                [[0, -1], [2, -1], [-1] * 2],
+            ],
+            [[0, 1, 5], [1, 2, 0], [1, 8, 0]],
+        ),
+    ],
+    ids=["set", "tree"],
+)
+def test_a_layer_sees_the_means_of_the_groups_that_the_model_names(neighbours, seen):
+    neighbours, seen = np.array(neighbours), np.array(seen)
+    groups = neighbours.shape[1]
+    weight = jnp.linspace(0.1, 0.3, groups)[:, None]
+    one = SiteNetwork(
+        mean=jnp.zeros((3, 1)),
+        deviation=jnp.ones((3, 1)),
+        bound=jnp.ones(3),
+        place=jnp.zeros((3, 0)),
+        weights=(weight,),
+        biases=(jnp.zeros(1),),
+    )
+    one.check_layers(groups)
+    found = one(jnp.array([[[1.0], [2.0], [8.0]]]), neighbours)
+    np.testing.assert_allclose(found[0], np.tanh(seen @ weight), rtol=1e-6)
+
+
+class Marked(Pendulum):
+    """A pendulum that overrides all of the contract: nothing in it is `Model`'s default."""
+
+    action_shape = (1,)
+    observation_shape = (1,)
+    observation_units = ("rad",)
+
+    def difference(self, predicted, observed):
+        return jnp.sin(predicted - observed)
+
+    def observe(self, state):
+        return jnp.cos(state.angle)
+
+    def velocity(self, state):
+        return state.angle
+
+    def stepper(self):
+        return lambda state, action: self.step(state, 2.0 * action)
+
+    def constrain(self):
+        return Marked(2.0, 0.2)
+
+
+ONE, STATE = jnp.ones(1), Marked(1.0, 0.2).initial_state(jnp.ones((2, 1)))
+FORWARDED = {
+    "control_period": None, "action_shape": None, "observation_shape": None,
+    "observation_units": None, "observe": (STATE,), "difference": (ONE, 3.0 * ONE),
+    "initial_state": (jnp.ones((2, 1)),), "velocity": (STATE,),
+}  # fmt: skip
+CORRECTED = {"overrides", "step", "stepper", "independent_parts", "constrain"}
+
+
+def test_each_member_of_a_model_is_forwarded_or_corrected():
+    """A new member of `Model` belongs in one of the lists above, and in `Residual`."""
+    own = {name for name in dir(Model) if not hasattr(eqx.Module, name)} | set(
+        Model.__annotations__
+    )
+    public = {name for name in own if not name.startswith("_")}
+    assert public == {*FORWARDED, *CORRECTED}
+    assert public <= {*vars(Residual), *Residual.__annotations__}
+
+
+@pytest.mark.parametrize("name", FORWARDED)
+def test_what_is_forwarded_is_that_of_the_physics(name):
+    physics = Marked(1.0, 0.2, control_period=0.03)
+    expected = getattr(physics, name)
+    found = getattr(Residual(physics, network(physics)), name)
+    if FORWARDED[name] is not None:
+        expected, found = expected(*FORWARDED[name]), found(*FORWARDED[name])
+    assert eqx.tree_equal(found, expected)
+
+
+def test_what_is_corrected_goes_through_the_physics():
+    physics = Marked(1.0, 0.2)
+    corrected = Residual(physics, network(physics))
+    kicked = correctable(physics).corrected(STATE, corrected.correction(STATE, ONE))
+    assert kicked.rate == STATE.rate  # `Marked` takes the angle for the velocity
+    assert kicked.angle != STATE.angle
+    assert eqx.tree_equal(corrected.step(STATE, ONE), physics.step(kicked, ONE))
+    assert eqx.tree_equal(corrected.stepper()(STATE, ONE), physics.step(kicked, 2.0 * ONE))
+    assert corrected.constrain().physics.length == 2.0
+    (part, of), *others = corrected.independent_parts()
+    assert (part is corrected, of, others) == (True, (0,), [])
 
 
 def test_its_parameters_are_those_of_the_physics_and_stay_legal():
@@ -189,17 +329,52 @@ def test_it_is_compiled_once():
 
 
 def test_what_does_not_fit_together_is_refused():
-    with pytest.raises(PalpateError, match=r"^Cart cannot be corrected by a network: expected a "):
-        Residual(Cart(1.0, 0.2), network(MODELS["cart"]))
-    with pytest.raises(PalpateError, match=r"expects a correction of shape \(6, 3\), .*\(1, 1\)$"):
+    with pytest.raises(PalpateError, match=r"^a layer .* each of 3 groups .*\(21, outputs\)"):
         Residual(rope(), network(MODELS["cart"]))
+    more = dataclasses.replace(rope(), control_period=0.02)
+    five = Rope.uniform(length=0.4, mass=0.03, nodes=5, driven=(0,))
+    with pytest.raises(PalpateError, match=r"expects a correction of shape \(5, 3\), .*\(6, 3\)$"):
+        Residual(five, network(more))
     whole = network(rope())
     for change, sentence in (
         ({"bound": jnp.ones(5)}, r"^'bound' .* shape \(6,\), got \(5,\)$"),
         ({"place": jnp.ones((5, 4))}, r"^'place' .* shape \(6, 4\), got \(5, 4\)$"),
         ({"place": jnp.ones(6)}, r"at least one layer, got \(6, 11\), \(6,\) and 3$"),
         ({"biases": whole.biases[1:]}, "^a correction of 3 layers needs as many biases, got 2$"),
-        ({"weights": whole.weights[::-1]}, r"needs weights \(45, outputs\) and biases"),
     ):
         with pytest.raises(PalpateError, match=sentence):
             dataclasses.replace(whole, **change)
+    backwards = dataclasses.replace(whole, weights=whole.weights[::-1])
+    with pytest.raises(PalpateError, match=r"needs weights \(45, outputs\) and biases"):
+        Residual(rope(), backwards)
+
+
+def test_a_model_that_does_not_say_its_velocity_is_told_what_to_implement():
+    class Turning(Cart):
+        def initial_state(self, observations):
+            return super().initial_state(observations), jnp.zeros(2)
+
+    class Velocities(Turning):
+        def velocity(self, state):
+            return state[1]
+
+    class Elsewhere(Turning):
+        def velocity(self, state):
+            return jnp.zeros(2)
+
+    with pytest.raises(PalpateError, match=r"^Turning does not say which leaf .* override `Model"):
+        correctable(Turning(1.0, 0.2))
+    with pytest.raises(PalpateError, match=r"^Elsewhere.velocity must return one floating leaf"):
+        correctable(Elsewhere(1.0, 0.2))
+    assert correctable(Velocities(1.0, 0.2)).correction_shape == (1, 2)
+
+
+def test_neighbours_that_are_no_sites_are_refused():
+    class Lost(Rope):
+        @property
+        def correction_neighbours(self):
+            return super().correction_neighbours + 1
+
+    lost = Lost.uniform(length=0.4, mass=0.03, nodes=6, driven=(0, 1, 4, 5), drive="position")
+    with pytest.raises(PalpateError, match=r"^the neighbours that Lost .* from -1 to 5, got \[\["):
+        Residual(lost, network(rope()))

@@ -174,11 +174,10 @@ def _corrected(path: str | Path, physics: Model, content: Any) -> Residual:
             arrays[name] = tuple(jnp.asarray(layer, jnp.float32) for layer in layers)
         else:
             arrays[name] = jnp.asarray(_numbers(path, where, value), jnp.float32)
-    model = correctable(physics)
     seen = jax.eval_shape(
-        lambda: model.residual_features(
-            model.initial_state(jnp.zeros((1, *model.observation_shape))),
-            jnp.zeros(model.action_shape),
+        lambda: correctable(physics).residual_features(
+            physics.initial_state(jnp.zeros((1, *physics.observation_shape))),
+            jnp.zeros(physics.action_shape),
         )
     )
     if arrays["mean"].shape != seen.shape:

@@ -66,6 +66,24 @@ class Model(eqx.Module):
         Shape (frames, *observation_shape), with or without a batch axis before.
         """
 
+    def velocity(self, state: Any) -> Any:
+        """The leaf of a state that is its velocity, which a learned correction adds to.
+
+        The second of two floating leaves of one shape: position and rate. Raises `PalpateError`
+        for another state: its model overrides this.
+        """
+        leaves = jax.tree.leaves(state)
+        kinds = [(leaf.shape, jnp.issubdtype(leaf.dtype, jnp.floating)) for leaf in leaves]
+        if len(leaves) != 2 or kinds[0] != kinds[1] or not kinds[1][1]:
+            raise PalpateError(
+                f"{type(self).__name__} does not say which leaf of its state is the velocity: "
+                "expected a state of two floating arrays of one shape, position and rate, got "
+                + ", ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in leaves)
+                + "; override `Model.velocity`, which returns the leaf, or implement "
+                "`models.residual.Correctable`"
+            )
+        return leaves[1]
+
     def independent_parts(self) -> tuple[tuple["Model", tuple[int, ...]], ...]:
         """What moves by itself, whatever the rest does, as models, and where each is in this one.
 

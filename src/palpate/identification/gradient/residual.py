@@ -38,11 +38,11 @@ from palpate.runs.progress import interruptible, progress
 
 CHECK = 20  # iterations between looks at the held-out trials
 CONFIDENCE = 0.95  # that the gain on held-out trials is not chance, one-sided
-LEAST_GAIN = 0.02  # of the physics' error, below which a correction is not worth carrying
+MIN_GAIN = 0.02  # of the physics' error, below which a correction is not worth carrying
 AVERAGED = 30  # iterations whose networks are averaged (Polyak): one alone is noisy
 # Share of what the physics changes below which a correction mends no physics: it makes up for how
 # well the start of a prediction is known, which gains as much on data that the physics made itself.
-LEAST_SIZE = 0.01
+MIN_SIZE = 0.01
 EXAMPLES = 2000  # states that the features are normalised by
 
 
@@ -192,6 +192,7 @@ def _start(model: Model, source: SegmentSource, settings: ResidualSettings) -> S
         features,
         bound,
         change.shape[-1],
+        physics.correction_neighbours.shape[1],
         width=settings.width,
         depth=settings.depth,
     )
@@ -221,11 +222,11 @@ def _descend(
             rng = np.random.default_rng((settings.seed, descent.iteration))
             segments = source.sample(rng, settings.windows, horizon)
             state = (descent.network, descent.optimiser, descent.average, model, scale)
-            *state, loss = _improved(devices.everywhere(state), segments, settings)
+            *state, loss = _iteration(devices.everywhere(state), segments, settings)
             step = descent.iteration + 1
             looked = step % CHECK == 0 or step == len(stages)
-            found = _look(model, state[-1], judge) if looked else None
-            descent = _judged(descent, *state, found)
+            found = _held_out_error(model, state[-1], judge) if looked else None
+            descent = _advanced(descent, *state, found)
             bar.show(loss=loss, held_out=descent.least / physics.mean_absolute)
             if run is not None:
                 known = float(loss) if np.isfinite(loss) else None
@@ -234,7 +235,7 @@ def _descend(
                     run.save(step, descent)
             if stop or descent.stale >= settings.patience:
                 break
-    return _here(descent.best)
+    return _on_default_device(descent.best)
 
 
 def _optimiser(settings: ResidualSettings) -> optax.GradientTransformation:
@@ -242,18 +243,18 @@ def _optimiser(settings: ResidualSettings) -> optax.GradientTransformation:
     rate = optax.cosine_decay_schedule(settings.learning_rate, sum(settings.iterations))
     return optax.chain(
         optax.clip_by_global_norm(settings.clip),
-        optax.adamw(rate, weight_decay=settings.weight_decay, mask=_weights_alone),
+        optax.adamw(rate, weight_decay=settings.weight_decay, mask=_weights_only),
     )
 
 
-def _weights_alone(network: SiteNetwork) -> SiteNetwork:
+def _weights_only(network: SiteNetwork) -> SiteNetwork:
     """True for the weights, False for all other leaves."""
     nothing = jax.tree.map(lambda _: False, network)
     return eqx.tree_at(lambda n: n.weights, nothing, (True,) * len(network.weights))
 
 
 @eqx.filter_jit
-def _improved(
+def _iteration(
     state: tuple[SiteNetwork, Any, SiteNetwork, Model, Array],
     segments: Segments,
     settings: ResidualSettings,
@@ -285,19 +286,19 @@ def _improved(
     return network, moments, average, jnp.where(finite, loss, jnp.nan)
 
 
-def _here(tree: SiteNetwork) -> SiteNetwork:
+def _on_default_device(tree: SiteNetwork) -> SiteNetwork:
     """The arrays on the default device alone."""
     return jax.tree.map(jnp.asarray, jax.device_get(tree))
 
 
-def _look(model: Model, network: SiteNetwork, judge: Aligned) -> float | None:
+def _held_out_error(model: Model, network: SiteNetwork, judge: Aligned) -> float | None:
     """Mean absolute error of the open-loop predictions of the held-out trials."""
-    corrected = Residual(physics=model, network=_here(network))
+    corrected = Residual(physics=model, network=_on_default_device(network))
     error = prediction_error(corrected, judge).mean_absolute
     return error if np.isfinite(error) else None
 
 
-def _judged(
+def _advanced(
     descent: Descent, network: SiteNetwork, moments: Any, average: SiteNetwork, found: float | None
 ) -> Descent:
     """The descent one iteration on; `found` is the error on the held-out trials, if looked at."""
@@ -312,26 +313,26 @@ def _verdict(physics: PredictionError, corrected: PredictionError, size: float) 
     """Whether to keep a correction, and the sentence that says why.
 
     Student's t on the gain of each held-out trial: what is kept must gain more than chance gives,
-    and more than `LEAST_GAIN`, with more than `LEAST_SIZE`.
+    and more than `MIN_GAIN`, with more than `MIN_SIZE`.
     """
     before, after = physics.by_trial, corrected.by_trial
-    told = np.isfinite(before) & np.isfinite(after)
-    gain, count = (before - after)[told], int(told.sum())
+    predicted = np.isfinite(before) & np.isfinite(after)
+    gain, count = (before - after)[predicted], int(predicted.sum())
     relative = 1.0 - corrected.mean_absolute / physics.mean_absolute
     if count < 2 or not np.isfinite(relative):
         return False, "dropped: fewer than two held-out trials can be predicted with it"
     chance = student.ppf(CONFIDENCE, count - 1) * np.std(gain, ddof=1) / np.sqrt(count)
-    said = f"on {count} held-out trials the error falls by {relative:.1%}"
-    if relative < LEAST_GAIN:
-        return False, f"dropped: {said}, less than the {LEAST_GAIN:.0%} that would be worth it"
-    if size < LEAST_SIZE:
+    gained = f"on {count} held-out trials the error falls by {relative:.1%}"
+    if relative < MIN_GAIN:
+        return False, f"dropped: {gained}, less than the {MIN_GAIN:.0%} that would be worth it"
+    if size < MIN_SIZE:
         return False, (
-            f"dropped: {said}, but it is {size:.1%} of what the physics changes: noise in the "
+            f"dropped: {gained}, but it is {size:.1%} of what the physics changes: noise in the "
             "start of a prediction allows as much"
         )
     if np.mean(gain) <= chance:
-        return False, f"dropped: {said}, which may be chance ({int(np.sum(gain > 0))} gain)"
-    return True, f"kept: {said}, {int(np.sum(gain > 0))} of them gain"
+        return False, f"dropped: {gained}, which may be chance ({int(np.sum(gain > 0))} gain)"
+    return True, f"kept: {gained}, {int(np.sum(gain > 0))} of them gain"
 
 
 @eqx.filter_jit

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from palpate.models.planar.checks import coupled
 from palpate.models.planar.integration import advance
@@ -119,6 +119,42 @@ class Planar(PlanarParameters):
 
         return step
 
+    @property
+    def correction_shape(self) -> tuple[int, int]:
+        """(bodies, 3): see `models.residual.Correctable`."""
+        return self.bodies, 3
+
+    @property
+    def correction_neighbours(self) -> Int[np.ndarray, "bodies 1 1"]:
+        """Each body sees itself alone: how bodies act on each other is left to the physics."""
+        return np.arange(self.bodies)[:, None, None]
+
+    def residual_features(
+        self, state: PlanarState, action: Float[Array, "*batch bodies 3"]
+    ) -> Float[Array, "*batch bodies 6"]:
+        """Velocity and wrench of each body in its own axes: m/s, m/s, rad/s, N, N, N m."""
+        own = [_turned(each, -state.pose[..., 2]) for each in (state.velocity, action)]
+        return jnp.concatenate(own, axis=-1)
+
+    def corrected(
+        self, state: PlanarState, correction: Float[Array, "*batch bodies 3"]
+    ) -> PlanarState:
+        """The state with velocities added to what is not bolted.
+
+        In m/s along each body's own axes, and in m/s at `even_gyration` from its origin.
+        """
+        turning = correction[..., 2] / self.even_gyration
+        added = _turned(correction.at[..., 2].set(turning), state.pose[..., 2])
+        return PlanarState(state.pose, state.velocity + (1.0 - self.bolted[..., None]) * added)
+
+    def correction_between(
+        self, state: PlanarState, following: PlanarState
+    ) -> Float[Array, "*batch bodies 3"]:
+        """Change of the velocities of what is not bolted, as `corrected` adds them."""
+        change = (1.0 - self.bolted[..., None]) * (following.velocity - state.velocity)
+        change = _turned(change, -state.pose[..., 2])
+        return change.at[..., 2].set(change[..., 2] * self.even_gyration)
+
     def independent_parts(self) -> tuple[tuple["Planar", tuple[int, ...]], ...]:
         """Groups of bodies that no link and no contact couples; without links, no room for them."""
         groups = coupled(self)
@@ -212,6 +248,12 @@ def _side_by_side(arrays: Sequence[Array], axes: Sequence[int], lanes: int = 1) 
     ]
     lanes = max(lanes, *(array.shape[-1] for array in last))
     return [jnp.broadcast_to(array, (*array.shape[:-1], lanes)) for array in last]
+
+
+def _turned(vectors: Array, angle: Array) -> Array:
+    """(*batch, bodies, 3) velocities or wrenches after their body was turned by an angle."""
+    x, y = turn(vectors[..., 0], vectors[..., 1], jnp.cos(angle), jnp.sin(angle))
+    return jnp.stack([x, y, vectors[..., 2]], axis=-1)
 
 
 def wrapped(angle: Array) -> Array:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from palpate.errors import PalpateError
 from palpate.models.rope import kernel, own_frame, stability
@@ -204,6 +204,13 @@ class Rope(RopeParameters):
     def correction_shape(self) -> tuple[int, int]:
         """(nodes, 3): see `models.residual.Correctable`."""
         return self.nodes, 3
+
+    @property
+    def correction_neighbours(self) -> Int[np.ndarray, "nodes 3 1"]:
+        """A chain: the node before, the node itself, the node after."""
+        node = np.arange(self.nodes)
+        after = np.append(node[1:], -1)
+        return np.stack([node - 1, node, after], axis=-1)[..., None]
 
     def residual_features(
         self, state: RopeState, action: Float[Array, "*batch driven 3"]

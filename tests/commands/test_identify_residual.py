@@ -11,7 +11,6 @@ from palpate.commands import identify, identify_data
 from palpate.errors import PalpateError
 from palpate.families.options import Identify
 from palpate.identification.gradient.residual import ResidualSettings
-from palpate.models import files
 from palpate.models.files import load_model
 from palpate.models.model import rollout
 from palpate.models.residual import Residual
@@ -48,8 +47,7 @@ class StickyCart(Cart):
 
 
 @pytest.fixture
-def recording(tmp_path, monkeypatch):
-    monkeypatch.setitem(files.MODELS, "cart", Cart)
+def recording(tmp_path, monkeypatch, toys):
     few = {"horizons": (0.5,), "iterations": (60,), "windows": 8, "width": 8}
     monkeypatch.setattr(
         identify,

@@ -1,7 +1,7 @@
 """What a family of another package brings to the commands: a pendulum with a world of its own."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -120,7 +120,7 @@ class IdentifyPendulum(Identify):
     def action(self, recording: Recording) -> str:
         return ACCELERATION
 
-    def start(self, aligned: Aligned) -> Pendulum:
+    def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Pendulum:
         return Pendulum(length=1.0, damping=0.2, control_period=aligned.period)
 
 

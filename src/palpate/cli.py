@@ -155,8 +155,7 @@ def _run(words: list[str]) -> int:
     options = parse(kind_of_options, program, rest)
     if options is None:
         return 0
-    work = getattr(kind_of_options, "worker", command.run)
-    resolve(work)(options, *([kind] if name == "reproduce" else []))
+    resolve(command.run)(options, *([kind] if name == "reproduce" else []))
     return 0
 
 

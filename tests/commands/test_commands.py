@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from palpate.cli import main
-from palpate.commands import demo, folders, identify, reproduce, train
+from palpate.commands import demo, folders, identify, identify_data, reproduce, train
+from palpate.commands.identify_report import FitReport
 from palpate.commands.options import Reproduce
 from palpate.errors import PalpateError
 from palpate.families.options import Identify, Train
@@ -17,10 +18,11 @@ from palpate.families.rope.demo import PICTURE, DemoRope, Size
 from palpate.families.rope.options import IdentifyRope, RecordRope
 from palpate.identification.data.prediction import PredictionError
 from palpate.identification.data.segments import known_start
-from palpate.identification.gradient.least_squares import Intervals
+from palpate.identification.declarations import with_declarations
 from palpate.models.files import load_model
 from palpate.models.model import rollout
 from palpate.networks import load_policy
+from palpate.parameters import describe
 from palpate.recordings import Channel, Driven, Recording, Role, Trial
 from palpate.recordings.files import read_recording, write_recording
 from palpate.report import read_evidence
@@ -52,7 +54,7 @@ class IdentifyToy(Identify):
     def action(self, recording):
         return "motor"
 
-    def start(self, aligned):
+    def reference(self, recordings, aligned):
         return START[self.family]
 
 
@@ -183,7 +185,7 @@ def test_the_error_at_the_end_is_the_last_that_was_seen(tmp_path):
     assert "NaN" not in (folder / "result.json").read_text()
 
 
-def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap():
+def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap(tmp_path):
     seen = np.ones((4, 6, 2, 3), bool)
     seen[:, 2] = seen[1:, 3] = seen[:, 4, 1] = False
     prediction, target = np.full(seen.shape, 0.1), np.zeros(seen.shape)
@@ -192,15 +194,19 @@ def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap():
     segments = known_start(*map(jnp.asarray, (*start, target, seen)))
     by_trial, time = np.array([2.0, 1.0, np.nan, np.nan]), 0.1 * np.arange(1, 7)
     error = PredictionError(0.1, by_trial, time, np.ones(6), prediction, segments)
-    nothing = Intervals({}, {}, {}, ())
-    identified = identify.Identified(START["cart"], nothing, error, error, error)
-    found = identify.evidence(identified, "m")
+    file = recorded("cart", tmp_path / "cart.npz", trials=1)
+    data = identify_data.read(IdentifyToy(recordings=(file,)))
+    metres, newtons = (
+        FitReport(
+            START["cart"], error, error, error, dataclasses.replace(data, unit=unit), None
+        ).evidence()
+        for unit in ("m", "N")
+    )
     for edge in ("low", "high"):
-        assert np.flatnonzero(np.isnan(found[f"horizon.identified.{edge}"])).tolist() == [2]
-    np.testing.assert_allclose(found["horizon.identified.low"][3], 6.9 * np.sqrt(3), rtol=1e-5)
-    np.testing.assert_allclose(found["motion.observed"][0], 7.0)
-    assert np.isnan(found["motion.observed"][2]).all()
-    newtons = identify.evidence(identified, "N")
+        assert np.flatnonzero(np.isnan(metres[f"horizon.identified.{edge}"])).tolist() == [2]
+    np.testing.assert_allclose(metres["horizon.identified.low"][3], 6.9 * np.sqrt(3), rtol=1e-5)
+    np.testing.assert_allclose(metres["motion.observed"][0], 7.0)
+    assert np.isnan(metres["motion.observed"][2]).all()
     assert not any(name.startswith("motion") for name in newtons)  # no places, whatever the shape
 
 
@@ -209,10 +215,12 @@ def test_validation_is_scored_as_recorded_and_not_fitted(tmp_path):
         recordings=(recorded("cart", tmp_path / "a.npz", trials=2),),
         validate=(recorded("cart", tmp_path / "b.npz", trials=3),),
     )
-    data = identify.read(options)
+    data = identify_data.read(options)
     assert len(data.fitted.trials) == 2
     assert len(data.validation.trials) == 3
-    both = identify.read(dataclasses.replace(options, validate=(), recordings=options.validate * 2))
+    both = identify_data.read(
+        dataclasses.replace(options, validate=(), recordings=options.validate * 2)
+    )
     assert {trial.name for trial in both.fitted.trials}.isdisjoint(
         trial.name for trial in both.validation.trials
     )
@@ -232,7 +240,7 @@ def test_what_was_put_right_is_said_of_every_recording(tmp_path, capsys):
 
     fitted, validation = marked("a.npz", [7], 4), marked("b.npz", [11, 12], 5)
     options = IdentifyRope(recordings=(fitted,), validate=(validation,))
-    identify.read(options)
+    identify_data.read(options)
     unseen = "unseen positions of driven markers were interpolated"
     assert capsys.readouterr().out.splitlines() == [
         "note: trial 'one', markers: 4 unlabelled markers were left out",
@@ -240,19 +248,19 @@ def test_what_was_put_right_is_said_of_every_recording(tmp_path, capsys):
         "note: validation, trial 'one', markers: 5 unlabelled markers were left out",
         f"note: validation, trial 'one', grip: 2 {unseen}",
     ]
-    identify.read(dataclasses.replace(options, nodes=3, validate=()))
+    identify_data.read(dataclasses.replace(options, nodes=3, validate=()))
     assert capsys.readouterr().out.splitlines()[1] == f"note: trial 'one', grip: 1 {unseen}"
 
 
 def test_parameters_are_freed_fixed_and_shared_by_name():
-    cart = identify.with_declarations(START["cart"], (), ("mass",), ("friction",))
-    rows = {row["name"]: row for row in identify.describe(cart)}
+    cart = with_declarations(START["cart"], (), ("mass",), ("friction",))
+    rows = {row["name"]: row for row in describe(cart)}
     assert rows["mass"]["fixed"]
     assert rows["friction"]["shared"]
     with pytest.raises(PalpateError, match=r"unknown parameter 'mas'; did you mean 'mass'\?"):
-        identify.with_declarations(cart, ("mas",), (), ())
+        with_declarations(cart, ("mas",), (), ())
     with pytest.raises(PalpateError, match="'mass' cannot be fixed and identified"):
-        identify.with_declarations(cart, (), ("mass",), ("mass",))
+        with_declarations(cart, (), ("mass",), ("mass",))
 
 
 # --- recording --------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayesian_toys import NOISE, Sled
-from palpate.commands import identify_bayesian
+from palpate.commands import identify, identify_report
 from palpate.errors import PalpateError
 from palpate.families.furniture.options import IdentifyFurniture
 from palpate.families.furniture.recording import POSE, WRENCH
@@ -29,7 +29,7 @@ SLED = Sled(mass=14.0, friction=[6.0, 40.0])
 @pytest.mark.parametrize("few", [{"draws": 3}, {"draws": -1}, {"chains": 0}, {"chains": -2}])
 def test_fewer_draws_than_can_be_judged_are_refused_before_anything_is_read(few):
     with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
-        identify_bayesian.run(IdentifyFurniture(recordings=(), **few))
+        identify.run(IdentifyFurniture(recordings=(), **few))
     target = motion_posterior(SLED, unseen_angle(), known_scales(SLED, NOISE))
     with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
         compare({"sled": target}, **few)
@@ -63,18 +63,18 @@ def test_what_cannot_be_scored_on_is_refused_before_anything_is_sampled(
     def began(*_):
         raise AssertionError("expected to be refused before what takes minutes")
 
-    monkeypatch.setattr(identify_bayesian, "posterior_of", began)
+    monkeypatch.setattr(identify, "identify", began)
     monkeypatch.setattr(IdentifyFurniture, "hypotheses", began)  # of several bodies it takes long
     fitted, scored = still(tmp_path / "R.npz"), still(tmp_path / "P.npz", seen)
     options = IdentifyFurniture(recordings=(fitted,), validate=(scored,), out=tmp_path / "out")
     with pytest.raises(PalpateError, match=sentence):
-        identify_bayesian.run(options)
+        identify.run(options)
 
 
 def test_too_little_is_refused(tmp_path):
     short = still(tmp_path / "R.npz", count=6)
     with pytest.raises(PalpateError, match=r"last 0\.\d+ s in all: expected at least 0\.5 s"):
-        identify_bayesian.run(IdentifyFurniture(recordings=(short,)))
+        identify.run(IdentifyFurniture(recordings=(short,)))
 
 
 def test_nobody_knows_whether_what_is_seen_twice_began_at_rest():
@@ -103,17 +103,17 @@ def test_the_error_of_what_nobody_saw_is_said_to_be_unknown(capsys):
     draws = Draws(position, np.zeros((2, 20)), np.ones(2), 0, 40, 1.0, 0.0)
     posterior = Posterior(Settled(target, ()), draws, pieces)
     found = score(target, predicted, pieces)
-    figures = identify_bayesian._figures(posterior, found, SLED, 1.0)
+    figures = identify_report.drawn_figures(posterior, found, SLED, 1.0, "m, m, rad")
     values = {figure.name: figure.value for figure in figures}
     assert values["rmse_m"] == pytest.approx(np.sqrt((14 * 3**2 + 4 * 6**2) / 18))
     assert values["rmse_rad"] is None
     settings = {"probability": {"sled": 1.0}, "scored_on": "what was fitted"}
     result = Result(
-        "x", figures, settings, [0], None, 1.0, parameters=identify_bayesian.rows(posterior)
+        "x", figures, settings, [0], None, 1.0, parameters=identify_report.drawn_rows(posterior)
     )
-    identify_bayesian._print(result)
+    identify_report.show(result)
     assert f"error {values['rmse_m']:.3g} m, unknown rad;" in capsys.readouterr().out
-    horizon = identify_bayesian._horizon(predicted, pieces, SLED)
+    horizon = identify_report.expected_errors(predicted, pieces, SLED)
     for name in ("horizon.error", "horizon.expected"):
         assert np.isfinite(horizon[name]).tolist() == [True] * 7 + [False]
     assert horizon["horizon.error"][6] == pytest.approx(3.0)

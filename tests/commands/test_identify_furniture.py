@@ -117,12 +117,12 @@ def test_angles_may_be_wrapped():
 def test_what_may_be_is_asked_of_recordings_of_the_same_bodies():
     far, near = two_boxes(np.full(20, 2.0)), two_boxes(np.full(20, 0.1))
     options = IdentifyFurniture(recordings=(), structure="feet")
-    (model,) = options.hypotheses([far, near], 1 / RATE).models.values()
+    (model,) = options.hypotheses([far, near], far.align(1 / RATE)).models.values()
     assert len(model.pairs) == 3
     assert len(options.sufficient(model, [far]).pairs) == 0
     assert len(options.sufficient(model, [far, near]).pairs) == 1
     with pytest.raises(PalpateError, match="expected the same bodies"):
-        options.reference([far, prepare(recording(*still()))], 1 / RATE)
+        options.reference([far, prepare(recording(*still()))], far.align(1 / RATE))
 
 
 def test_rest_is_told_from_motion():

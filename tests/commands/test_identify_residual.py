@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palpate.commands import identify, identify_data
+from palpate.commands import identify
 from palpate.errors import PalpateError
 from palpate.families.options import Identify
 from palpate.identification.gradient.residual import ResidualSettings
@@ -34,7 +34,7 @@ class IdentifyCart(Identify):
     def action(self, recording):
         return "motor"
 
-    def start(self, aligned):
+    def reference(self, recordings, aligned):
         return Cart(1.0, 0.2)
 
 
@@ -107,7 +107,7 @@ def test_nothing_is_said_of_a_correction_that_was_not_asked_for(recording, tmp_p
 def test_too_few_trials_are_refused_before_anything_is_fitted(recording, tmp_path):
     options = IdentifyCart(recordings=(recording,), residual=True, out=tmp_path / "run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identify_data, "HELD_OUT", 0.9)
+        patch.setattr(IdentifyCart, "held_out", 0.9)
         with pytest.raises(PalpateError, match=r"needs at least 3 trials.* the recording has 2$"):
             identify.run(options)
     assert not (tmp_path / "run").exists()

@@ -1,7 +1,6 @@
 """Which bodies are joined: candidates from how they move, and the verdict of the evidence."""
 
 import dataclasses
-import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +17,7 @@ from palpate.models.model import rollout
 from palpate.models.planar import furniture
 from palpate.models.planar.shapes import rectangle
 from palpate.models.planar.system import system_of
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Channel, Labels, Polygons, Recording, Role, Trial
 
 PERIOD = 0.02
 NOISE = np.array([5e-4, 5e-4, 1e-3])
@@ -53,10 +52,13 @@ def pulled(joined: bool, seconds: float = 6.0) -> Recording:
             POSE: Channel(POSE, Role.OBSERVATION, stamps, poses, "m, m, rad"),
             WRENCH: Channel(WRENCH, Role.COMMAND, stamps[:-1], wrench, "N, N, N m"),
         }
-        trials.append(Trial(f"held {held}", channels))
-    outlines = {"cart": BOX.tolist(), "trailer": BOX.tolist()}
-    told = {"bodies": json.dumps(list(outlines)), "outlines": json.dumps(outlines)}
-    return Recording(tuple(trials), told)
+        trials.append(Trial(f"held {held}", channels, facts=outlined("cart", "trailer")))
+    return Recording(tuple(trials), {})
+
+
+def outlined(*names):
+    """The facts that bodies of these names are boxes."""
+    return {"bodies": Labels(names), "outlines": Polygons((BOX,) * len(names), names, "body")}
 
 
 @pytest.fixture(scope="module")
@@ -219,8 +221,7 @@ def standing() -> Recording:
         POSE: Channel(POSE, Role.OBSERVATION, time, poses, "m, m, rad"),
         WRENCH: Channel(WRENCH, Role.COMMAND, time[:-1], wrench[:-1], "N, N, N m"),
     }
-    told = {"bodies": '["desk"]', "outlines": json.dumps({"desk": BOX.tolist()})}
-    return Recording((Trial("one", channels),), told)
+    return Recording((Trial("one", channels, facts=outlined("desk")),), {})
 
 
 def test_what_is_bolted_stands_at_the_mean_of_all_that_is_seen():

@@ -11,9 +11,10 @@ import pytest
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
 from palpate.identification.data.segments import cut
+from palpate.identification.posterior.comparison import posterior_of
 from palpate.identification.posterior.laplace import Modes
 from palpate.identification.posterior.likelihood import known_scales, motion_posterior
-from palpate.identification.posterior.posterior import draw, identify, preparing, sample
+from palpate.identification.posterior.posterior import SAMPLERS, Sampler, draw, preparing, sample
 from palpate.identification.posterior.settled import Part, Settled, settle_each
 
 TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
@@ -48,7 +49,7 @@ def first():
     """A posterior, and what was compiled for it."""
     with compiled() as names:
         # Headed backwards: the camera's angle jumps by a turn within the pieces.
-        found = identify(MODEL, pushes(TRUE, 1, heading=3.1), draws=200, at_rest=True)
+        found = sample(posterior_of(MODEL, pushes(TRUE, 1, heading=3.1), seconds=1.0), draws=200)
     return found, names
 
 
@@ -91,14 +92,14 @@ def test_models_are_a_batch(posterior):
 
 
 def test_the_same_seed_gives_the_same_draws(posterior):
-    again = identify(MODEL, pushes(TRUE, 1, heading=3.1), draws=200, at_rest=True)
+    again = sample(posterior_of(MODEL, pushes(TRUE, 1, heading=3.1), seconds=1.0), draws=200)
     np.testing.assert_array_equal(again.draws.position, posterior.draws.position)
 
 
 def test_another_recording_of_the_same_shape_compiles_nothing(first):
     assert first[1] == COMPILED
     with compiled() as names:
-        identify(MODEL, pushes(TRUE, 5, heading=3.1), at_rest=True, draws=50)
+        sample(posterior_of(MODEL, pushes(TRUE, 5, heading=3.1), seconds=1.0), draws=50)
     assert not names
 
 
@@ -128,7 +129,7 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
         raise AssertionError("expected to be refused before the search for modes")
 
     monkeypatch.setattr("palpate.identification.posterior.posterior.settle_each", searched)
-    monkeypatch.setattr("palpate.identification.posterior.posterior.local_global", searched)
+    monkeypatch.setitem(SAMPLERS, "local-global", Sampler(searched, 32, 100))
     recording = pushes(TRUE, 3, trials=1, frames=61)
     target = motion_posterior(
         MODEL, cut(recording, MODEL, 1.0, at_rest=True), known_scales(MODEL, NOISE)
@@ -137,8 +138,6 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
     modes = Modes(some, some[0, :1], some, np.eye(target.dimension)[None], some[0, :1])
     part = Part(target, modes, np.arange(target.dimension))
     for few in ({"draws": 3}, {"draws": -1}, {"chains": 0}, {"chains": -2}):
-        with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
-            identify(MODEL, recording, at_rest=True, **few)
         with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
             sample(target, **few)
         with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
@@ -168,7 +167,7 @@ def test_an_unmoved_sled_is_said_to_tell_nothing():
         0.0 * recording.action,
         recording.length,
     )
-    found = identify(MODEL, still, at_rest=True)
+    found = sample(posterior_of(MODEL, still, seconds=1.0))
     assert {"mass", "friction[0]", "friction[1]"} <= set(found.undecided)
     assert any("next to nothing of" in sentence for sentence in found.warnings)
 
@@ -179,4 +178,4 @@ def test_a_model_that_fails_says_so():
         recording.period, recording.observation, recording.action * np.inf, recording.length
     )
     with pytest.raises(PalpateError, match="not finite anywhere"):
-        identify(MODEL, broken, at_rest=True, draws=50)
+        sample(posterior_of(MODEL, broken, seconds=1.0), draws=50)

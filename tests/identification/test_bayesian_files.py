@@ -10,6 +10,7 @@ import pytest
 
 from bayesian_toys import Sled, pushes
 from palpate.errors import PalpateError
+from palpate.identification.posterior.comparison import posterior_of
 from palpate.identification.posterior.files import (
     read_models,
     read_posterior,
@@ -17,7 +18,7 @@ from palpate.identification.posterior.files import (
     write_netcdf,
     write_posterior,
 )
-from palpate.identification.posterior.posterior import identify
+from palpate.identification.posterior.posterior import sample
 from palpate.runs.storage import DamagedFileError
 
 
@@ -25,7 +26,7 @@ from palpate.runs.storage import DamagedFileError
 def posterior():
     model = Sled(mass=10.0, friction=[15.0, 15.0])
     recording = pushes(Sled(mass=14.0, friction=[6.0, 40.0]), 1, trials=2, frames=51)
-    return identify(model, recording, at_rest=True, chains=2, draws=50)
+    return sample(posterior_of(model, recording, seconds=1.0), chains=2, draws=50)
 
 
 def test_what_was_written_is_read_back(posterior, tmp_path):

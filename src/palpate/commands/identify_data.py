@@ -9,9 +9,8 @@ from palpate.errors import PalpateError
 from palpate.families.options import Identify
 from palpate.recordings import Aligned, Recording, join
 from palpate.recordings.files import read_recording
-from palpate.recordings.markers import repair_markers
 
-HELD_OUT = 0.25  # of the trials, where no recording for validation is given
+SHORTEST = 0.5  # s of recordings that a posterior needs, in all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,50 +23,44 @@ class Data:
     validation_aligned: Aligned
     unit: str
 
+    @property
+    def shown(self) -> list[Recording]:
+        """All recordings, the fitted one first."""
+        return [self.fitted] if self.validation is None else [self.fitted, self.validation]
+
 
 def read(options: Identify) -> Data:
     """The recordings, prepared by the family, repaired where they are fitted, and split by trial.
 
-    What is scored is scored as it was recorded: only what is fitted is repaired.
+    What is scored is scored as it was recorded: only what is fitted is repaired. Raises
+    `PalpateError` for recordings that cannot be used.
     """
     if not options.recordings:
         raise PalpateError("no recording is named: expected at least one file or log")
     raw = _read(options.recordings, options)
     if options.validate:
         fitted, validation = raw, _read(options.validate, options)
-    elif len(raw.trials) > 1:
-        fitted, validation = raw.split(HELD_OUT, options.seed)
+    elif len(raw.trials) > 1 and options.held_out:
+        fitted, validation = raw.split(options.held_out, options.seed)
     else:
         fitted, validation = raw, None
-    observation = options.observation
-    if fitted.trials[0][observation].values.ndim == 3:
-        fitted = repair_markers(fitted, observation)
-    fitted = _prepared(fitted, options, "")
-    action = options.action(fitted)
-    period = _period(fitted, observation, options.rate)
-    aligned = fitted.align(period, observation, action)
-    if validation is None:
-        scored = aligned
-    else:
+    fitted = _prepared(options.repair(fitted), options, "")
+    observation, action = options.observation, options.action(fitted)
+    if not options.fits:
+        _check_duration(fitted, options)
+    # The control period is that of the sensor, free of the last digits of its clock.
+    periods = [trial[observation].nominal_period for trial in fitted.trials]
+    period = 1.0 / options.rate if options.rate else float(f"{np.median(periods):.5g}")
+    aligned = scored = fitted.align(period, observation, action)
+    if validation is not None:
         validation = _prepared(validation, options, "validation, ")
         scored = validation.align(period, observation, action)
-    unit = fitted.trials[0][observation].unit
-    return Data(fitted, validation, aligned, scored, unit)
+    return Data(fitted, validation, aligned, scored, fitted.trials[0][observation].unit)
 
 
 def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
-    return join(
-        [
-            read_recording(
-                path,
-                rate=options.rate,
-                unit=options.unit,
-                up=options.up,
-                topics=options.topics or (),
-            )
-            for path in paths
-        ]
-    )
+    how = {"rate": options.rate, "unit": options.unit, "up": options.up}
+    return join([read_recording(path, topics=options.topics or (), **how) for path in paths])
 
 
 def _prepared(recording: Recording, options: Identify, where: str) -> Recording:
@@ -78,9 +71,10 @@ def _prepared(recording: Recording, options: Identify, where: str) -> Recording:
     return prepared
 
 
-def _period(recording: Recording, observation: str, rate: float | None) -> float:
-    """The control period: that of the sensor, free of the last digits of its clock."""
-    if rate is not None:
-        return 1.0 / rate
-    periods = [trial[observation].nominal_period for trial in recording.trials]
-    return float(f"{np.median(periods):.5g}")
+def _check_duration(recording: Recording, options: Identify) -> None:
+    lasting = sum(float(np.ptp(t[options.observation].time)) for t in recording.trials)
+    if lasting < SHORTEST:
+        raise PalpateError(
+            f"{' and '.join(map(str, options.recordings))} last {lasting:.3g} s in all: expected "
+            f"at least {SHORTEST:g} s of motion"
+        )

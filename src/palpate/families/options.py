@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 Number = Annotated[float | None, arg(metavar="NUMBER", help_behavior_hint="(default: none)")]
 Whole = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: as many as needed)")]
+USUAL = "(default: as the method needs)"
 Names = Annotated[tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="(default: none)")]
 Place = Annotated[
     Path | None, arg(metavar="PATH", help_behavior_hint="(default: a folder below runs/)")
@@ -113,51 +114,6 @@ class Reading(Options):
     """Of a robot's log: that of the markers, and those of the gripper's pose and velocity."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Identify(Reading, ABC):
-    """Identification from recordings; each family says which channels, and from which model."""
-
-    family: ClassVar[str]
-    observation: ClassVar[str]  # the channel that is predicted
-
-    recordings: Positional[
-        Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
-    ]
-    """What to fit: .npz of palpate, .npz with `positions`, .csv of a motion-capture system, or a
-    robot's log: .mcap, .db3, .bag, or the folder of a rosbag2."""
-    validate: Annotated[
-        tuple[Path, ...],
-        arg(metavar="FILE ...", help_behavior_hint="(default: a quarter of the trials)"),
-    ] = ()
-    """Recordings to score on and not to fit."""
-    free: Names = ()
-    """Parameters to identify that otherwise would not be."""
-    fixed: Names = ()
-    """Parameters to leave as they are."""
-    shared: Names = ()
-    """Parameters to give one value for all elements."""
-    method: Literal["adam", "levenberg-marquardt"] = "adam"
-    """How to descend."""
-    iterations: Annotated[
-        tuple[int, ...], arg(metavar="N ...", help_behavior_hint="(default: as many as needed)")
-    ] = ()
-    """At each of the growing horizons; fewer are faster and fit worse."""
-    residual: bool = False
-    """Fit a network to what the physics leaves over; kept if it helps on trials held out of it."""
-
-    @abstractmethod
-    def prepare(self, recording: Recording) -> Recording:
-        """The recording with the channels that the model needs."""
-
-    @abstractmethod
-    def action(self, recording: Recording) -> str:
-        """The channel of a prepared recording that drives the model."""
-
-    @abstractmethod
-    def start(self, aligned: Aligned) -> Model:
-        """The model an identification starts from."""
-
-
 @dataclass(frozen=True)
 class Hypotheses:
     """Models to be compared, by name.
@@ -170,45 +126,96 @@ class Hypotheses:
     by_itself: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
+FITS = ("gradient", "levenberg-marquardt", "adam")  # the last is an older name of the first
+Method = Literal[
+    "gradient", "levenberg-marquardt", "nuts", "metropolis", "local-global", "smc", "adam"
+]
+
+
 @dataclass(frozen=True, kw_only=True)
-class IdentifyBayesian(Reading, ABC):
-    """Identification with a posterior; each family says which models are compared."""
+class Identify(Reading, ABC):
+    """Identification from recordings; each family says which channels, and which models."""
 
     family: ClassVar[str]
     observation: ClassVar[str]  # the channel that is predicted
-    action: ClassVar[str]  # the channel that drives the model
-    worker: ClassVar[str] = "palpate.commands.identify_bayesian:run"
+    held_out: ClassVar[float] = 0.25  # of the trials, where no recording for validation is given
+    one_object: ClassVar[bool] = False  # points of one thing are observed, with one noise
 
     recordings: Positional[
         Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
     ]
-    """What to fit: .npz of palpate."""
+    """What to fit: .npz of palpate, .npz with `positions`, .csv of a motion-capture system, or a
+    robot's log: .mcap, .db3, .bag, or the folder of a rosbag2."""
     validate: Annotated[
-        tuple[Path, ...], arg(metavar="FILE ...", help_behavior_hint="(default: none)")
+        tuple[Path, ...],
+        arg(metavar="FILE ...", help_behavior_hint="(default: held-out trials, if any)"),
     ] = ()
     """Recordings to score on and not to fit."""
-    draws: int = 100
+    free: Names = ()
+    """Parameters to identify that otherwise would not be."""
+    fixed: Names = ()
+    """Parameters to leave as they are."""
+    shared: Names = ()
+    """Parameters to give one value for all elements."""
+    prior: Annotated[
+        tuple[str, ...], arg(metavar="NAME=A,B ...", help_behavior_hint="(default: as declared)")
+    ] = ()
+    """What is known of a parameter: its median and the standard deviation of its logarithm if it is
+    positive, mean and standard deviation if not."""
+    init: Annotated[Path | None, arg(metavar="MODEL", help_behavior_hint="(default: none)")] = None
+    """Start from the values of a model that was identified before: its folder or file."""
+    method: Method = "gradient"
+    """Fits: gradient (Adam), levenberg-marquardt. Draws of a posterior: nuts (no-U-turn sampler),
+    metropolis, local-global (steps of local shape, leaps between components), smc (tempered)."""
+    iterations: Annotated[
+        tuple[int, ...], arg(metavar="N ...", help_behavior_hint="(default: as many as needed)")
+    ] = ()
+    """Of a fit, at each of the growing horizons; fewer are faster and fit worse."""
+    residual: bool = False
+    """Fit a network to what the physics leaves over; kept if it helps on trials held out of it."""
+    draws: Annotated[int | None, arg(metavar="N", help_behavior_hint=USUAL)] = None
     """Of each chain, after its warm-up."""
-    chains: int = 32
+    chains: Annotated[int | None, arg(metavar="N", help_behavior_hint=USUAL)] = None
     """Independent of one another, so that it shows when they do not agree."""
+    arviz: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Write the draws as NetCDF too, for ArviZ."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the method gives one model with intervals, and not draws."""
+        return self.method in FITS
 
     @abstractmethod
     def prepare(self, recording: Recording) -> Recording:
-        """The recording with the channels that the models need."""
+        """The recording with the channels that the model needs."""
+
+    def repair(self, recording: Recording) -> Recording:
+        """The recording, to be fitted, without what is plainly wrong in it; before `prepare`."""
+        return recording
 
     @abstractmethod
-    def reference(self, recordings: Sequence[Recording], period: float) -> Model:
-        """A model of what was recorded, at once: by it recordings are checked.
+    def action(self, recording: Recording) -> str:
+        """The channel of a prepared recording that drives the model."""
 
-        The first recording is to be fitted, what follows only to be scored on.
+    @abstractmethod
+    def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Model:
+        """The model an identification starts from, at once: by it recordings are checked.
+
+        The first recording is to be fitted and is `aligned`, what follows only to be scored on.
         """
 
-    @abstractmethod
-    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
-        """The models to compare; one is fitted without comparison. Arguments as of `reference`.
+    def hypotheses(self, recordings: Sequence[Recording], aligned: Aligned) -> Hypotheses:
+        """The models to compare; one is identified without comparison. Arguments as of `reference`.
 
         May take minutes.
         """
+        return Hypotheses({self.family: self.reference(recordings, aligned)})
+
+    def declared(self, model: Model) -> Model:
+        """The model with what was said of its parameters; raises as `with_declarations`."""
+        from palpate.identification.declarations import with_declarations
+
+        return with_declarations(model, self.free, self.fixed, self.shared, self.prior)
 
     def sufficient(self, model: Model, recordings: Sequence[Recording]) -> Model:
         """The model without what cannot show in these recordings, for less work."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.commands.identify_bayesian import LEVEL
+from palpate.commands.identify_report import LEVEL
 from palpate.families.furniture.recording import (
     POSE,
     WRENCH,

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import arg
 
 from palpate.errors import PalpateError
-from palpate.families.options import Hypotheses, IdentifyBayesian, Record
+from palpate.families.options import Hypotheses, Identify, Method, Record
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from palpate.models.model import Model
-    from palpate.recordings import Recording
+    from palpate.recordings import Aligned, Recording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,26 +51,29 @@ class RecordFurniture(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IdentifyFurniture(IdentifyBayesian):
+class IdentifyFurniture(Identify):
     """Identify furniture: mass, friction, wheels, from recorded poses and the wrench that acted.
 
     A recording has the channels "pose" (m, m, rad) and "wrench" (N, N, N m, about the middle of
-    each outline, in the world's axes). Bayesian: the result is draws of models that all agree with
-    the recording, and what it could not tell. With --structure compare, wheels, feet, a hinge and
-    bolts are compared by how probable they make the recording, for each body; and whether some of
-    them are joined.
+    each outline, in the world's axes). By default the result is draws of models that all agree with
+    the recording, and what it could not tell; --method gradient fits one model. With --structure
+    compare, wheels, feet, a hinge and bolts are compared by how probable they make the recording,
+    for each body; and whether some of them are joined.
 
     1. A recording of palpate:                  palpate identify furniture R.npz
     2. Scored on pushes it was not fitted to:   palpate identify furniture R.npz --validate P.npz
     3. One that does not bring outlines:        palpate identify furniture R.npz --size 1.2 0.7
     4. What is it, and with two wheels?         palpate identify furniture R.npz
                                                     --structure compare --wheels 2
+    5. One that was weighed, 25 kg to 1 %:      palpate identify furniture R.npz
+                                                    --prior mass=25,0.01
     """
 
     family: ClassVar[str] = "furniture"
     observation: ClassVar[str] = "pose"
-    action: ClassVar[str] = "wrench"
+    held_out: ClassVar[float] = 0.0  # each trial may be of another piece
 
+    method: Method = "local-global"
     size: Annotated[
         tuple[float, float] | None,
         arg(metavar="LENGTH WIDTH", help_behavior_hint="(default: outlines in the recording)"),
@@ -84,28 +87,40 @@ class IdentifyFurniture(IdentifyBayesian):
     law: Literal["coulomb", "viscous"] = "coulomb"
     """How wheels resist: dry, or in proportion to speed as in physics-based RL."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.wheels < 1:
+            raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
+        if self.structure == "compare" and (self.fits or self.init is not None):
+            raise PalpateError(
+                "--structure compare weighs draws of several models: expected another --method "
+                "than one that fits, and no --init"
+            )
+
     def prepare(self, recording: Recording) -> Recording:
         """The recording with a channel of poses and one of wrenches."""
         from palpate.families.furniture.recording import prepare
 
         return prepare(recording)
 
-    def reference(self, recordings: Sequence[Recording], period: float) -> Model:
+    def action(self, recording: Recording) -> str:
+        """The wrenches."""
+        return "wrench"
+
+    def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Model:
         """Bodies on wheels, every parameter at its prior's centre."""
         from palpate.families.furniture.recording import check_alike, starting_furniture
 
-        if self.wheels < 1:
-            raise PalpateError(f"a body on wheels has at least one, not {self.wheels}")
         check_alike(*recordings, sized=self.size is not None)
-        return starting_furniture(recordings[0], period, self.size, wheels=self.wheels)
+        return starting_furniture(recordings[0], aligned.period, self.size, wheels=self.wheels)
 
-    def hypotheses(self, recordings: Sequence[Recording], period: float) -> Hypotheses:
+    def hypotheses(self, recordings: Sequence[Recording], aligned: Aligned) -> Hypotheses:
         """Models to be compared, by name: see `furniture_structures`."""
         from palpate.families.furniture import structures as furniture_structures
 
-        about = recordings[0], period, self.size, self.wheels, self.law
+        about = recordings[0], aligned.period, self.size, self.wheels, self.law
         if self.structure == "compare":
-            return furniture_structures.hypotheses(*about, seed=self.seed)
+            return furniture_structures.hypotheses(*about, seed=self.seed, declared=self.declared)
         return Hypotheses({
             self.structure: furniture_structures.structures(*about)[self.structure]
         })  # fmt: skip
@@ -119,7 +134,7 @@ class IdentifyFurniture(IdentifyBayesian):
         return prune_contacts(model, *recordings)
 
     def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:
-        """See `IdentifyBayesian.meanings`."""
+        """See `Identify.meanings`."""
         from palpate.families.furniture.wheels import wheel_rows
         from palpate.models.planar import Planar
 

@@ -7,7 +7,7 @@ the one body stays at one point of the other, and evidence decides.
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -83,12 +83,14 @@ def hypotheses(
     wheels: int = 1,
     law: Law = "coulomb",
     seed: int = 0,
+    declared: Callable[[Model], Model] = lambda model: model,
 ) -> Hypotheses:
     """What the bodies of a recording may be together, by a name that says it.
 
     Of one body, its `structures`. Of several, each is what it most probably is by itself, and any
     of the `joints` may be there: what is joined is taken to be on wheels, as nobody knows what its
-    wheels did before the joint is known. Arguments as of `structures`.
+    wheels did before the joint is known. Arguments as of `structures`; `declared` gives a model of
+    one body what is known of its parameters.
     """
     names = names_of(recording)
     if len(names) == 1:
@@ -100,7 +102,7 @@ def hypotheses(
         models = structures(piece, period, size, wheels, law)
         found = explore(
             {
-                kind: posterior_of(prune_contacts(model, piece), aligned)
+                kind: posterior_of(declared(prune_contacts(model, piece)), aligned)
                 for kind, model in models.items()
             },
             seed,
@@ -113,11 +115,11 @@ def hypotheses(
     models = {}
     for chosen in _sets(likely):
         joined = {body for pair in chosen for body in pair}
-        being = {body: "wheels" if body in joined else kind for body, kind in kinds.items()}
+        together = {b: "wheels" if b in joined else kind for b, kind in kinds.items()}
         where = {pair: likely[pair] for pair in chosen}
-        model = _together(recording, period, size, wheels, law, being, where)
-        begun = [pieces[body][kind] for body, kind in being.items()]
-        models[_named(names, being, chosen)] = _begun(model, begun)
+        model = _together(recording, period, size, wheels, law, together, where)
+        begun = [pieces[body][kind] for body, kind in together.items()]
+        models[_named(names, together, chosen)] = _begun(model, begun)
     return Hypotheses(models, by_itself)
 
 
@@ -169,11 +171,11 @@ def _together(
     size: tuple[float, float] | None,
     wheels: int,
     law: Law,
-    being: Mapping[int, str],
+    kinds: Mapping[int, str],
     chosen: Mapping[Pair, tuple[np.ndarray, np.ndarray]],
 ) -> Planar:
     """All bodies as one model, with the `chosen` joints."""
-    pivots: dict[int, int | None] = {b: None for b, kind in being.items() if kind == "hinge"}
+    pivots: dict[int, int | None] = {b: None for b, kind in kinds.items() if kind == "hinge"}
     # A body has one pivot of its own: as few joints as there are can be shared out so.
     owners = next(of for of in itertools.product(*chosen) if len(set(of)) == len(of))
     others = {owner: sum(pair) - owner for owner, pair in zip(owners, chosen, strict=True)}
@@ -185,7 +187,7 @@ def _together(
         # Where both were seen, not where each was seen first: the one may have moved before.
         first = _seen(recording, [owner, other])[0]
         held[owner] = Held(own, place, first[0, 2] - first[1, 2])
-    return _masked(_with_bolts(_with_pivots(model, held), recording), being, set(others))
+    return _masked(_with_bolts(_with_pivots(model, held), recording), kinds, set(others))
 
 
 def _hinge(recording: Recording, body: int) -> Held:
@@ -251,12 +253,12 @@ def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:
     return with_values(model, values | {"link_anchor": anchor})
 
 
-def _masked(model: Planar, being: Mapping[int, str], joined: Iterable[int] = ()) -> Planar:
+def _masked(model: Planar, kinds: Mapping[int, str], joined: Iterable[int] = ()) -> Planar:
     """The model with the wheels, hinges and bolts of what its bodies are, and their joints."""
-    rows = range(len(being))
-    rolls = jnp.asarray([[being[b] == "wheels"] for b in rows])
-    held = jnp.asarray([[being[b] == "hinge" or b in joined] for b in rows])
-    bolted = jnp.asarray([being[b] == "bolted" for b in rows])
+    rows = range(len(kinds))
+    rolls = jnp.asarray([[kinds[b] == "wheels"] for b in rows])
+    held = jnp.asarray([[kinds[b] == "hinge" or b in joined] for b in rows])
+    bolted = jnp.asarray([kinds[b] == "bolted" for b in rows])
     return dataclasses.replace(
         model,
         wheel=jnp.where(rolls, jnp.ones_like(model.wheel), 0.0),
@@ -265,8 +267,8 @@ def _masked(model: Planar, being: Mapping[int, str], joined: Iterable[int] = ())
     )
 
 
-def _named(names: tuple[str, ...], being: Mapping[int, str], chosen: Iterable[Pair]) -> str:
+def _named(names: tuple[str, ...], kinds: Mapping[int, str], chosen: Iterable[Pair]) -> str:
     """Such as "cart: wheels, table: wheels, cart joined to table"."""
-    parts = [f"{names[body]}: {kind}" for body, kind in being.items()]
+    parts = [f"{names[body]}: {kind}" for body, kind in kinds.items()]
     parts += [f"{names[first]} joined to {names[second]}" for first, second in chosen]
     return ", ".join(parts)

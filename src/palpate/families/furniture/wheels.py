@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.identification.verdicts import UNDECIDED, verdict
+from palpate.identification.verdicts import undecided, verdict
 from palpate.models.planar import Planar
 from palpate.models.planar.wheels import wheel_axes
 
@@ -25,12 +25,12 @@ def wheel_rows(models: Planar, prior: Planar, viscous: bool) -> list[dict[str, A
     degrees = _around(np.degrees(direction))
     low, high = np.quantile(degrees, INTERVAL, axis=0)
     lost = [high - low > ANYWHERE]
-    lost += [
-        np.std(np.log(force), axis=0) > UNDECIDED * np.std(np.log(drawn), axis=0)
-        for force, drawn in zip(forces, before, strict=True)
-    ]
+    for force, drawn in zip(forces, before, strict=True):
+        after, prior_log = np.log(force), np.log(drawn)
+        width, shift = np.std(prior_log, axis=0), after.mean(axis=0) - prior_log.mean(axis=0)
+        lost.append(undecided(np.std(after, axis=0) / width, shift / width))
     unit = "N s/m" if viscous else "N"
-    told = [
+    described = [
         (
             "wheel_direction", degrees, "deg",
             "where the wheel rolls: its weaker axis, from the body's x axis",
@@ -48,10 +48,10 @@ def wheel_rows(models: Planar, prior: Planar, viscous: bool) -> list[dict[str, A
             "shared": False,
             "lower": np.quantile(values, INTERVAL[0], axis=0).tolist(),
             "upper": np.quantile(values, INTERVAL[1], axis=0).tolist(),
-            "verdict": verdict(undecided),
+            "verdict": verdict(left),
             "derived": True,
         }
-        for (name, values, unit, about), undecided in zip(told, lost, strict=True)
+        for (name, values, unit, about), left in zip(described, lost, strict=True)
     ]
 
 

@@ -22,6 +22,8 @@ from palpate.families.options import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from palpate.models.model import Model
     from palpate.models.rope import Rope
     from palpate.networks import CommandPolicy
@@ -118,10 +120,13 @@ class IdentifyRope(Identify):
     3. A rope that was weighed, 120 g:          palpate identify rope R.npz --mass 0.12
     4. One bending stiffness for all joints:    palpate identify rope R.npz
                                                     --shared bend_stiffness
+    5. Draws of a posterior, of few nodes:      palpate identify rope R.npz --nodes 6
+                                                    --substeps 8 --method local-global
     """
 
     family: ClassVar[str] = "rope"
     observation: ClassVar[str] = "markers"
+    one_object: ClassVar[bool] = True
 
     driven: Annotated[
         tuple[int, ...],
@@ -155,7 +160,13 @@ class IdentifyRope(Identify):
 
         return GRIP if GRIP in recording.trials[0].channels else GRIPPER
 
-    def start(self, aligned: Aligned) -> Rope:
+    def repair(self, recording: Recording) -> Recording:
+        """See `repair_markers`."""
+        from palpate.recordings.markers import repair_markers
+
+        return repair_markers(recording, self.observation)
+
+    def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Rope:
         """See `starting_rope`."""
         from palpate.families.rope.recording import starting_rope
         from palpate.recordings.recording import resolve_indices

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from palpate.identification.data.prediction import observation_scale, predict, residuals
 from palpate.identification.data.segments import Segments, SegmentSource
-from palpate.identification.verdicts import UNDECIDED, verdict
+from palpate.identification.verdicts import undecided, verdict
 from palpate.parameters import FreeParameters, value_of
 from palpate.recordings import Aligned
 
@@ -255,7 +255,9 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
             for sign in (-QUANTILE, QUANTILE)
         )
         lower[path], upper[path] = low, high
-        verdicts[path] = verdict(np.ravel(deviation[path]) > UNDECIDED)
+        verdicts[path] = verdict(
+            undecided(*(np.asarray(of[path]).ravel() for of in (deviation, free)))
+        )
     return Intervals(lower, upper, verdicts, _undecided(information, unravel))
 
 

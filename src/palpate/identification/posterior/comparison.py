@@ -16,7 +16,7 @@ from palpate.identification.posterior.likelihood import (
     motion_posterior,
 )
 from palpate.identification.posterior.posterior import (
-    CHAINS,
+    LOCAL_GLOBAL,
     Posterior,
     check_numbers,
     draw,
@@ -41,22 +41,23 @@ class Comparison:
 
 def compare(
     targets: Mapping[str, MotionPosterior],
-    draws: int = 100,
-    chains: int = CHAINS,
+    draws: int | None = None,
+    chains: int | None = None,
     seed: int = 0,
+    method: str = LOCAL_GLOBAL,
 ) -> Comparison:
     """Compare hypotheses by their evidence and sample the posterior of the most probable.
 
-    All of them are alike before. The evidence is Laplace's at the best mode of each: tempered
-    particles (`tempered.temper`) give it without the assumption of a normal posterior, and take
-    many times as long. Raises as `bayesian.draw`.
+    The evidence is Laplace's at the best mode of each: tempered particles (`tempered.temper`) give
+    it without the assumption of a normal posterior, and take many times as long. Raises as
+    `posterior.draw`.
     """
     check_numbers(chains, draws)
-    with preparing(next(iter(targets.values())), chains):
+    with preparing(next(iter(targets.values())), chains, method):
         explored = explore(targets, seed)
     probability = shares({name: settled.evidence for name, settled in explored.items()})
     structure = max(probability, key=probability.__getitem__)
-    posterior = draw(explored[structure], chains=chains, draws=draws, seed=seed)
+    posterior = draw(explored[structure], method, chains=chains, draws=draws, seed=seed)
     return Comparison(posterior, structure, probability)
 
 
@@ -73,14 +74,21 @@ def shares(logarithms: Mapping[str, float]) -> dict[str, float]:
     return {name: weight / sum(weights.values()) for name, weight in weights.items()}
 
 
-def posterior_of(model: Model, aligned: Aligned) -> MotionPosterior:
-    """What is to be sampled: of pieces of the trials, the first of each from rest if it is so."""
-    scales = inferred_scales(model, noise_scale(aligned, model))
-    return motion_posterior(model, cut_pieces(aligned, model), scales).with_one_rotation()
+def posterior_of(
+    model: Model, aligned: Aligned, one_object: bool = False, seconds: float = PIECE
+) -> MotionPosterior:
+    """What is to be sampled: of pieces of the trials, the first of each from rest if it is so.
+
+    `one_object`: see `inferred_scales`.
+    """
+    scales = inferred_scales(model, noise_scale(aligned, model), one_object)
+    pieces = cut_pieces(aligned, model, seconds)
+    return motion_posterior(model, pieces, scales).with_one_rotation()
 
 
-def cut_pieces(aligned: Aligned, model: Model) -> Segments:
-    return cut(aligned, model, PIECE, begins_at_rest(aligned, model))
+def cut_pieces(aligned: Aligned, model: Model, seconds: float = PIECE) -> Segments:
+    """Consecutive pieces of the trials, for a posterior to be fitted to or held against."""
+    return cut(aligned, model, seconds, begins_at_rest(aligned, model))
 
 
 def begins_at_rest(aligned: Aligned, model: Model) -> bool:

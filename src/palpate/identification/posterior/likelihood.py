@@ -50,12 +50,15 @@ class Scales(eqx.Module):
     known: bool = eqx.field(static=True)
 
 
-def inferred_scales(model: Model, noise: Float[np.ndarray, " last"]) -> Scales:
+def inferred_scales(
+    model: Model, noise: Float[np.ndarray, " last"], one_object: bool = False
+) -> Scales:
     """Scales to be inferred, about a sensor noise by entry of the last observation axis.
 
-    Entries of one unit of a body share a scale, about the median of theirs.
+    Entries of one unit of a body share a scale, about the median of theirs. With `one_object` the
+    leading entries are points of one thing, a rope's markers, and share them too.
     """
-    return _scales(model, noise, known=False)
+    return _scales(model, noise, known=False, one_object=one_object)
 
 
 def known_scales(model: Model, noise: Float[np.ndarray, " last"]) -> Scales:
@@ -63,7 +66,7 @@ def known_scales(model: Model, noise: Float[np.ndarray, " last"]) -> Scales:
     return _scales(model, noise, known=True)
 
 
-def _scales(model: Model, noise: np.ndarray, known: bool) -> Scales:
+def _scales(model: Model, noise: np.ndarray, known: bool, one_object: bool = False) -> Scales:
     units = model.observation_units
     shape = model.observation_shape
     if len(noise) != shape[-1] or not np.all(np.isfinite(noise)) or np.any(np.asarray(noise) <= 0):
@@ -72,7 +75,8 @@ def _scales(model: Model, noise: np.ndarray, known: bool) -> Scales:
         )
     distinct = tuple(dict.fromkeys(units))
     medians = [np.median(np.asarray(noise)[np.array(units) == unit]) for unit in distinct]
-    bodies = int(np.prod(shape[:-1]))
+    entries = int(np.prod(shape[:-1]))
+    bodies = 1 if one_object else entries
     of_last = [distinct.index(unit) for unit in units]
     of = [f" of {body}" if bodies > 1 else "" for body in range(bodies)]
     labels = [f"noise{body} ({unit or 1})" for body in of for unit in distinct]
@@ -81,7 +85,7 @@ def _scales(model: Model, noise: np.ndarray, known: bool) -> Scales:
     return Scales(
         noise=noises,
         growth=(0.0 if known else GROWTH_RATIO) * noises,
-        of_channel=tuple(b * len(distinct) + u for b in range(bodies) for u in of_last),
+        of_channel=tuple(b % bodies * len(distinct) + u for b in range(entries) for u in of_last),
         labels=() if known else tuple(labels),
         known=known,
     )
@@ -103,6 +107,8 @@ class MotionPosterior(Target):
     spectrum: Float[Array, "segments channels time"]  # its eigenvalues, s^3
     counted: Float[Array, "segments channels time"]  # one where there is data, else zero
     sensitivity: Float[Array, "segments starts channels time"] | None  # of rotated residuals
+    # Sums over channels of products of sensitivities, where one variance is that of all channels.
+    products: Float[Array, "segments starts starts time"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -216,7 +222,11 @@ class MotionPosterior(Target):
         """The same with start errors propagated by the derivatives of the model at `position`."""
         if self.sensitivity is None:
             return self
-        return eqx.tree_at(lambda t: t.sensitivity, self, _sensitivity(self, position))
+        found = _sensitivity(self, position)
+        target = eqx.tree_at(lambda t: t.sensitivity, self, found)
+        if self.products is None:
+            return target
+        return eqx.tree_at(lambda t: t.products, target, _products(found))
 
     def with_one_rotation(self) -> "MotionPosterior":
         """The same where something is not seen; else with the eigenvectors that all pieces share.
@@ -261,8 +271,11 @@ class MotionPosterior(Target):
     def _root(self, variance: Array) -> Array:
         """Cholesky factor of 1 + A^T D^-1 A for each piece."""
         assert self.sensitivity is not None
-        weighted = self.sensitivity * (self.counted / variance)[:, None]
-        matrix = jnp.einsum("wqct,wpct->wqp", weighted, self.sensitivity)
+        if self.products is not None:  # a small part of the work, which all else is little beside
+            matrix = jnp.einsum("wqpt,wt->wqp", self.products, 1.0 / variance[:, 0])
+        else:
+            weighted = self.sensitivity * (self.counted / variance)[:, None]
+            matrix = jnp.einsum("wqct,wpct->wqp", weighted, self.sensitivity)
         return cholesky(matrix + jnp.eye(matrix.shape[-1]))
 
     def _through_root(self, explained: Array, variance: Array) -> Array:
@@ -287,7 +300,9 @@ def motion_posterior(model: Model, segments: Segments, scales: Scales) -> Motion
     deviations = np.asarray(segments.pose_deviation), np.asarray(segments.rate_deviation)
     uncertain = any(np.any(deviation > 0) for deviation in deviations)
     channels, horizon = spectrum.shape[1:]
-    empty = jnp.zeros((segments.count, 2 * channels, channels, horizon), dtype)
+    starts = 2 * channels
+    empty = jnp.zeros((segments.count, starts, channels, horizon), dtype)
+    one_variance = uncertain and scales.noise.size == 1 and bool(np.all(counted))
     target = MotionPosterior(
         FreeParameters(model),
         segments,
@@ -296,6 +311,7 @@ def motion_posterior(model: Model, segments: Segments, scales: Scales) -> Motion
         jnp.asarray(spectrum, dtype),
         jnp.asarray(counted, dtype),
         empty if uncertain else None,
+        jnp.zeros((segments.count, starts, starts, horizon), dtype) if one_variance else None,
     )
     return target.linearised(initial_position(target))
 
@@ -358,3 +374,8 @@ def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     slope = jax.jacfwd(moved)(jnp.zeros(size, position.dtype))
     columns = jnp.moveaxis(slope, -1, 0)  # (starts, segments, time, *observation)
     return jnp.moveaxis(jax.vmap(target._rotate)(columns), 0, 1)
+
+
+@eqx.filter_jit
+def _products(sensitivity: Array) -> Array:
+    return jnp.einsum("wqct,wpct->wqpt", sensitivity, sensitivity)

@@ -1,14 +1,11 @@
-"""Bayesian identification of any model with declared priors.
+"""Draws of any model with declared priors, given recordings of it, and how far to trust them.
 
-    posterior = identify(model, recording.align(model.control_period), at_rest=True)
+    posterior = sample(posterior_of(model, recording.align(model.control_period)), "nuts")
     posterior.table                    # medians, intervals, R-hat, what the data left undecided
     posterior.predict(cut(held_out, model, 2.0, at_rest=True))
 
-The likelihood is that of `likelihood`, of pieces of a second or so; chains begin at the posterior's
-modes, and walk it in steps of its local shape (`local_global`), or are those of the no-U-turn
-sampler (`hamiltonian`) where there are too many coordinates to learn proposals in.
-Other samplers of the same target: Metropolis (`metropolis`), tempered particles with evidence
-(`tempered`), and particles that follow data as they arrive (`online`).
+The likelihood is that of `likelihood`, of pieces of two seconds or so (`comparison.posterior_of`);
+what samples it is one of `SAMPLERS`.
 """
 
 import contextlib
@@ -26,28 +23,48 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from palpate.errors import PalpateError
-from palpate.identification.data.segments import Segments, cut, noise_scale
+from palpate.family import check_name
+from palpate.identification.data.segments import Segments
 from palpate.identification.posterior import predictive
 from palpate.identification.posterior.diagnostics import FEWEST, bulk_size, rhat, tail_size
-from palpate.identification.posterior.likelihood import (
-    MotionPosterior,
-    inferred_scales,
-    motion_posterior,
-)
+from palpate.identification.posterior.likelihood import MotionPosterior
 from palpate.identification.posterior.predictive import Predicted, Score
 from palpate.identification.posterior.settled import Settled, factors_of, joined, settle_each
 from palpate.identification.samplers.draws import Draws
 from palpate.identification.samplers.hamiltonian import no_u_turn
 from palpate.identification.samplers.local_global import CHAINS, compiled_meanwhile, local_global
-from palpate.identification.verdicts import UNDECIDED
+from palpate.identification.samplers.metropolis import metropolis
+from palpate.identification.samplers.tempered import populations
+from palpate.identification.verdicts import undecided
 from palpate.models.model import Model
 from palpate.parameters import value_of
-from palpate.recordings import Aligned
 
-MIXED, ENOUGH = 1.01, 400.0  # R-hat and effective sizes that chains should reach (Vehtari et al.)
+MIXED, EFFECTIVE = 1.01, 400.0  # R-hat and effective sizes to reach (Vehtari et al.)
 WIDEST = 40  # coordinates among which a mixture that proposes can be learnt
 PRIOR_DRAWS = 1000  # that the posterior's spread is held against
 PREDICTING = 400  # draws that a prediction is made of
+LOCAL_GLOBAL = "local-global"
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampler:
+    """What draws from a posterior whose modes are known, and how many chains and draws it wants.
+
+    `run(target, modes, key, chains, draws, tell)` gives `Draws`.
+    """
+
+    run: Callable[..., Draws]
+    chains: int
+    draws: int
+
+
+SAMPLERS = {
+    # Chains of the no-U-turn sampler run one after another on each core.
+    "nuts": Sampler(no_u_turn, 8, 200),
+    "metropolis": Sampler(metropolis, 16, 100),
+    LOCAL_GLOBAL: Sampler(local_global, CHAINS, 100),
+    "smc": Sampler(populations, 4, 500),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +72,8 @@ class Row:
     """One coordinate of a posterior, in the parameter's own unit.
 
     `lower` to `upper` holds 90 % of the draws; `share` is the posterior's standard deviation over
-    the prior's, both in whitened coordinates: 1 says that the data told nothing.
+    the prior's, and `shift` the distance of its mean from the prior's in such deviations, both in
+    whitened coordinates: a share of 1 and no shift say that the data told nothing.
     """
 
     name: str
@@ -65,6 +83,7 @@ class Row:
     lower: float
     upper: float
     share: float
+    shift: float
     rhat: float
     bulk: float
     tail: float
@@ -72,7 +91,7 @@ class Row:
     @property
     def undecided(self) -> bool:
         """Whether the data left this where the prior had it."""
-        return self.share > UNDECIDED
+        return bool(undecided(self.share, self.shift))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,12 +99,13 @@ class Posterior:
     """Draws of a model's parameters given recordings, and how far to trust them.
 
     `probes` are the pieces at whose ends the chains' predictions are compared: labels of wheels
-    may swap between draws that predict the same.
+    may swap between draws that predict the same. `sampler` is the name of what drew.
     """
 
     settled: Settled
     draws: Draws
     probes: Segments
+    sampler: str = LOCAL_GLOBAL
 
     @property
     def target(self) -> MotionPosterior:
@@ -147,21 +167,32 @@ class Posterior:
     def table(self) -> tuple[Row, ...]:
         """A row for each coordinate: the parameters by element, then the noise scales."""
         position = self.draws.position
-        legal = _legal(self.target, jnp.asarray(self.flat))
-        share = np.std(legal, axis=0) / np.std(_legal(self.target, self._prior_draws), axis=0)
+        after = np.asarray(_legal(self.target, jnp.asarray(self.flat)))
+        before = np.asarray(_legal(self.target, self._prior_draws))
+        share = after.std(axis=0) / before.std(axis=0)
+        shift = (after.mean(axis=0) - before.mean(axis=0)) / before.std(axis=0)
         judged = rhat(position), bulk_size(position), tail_size(position)
         values = self._by_name()
         rows = []
-        for index, name in enumerate(self.target.names):
-            unit, about, draws = values[name]
+        for index, (name, (unit, about, draws)) in enumerate(values.items()):
             lower, median, upper = np.quantile(draws, (0.05, 0.5, 0.95))
             rows.append(
                 Row(
                     name, unit, about, float(median), float(lower), float(upper),
-                    float(share[index]), *(float(column[index]) for column in judged),
+                    float(share[index]), float(shift[index]),
+                    *(float(column[index]) for column in judged),
                 )
             )  # fmt: skip
         return tuple(rows)
+
+    @property
+    def rows_of(self) -> dict[str, list[Row]]:
+        """The rows of `table` by parameter; noise scales are left out."""
+        paths = self.target.coordinates.declarations
+        return {
+            path: [row for row in self.table if row.name.partition("[")[0] == path]
+            for path in paths
+        }
 
     @property
     def undecided(self) -> tuple[str, ...]:
@@ -178,10 +209,10 @@ class Posterior:
                 f"{self.rhat_of_predictions:.3f}, expected below {MIXED}; draw more, or compare "
                 "hypotheses if there are several modes"
             )
-        if self.size_of_predictions < ENOUGH:
+        if self.size_of_predictions < EFFECTIVE:
             said.append(
                 f"predictions rest on {self.size_of_predictions:.0f} effective draws, expected at "
-                f"least {ENOUGH:.0f}: draw more"
+                f"least {EFFECTIVE:.0f}: draw more"
             )
         unmixed = [row.name for row in self.table if row.rhat >= MIXED]
         if unmixed:
@@ -210,7 +241,7 @@ class Posterior:
         return predictive.score(self.target, self.predict(segments, count, seed), segments)
 
     def _by_name(self) -> dict[str, tuple[str, str, np.ndarray]]:
-        """Unit, meaning and values (chains x draws) of each coordinate."""
+        """Unit, meaning and values (chains x draws) of each coordinate, in order."""
         found = {}
         for path, declaration in sorted(self.target.coordinates.declarations.items()):
             values = self.values[path]
@@ -219,7 +250,8 @@ class Posterior:
                 found[path] = declaration.unit, declaration.about, first[..., 0]
                 continue
             for index in np.ndindex(values.shape[2:]):
-                name = f"{path}[{', '.join(map(str, index))}]"
+                several = first.shape[-1] > 1
+                name = f"{path}[{', '.join(map(str, index))}]" if several else path
                 element = values[(..., *index)]
                 found[name] = declaration.unit, declaration.about, element
         noise, growth = (np.asarray(x) for x in _scales(self.target, jnp.asarray(self.flat)))
@@ -242,79 +274,71 @@ def spread_out(size: int, count: int | None = None) -> Int[np.ndarray, " count"]
     return np.linspace(0, size - 1, count).round().astype(int)
 
 
-def identify(
-    model: Model,
-    aligned: Aligned,
-    *,
-    seconds: float = 1.0,
-    at_rest: bool = False,
-    chains: int = CHAINS,
-    draws: int = 100,
-    seed: int = 0,
-    probes: Segments | None = None,
-    tell: Callable[[int, int], None] = lambda done, blocks: None,
-) -> Posterior:
-    """Infer a model's free parameters and the noise scales from aligned trials.
-
-    Trials are cut into pieces of `seconds`; `at_rest` says that each begins at rest. Chains are
-    compared by what they predict at the ends of `probes`, by default the pieces themselves.
-    `tell(done, blocks)` is called as the sampling goes on. The same seed gives the same draws.
-
-    Raises `PalpateError` when no piece can be cut, the likelihood is not finite anywhere, or so few
-    chains or draws are asked for that they cannot be judged.
-    """
-    check_numbers(chains, draws)
-    segments = cut(aligned, model, seconds, at_rest)
-    scales = inferred_scales(model, noise_scale(aligned, model))
-    target = motion_posterior(model, segments, scales).with_one_rotation()
-    return sample(target, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
-
-
 def sample(
     target: MotionPosterior,
+    method: str = LOCAL_GLOBAL,
     *,
-    chains: int = CHAINS,
-    draws: int = 100,
+    chains: int | None = None,
+    draws: int | None = None,
     seed: int = 0,
     probes: Segments | None = None,
     tell: Callable[[int, int], None] = lambda done, blocks: None,
 ) -> Posterior:
-    """As `identify`, for a target that was made apart."""
+    """Draws of a posterior by one of the `SAMPLERS`, as many as it wants where no number is given.
+
+    Chains are compared by what they predict at the ends of `probes`, by default the pieces that
+    were fitted. `tell(done, blocks)` is called as the sampling goes on. The same seed gives the
+    same draws. Raises `PalpateError` when the likelihood is not finite anywhere, or so few chains
+    or draws are asked for that they cannot be judged.
+    """
     check_numbers(chains, draws)
     climbing, _ = jax.random.split(jax.random.key(seed))
-    with preparing(target, chains):
+    with preparing(target, chains, method):
         settled = settle_each(target, climbing)
-    return draw(settled, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+    return draw(settled, method, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
 
 
-def preparing(target: MotionPosterior, chains: int) -> AbstractContextManager[None]:
+def preparing(
+    target: MotionPosterior, chains: int | None, method: str = LOCAL_GLOBAL
+) -> AbstractContextManager[None]:
     """Within it modes may be searched for, while the sampler of such a target is compiled."""
     first, _ = factors_of(target)[0]
-    if first.dimension > WIDEST:
+    if method != LOCAL_GLOBAL or first.dimension > WIDEST:
         return contextlib.nullcontext()
-    return compiled_meanwhile(first, chains)
+    return compiled_meanwhile(first, chains or CHAINS)
 
 
 def draw(
     settled: Settled,
+    method: str = LOCAL_GLOBAL,
     *,
-    chains: int = CHAINS,
-    draws: int = 100,
+    chains: int | None = None,
+    draws: int | None = None,
     seed: int = 0,
     probes: Segments | None = None,
     tell: Callable[[int, int], None] = lambda done, blocks: None,
 ) -> Posterior:
-    """As `sample`, for a target whose modes are known."""
+    """As `sample`, for a target whose modes are known.
+
+    A factor of too many coordinates for a mixture to be learnt in is for the no-U-turn sampler even
+    where "local-global" is asked for; `Posterior.sampler` then says so.
+    """
     check_numbers(chains, draws)
     _, sampling = jax.random.split(jax.random.key(seed))
-    found = []
-    for number, part in enumerate(settled.parts):
-        sampler = local_global if part.target.dimension <= WIDEST else no_u_turn
+    check_name("sampler", method, SAMPLERS)
+    chosen = [
+        "nuts" if method == LOCAL_GLOBAL and part.target.dimension > WIDEST else method
+        for part in settled.parts
+    ]
+    fewest = min((SAMPLERS[name] for name in chosen), key=lambda sampler: sampler.chains)
+    numbers, found = (chains or fewest.chains, draws or fewest.draws), []
+    for number, (name, part) in enumerate(zip(chosen, settled.parts, strict=True)):
         key = jax.random.fold_in(sampling, number) if number else sampling
         told = functools.partial(_told, tell, number, len(settled.parts))
-        found.append(sampler(part.target, part.modes, key, chains, draws, told))
+        found.append(SAMPLERS[name].run(part.target, part.modes, key, *numbers, told))
     every = joined(settled, found, jax.random.fold_in(sampling, len(found)))
-    return Posterior(settled, every, settled.target.segments if probes is None else probes)
+    probes = settled.target.segments if probes is None else probes
+    return Posterior(settled, every, probes, " and ".join(dict.fromkeys(chosen)))
 
 
 def _told(tell: Callable[[int, int], None], part: int, parts: int, done: int, rounds: int) -> None:
@@ -322,12 +346,13 @@ def _told(tell: Callable[[int, int], None], part: int, parts: int, done: int, ro
     tell(part * rounds + done, parts * rounds)
 
 
-def check_numbers(chains: int, draws: int) -> None:
+def check_numbers(chains: int | None, draws: int | None) -> None:
     """Raise `PalpateError` for so few chains or draws that nothing says how far to trust them."""
-    if chains < 1 or draws < FEWEST:
+    if (chains is not None and chains < 1) or (draws is not None and draws < FEWEST):
         raise PalpateError(
-            f"expected at least 1 chain of {FEWEST} draws, by which it can be judged, got {chains} "
-            f"of {draws}: {CHAINS} of 100 are usual"
+            f"expected at least 1 chain of {FEWEST} draws, by which it can be judged, got "
+            f"{'the usual' if chains is None else chains} of "
+            f"{'the usual' if draws is None else draws}"
         )
 
 

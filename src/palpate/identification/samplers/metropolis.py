@@ -10,6 +10,7 @@ Yang, J. Am. Stat. Assoc. 104, 2009). In both the length of the steps is steered
 """
 
 import time
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -17,18 +18,44 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from palpate.identification.samplers.draws import Draws, check_start, time_to_compile
+from palpate.identification.posterior.laplace import Modes
+from palpate.identification.samplers.draws import Draws, begun, check_start, time_to_compile
 from palpate.identification.samplers.target import Target
 from palpate.numerics.devices import over_devices
 
 ACCEPTANCE = 0.234
 LOOKS = 20  # at the chains during the warm-up
+WARM_UP, STEPS = 150, 15  # steps for each coordinate: of the warm-up, and between two draws
 
 
 class _Walk(eqx.Module):
     position: Float[Array, "*batch free"]
     density: Float[Array, "*batch"]
     accepted: Float[Array, "*batch"]
+
+
+def metropolis(
+    target: Target,
+    modes: Modes,
+    key: PRNGKeyArray,
+    chains: int,
+    draws: int,
+    tell: Callable[[int, int], None] = lambda done, rounds: None,
+) -> Draws:
+    """Sample `draws` of each of `chains` as `covariance_adapted`.
+
+    Chains begin at draws of the modes' mixture, with the covariance at the best mode until there
+    are draws to learn it from.
+    """
+    begin, walking = jax.random.split(key)
+    start, *_ = begun(target, modes, begin, chains)
+    size = target.dimension
+    found = _sampled(
+        target, jnp.asarray(start), walking, draws, WARM_UP * size, STEPS * size, adapted=True,
+        covariance=np.asarray(modes.covariance[0], np.float64),
+    )  # fmt: skip
+    tell(1, 1)
+    return found
 
 
 def prior_scaled(
@@ -59,18 +86,20 @@ def covariance_adapted(
     return _sampled(target, start, key, draws, warm_up, thin, adapted=True)
 
 
-def _sampled(target, start, key, draws: int, warm_up: int, thin: int, adapted: bool) -> Draws:
+def _sampled(
+    target, start, key, draws: int, warm_up: int, thin: int, adapted: bool, covariance=None
+) -> Draws:
     began = time.monotonic()
     check_start(target, np.asarray(start), np.asarray(_densities(target, start)))
     spent = [time.monotonic() - began]
     chains, size = start.shape
     length = -(-warm_up // LOOKS)
     scale, position = 2.38 / np.sqrt(size), start
-    covariance, history = np.eye(size), []
+    shape, history = np.eye(size) if covariance is None else covariance, []
 
     def walked(key: PRNGKeyArray, draws: int, thin: int) -> _Walk:
         now = time.monotonic()
-        root = jnp.asarray(scale * np.linalg.cholesky(covariance), start.dtype)
+        root = jnp.asarray(scale * np.linalg.cholesky(shape), start.dtype)
         walk = _walk(target, position, root, jax.random.split(key, chains), draws, thin)
         walk = jax.device_get(walk)
         spent.append(time.monotonic() - now)
@@ -82,7 +111,7 @@ def _sampled(target, start, key, draws: int, warm_up: int, thin: int, adapted: b
         scale *= np.exp((walk.accepted.mean() - ACCEPTANCE) * 4.0 / np.sqrt(index + 1.0))
         history.append(walk.position)
         if adapted:
-            covariance = _learnt(history[len(history) // 2 :])
+            shape = _learnt(history[len(history) // 2 :])
     walk = walked(jax.random.fold_in(key, 1), draws, thin)
     steps = [1] + [length] * LOOKS + [draws * thin]  # the first is where the chains begin
     return Draws(

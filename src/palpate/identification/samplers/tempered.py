@@ -6,12 +6,10 @@ Doucet and Tsagaris, Scand. J. Stat. 38, 2011); then they are resampled and move
 steps of the shape of their own covariance (Chopin, Biometrika 89, 2002). The means of the weights
 multiply to the evidence, the data's density under the model (Del Moral, Doucet and Jasra, J. R.
 Stat. Soc. B 68, 2006).
-
-Hypotheses about structure (is there a wheel, a bolt) of one shape, other masks, are a batch of
-targets; their evidences compare them (`compare`). Those of other shapes are tempered one by one.
 """
 
-from typing import Any
+import time
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -20,7 +18,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.identification.samplers.target import Target
+from palpate.identification.posterior.laplace import Modes
+from palpate.identification.samplers.draws import Draws
+from palpate.identification.samplers.target import Target, log_prior
 
 KEPT = 0.5  # share of the particles that one change of temperature may leave effective
 LONGEST = 200  # temperatures
@@ -35,15 +35,16 @@ class Particles(eqx.Module):
 
     `temperature` is 1 when all of the data count; below it, the schedule ran out of `LONGEST`
     temperatures. `scale` is the length of the last Metropolis steps in posterior deviations,
-    `acceptance` their rate.
+    `acceptance` their rate, and `evaluations` how many densities were computed.
     """
 
-    position: Float[Array, "*batch particles free"]
-    likelihood: Float[Array, "*batch particles"]
-    evidence: Float[Array, "*batch"]
-    temperature: Float[Array, "*batch"]
-    scale: Float[Array, "*batch"]
-    acceptance: Float[Array, "*batch"]
+    position: Float[Array, "particles free"]
+    likelihood: Float[Array, " particles"]
+    evidence: Float[Array, ""]
+    temperature: Float[Array, ""]
+    scale: Float[Array, ""]
+    acceptance: Float[Array, ""]
+    evaluations: Int[Array, ""]
 
 
 def temper(target: Target, key: PRNGKeyArray, particles: int = 512, moves: int = 10) -> Particles:
@@ -55,55 +56,51 @@ def temper(target: Target, key: PRNGKeyArray, particles: int = 512, moves: int =
     return _checked(*_temper(target, key, particles, moves))
 
 
-def compare(
-    targets: Any, key: PRNGKeyArray, particles: int = 512, moves: int = 10
-) -> tuple[Float[np.ndarray, " hypotheses"], Particles]:
-    """Posterior probability of each hypothesis, all alike before, and the particles of each.
+def populations(
+    target: Target,
+    modes: Modes,
+    key: PRNGKeyArray,
+    chains: int,
+    draws: int,
+    tell: Callable[[int, int], None] = lambda done, rounds: None,
+) -> Draws:
+    """As many independent populations as `chains`, of as many particles each as `draws`.
 
-    `targets` is a batch: a `Target` whose arrays lead with the hypotheses' axis (`batch_of`).
-    Raises as `temper`.
+    They begin at draws of the prior and know nothing of the `modes`. Raises as `temper`.
     """
-    count = jax.tree.leaves(eqx.filter(targets, eqx.is_array))[0].shape[0]
-    found = _checked(*_temper_batch(targets, jax.random.split(key, count), particles, moves))
-    evidence = np.asarray(found.evidence, np.float64)
-    weight = np.exp(evidence - evidence.max())
-    return weight / weight.sum(), found
+    began, spent, found = time.monotonic(), [], []
+    for number, one in enumerate(jax.random.split(key, chains)):
+        now = time.monotonic()
+        found.append(jax.device_get(temper(target, one, draws)))
+        spent.append(time.monotonic() - now)
+        tell(number + 1, chains)
+    position = np.stack([of.position for of in found])
+    prior = np.asarray(log_prior(jnp.asarray(position)))
+    return Draws(
+        position=position,
+        density=np.stack([of.likelihood for of in found]) + prior,
+        acceptance=np.array([float(of.acceptance) for of in found]),
+        divergences=0,
+        evaluations=sum(int(of.evaluations) for of in found),
+        seconds=time.monotonic() - began,
+        compiling=max(0.0, spent[0] - min(spent)),
+    )
 
 
-def batch_of(targets: list[Target]) -> Any:
-    """Targets of one shape as a batch. Raises `PalpateError` when they differ in more than data."""
-    structures = {jax.tree.structure(t) for t in targets}
-    shapes = {
-        tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(eqx.filter(t, eqx.is_array)))
-        for t in targets
-    }
-    if len(structures) > 1 or len(shapes) > 1:
-        raise PalpateError(
-            "hypotheses have to agree in everything but the values of their arrays: "
-            "pad their structure to one size, and free the same parameters"
-        )
-    return jax.tree.map(lambda *x: jnp.stack(x) if eqx.is_array(x[0]) else x[0], *targets)
-
-
-def _checked(particles: Particles, possible: Int[Array, "*batch"]) -> Particles:
+def _checked(particles: Particles, possible: Int[Array, ""]) -> Particles:
     """The particles, if so many draws of the prior were `possible` that there are any to trust."""
-    temperature = np.asarray(particles.temperature)
-    if np.any(np.asarray(possible) < FEWEST):
+    temperature = float(particles.temperature)
+    if int(possible) < FEWEST:
         raise PalpateError(
             "hardly any draw of the prior has a finite likelihood: expected a model that can "
             "predict the data somewhere; declare narrower priors, or check the data"
         )
-    if np.any(temperature < 1.0):
+    if temperature < 1.0:
         raise PalpateError(
-            f"after {LONGEST} temperatures only {float(temperature.min()):.2g} of the data count: "
+            f"after {LONGEST} temperatures only {temperature:.2g} of the data count: "
             "take more particles or moves, or larger noise scales"
         )
     return particles
-
-
-@eqx.filter_jit
-def _temper_batch(targets: Any, keys: Array, particles: int, moves: int) -> tuple[Particles, Array]:
-    return eqx.filter_vmap(lambda t, k: _temper(t, k, particles, moves))(targets, keys)
 
 
 @eqx.filter_jit
@@ -115,7 +112,8 @@ def _temper(
     first, key = jax.random.split(key)
     position = jax.random.normal(first, (particles, target.dimension))
     zero = jnp.zeros((), position.dtype)
-    begin = Particles(position, likelihoods(position), zero, zero, zero + 0.5, zero)
+    count = jnp.asarray(particles)
+    begin = Particles(position, likelihoods(position), zero, zero, zero + 0.5, zero, count)
     possible = jnp.sum(begin.likelihood > IMPOSSIBLE)
 
     def unfinished(carry) -> Bool[Array, ""]:
@@ -136,8 +134,9 @@ def _temper(
             temperature, covariance, state.scale, moving, moves,
         )  # fmt: skip
         state = Particles(
-            position, likelihood, state.evidence + gain, temperature, scale, acceptance
-        )
+            position, likelihood, state.evidence + gain, temperature, scale, acceptance,
+            state.evaluations + moves * particles,
+        )  # fmt: skip
         return index + 1, state, key
 
     return jax.lax.while_loop(unfinished, cool, (0, begin, key))[1], possible
@@ -192,17 +191,13 @@ def finite(likelihood: Array) -> Array:
 
 
 def systematic(
-    key: PRNGKeyArray, log_weight: Float[Array, " particles"], count: int | None = None
-) -> Int[Array, " count"]:
-    """Indices of resampled particles, by one uniform number (Kitagawa 1996).
-
-    As many as asked for; where no `count` is given, as many as there are.
-    """
-    particles = log_weight.shape[0]
-    count = particles if count is None else count
+    key: PRNGKeyArray, log_weight: Float[Array, " particles"]
+) -> Int[Array, " particles"]:
+    """Indices of resampled particles, by one uniform number (Kitagawa 1996)."""
+    count = log_weight.shape[0]
     cumulative = jnp.cumsum(jax.nn.softmax(log_weight))
     points = (jax.random.uniform(key) + jnp.arange(count)) / count
-    return jnp.clip(jnp.searchsorted(cumulative, points * cumulative[-1]), 0, particles - 1)
+    return jnp.clip(jnp.searchsorted(cumulative, points * cumulative[-1]), 0, count - 1)
 
 
 def effective_share(log_weight: Float[Array, " particles"]) -> Float[Array, ""]:
@@ -217,23 +212,18 @@ def weighted_covariance(position: Array, weight: Array) -> Array:
     return (centred * weight[:, None]).T @ centred
 
 
-def next_change(
-    likelihood: Float[Array, " particles"],
-    left: Float[Array, ""],
-    log_weight: Float[Array, " particles"] | float = 0.0,
-) -> Float[Array, ""]:
+def next_change(likelihood: Float[Array, " particles"], left: Float[Array, ""]) -> Float[Array, ""]:
     """The change of temperature that leaves the effective share `KEPT`, or all that is left.
 
     Bisected in the logarithm: the first changes are smaller than the last by orders of magnitude.
-    `log_weight` are weights that the particles have already.
     """
 
     def halve(_, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
         middle = 0.5 * (low + high)
-        enough = effective_share(log_weight + jnp.exp(middle) * likelihood) >= KEPT
+        enough = effective_share(jnp.exp(middle) * likelihood) >= KEPT
         return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
 
     begin = jnp.log(left) - 40.0, jnp.log(left)
     low, _ = jax.lax.fori_loop(0, BISECTIONS, halve, begin)
-    return jnp.where(effective_share(log_weight + left * likelihood) >= KEPT, left, jnp.exp(low))
+    return jnp.where(effective_share(left * likelihood) >= KEPT, left, jnp.exp(low))

@@ -1,0 +1,378 @@
+"""What `palpate identify` says of what it found: figures, parameters, evidence, lines to read."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from palpate.commands.identify_data import Data
+from palpate.identification.data.prediction import PredictionError, or_nan, prediction_error
+from palpate.identification.data.segments import Segments, difference
+from palpate.identification.gradient.residual import Correction
+from palpate.identification.identify import Identified
+from palpate.identification.posterior.comparison import PIECE
+from palpate.identification.posterior.posterior import Posterior
+from palpate.identification.posterior.predictive import Predicted, Score
+from palpate.identification.verdicts import verdict
+from palpate.models.model import Model
+from palpate.parameters import describe, format_value
+from palpate.report.charts import quantiles
+from palpate.runs import Figure, Result
+
+LEVEL = 0.9
+CORRECTION = "correction"  # what the result's settings say of it
+UNITS = {"m": (100.0, "cm")}  # a person reads these errors of a fit in another unit
+
+
+def units_of(unit: str, model: Model) -> tuple[str, ...]:
+    """The unit of each entry of an observation's last axis, as its channel has it: "m, m, rad"."""
+    several = tuple(unit.split(", "))
+    count = model.observation_shape[-1] if model.observation_shape else 1
+    return several if len(several) == count else (unit,) * count
+
+
+def split(data: Data) -> dict[str, Any]:
+    """Which trials were fitted and which scored, for the result."""
+    return {
+        "fitted": [trial.name for trial in data.fitted.trials],
+        "validation": [trial.name for trial in data.validation.trials]
+        if data.validation
+        else "none: all trials were fitted, and the errors are those on them",
+    }
+
+
+# --- a fit --------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Corrected:
+    """What became of a correction, and the error of the physics without it."""
+
+    correction: Correction
+    physics: PredictionError
+
+
+@dataclasses.dataclass(frozen=True)
+class FitReport:
+    """A fitted model and its errors beside those of the model it started from.
+
+    Where a correction was kept, `fitted` and `scored` are with it.
+    """
+
+    delivered: Model
+    fitted: PredictionError
+    scored: PredictionError
+    start: PredictionError
+    data: Data
+    corrected: Corrected | None
+
+    @classmethod
+    def of(
+        cls, start: Model, found: Identified, data: Data, corrected: Corrected | None
+    ) -> "FitReport":
+        """Score what was found on the trials held out, or on the fitted ones if none were."""
+        kept = corrected is not None and corrected.correction.kept
+        model = corrected.correction.model if corrected and kept else found.model
+        fitted = prediction_error(model, data.fitted_aligned)
+        held_out = data.validation is not None
+        scored = prediction_error(model, data.validation_aligned) if held_out else fitted
+        before = prediction_error(start, data.validation_aligned)
+        return cls(model, fitted, scored, before, data, corrected)
+
+    def figures(self, wall_time: float) -> list[Figure]:
+        """Errors of each unit that is observed, and the seconds it took."""
+        figures = []
+        for unit, entries in self._units().items():
+            scale, shown = UNITS.get(unit, (1.0, unit))
+            errors = [
+                _errors(self.delivered, error, entries)
+                for error in (self.scored, self.start, self.fitted)
+            ]
+            (l1, end), (start_l1, start_end), (fitted_l1, _) = [
+                (scale * mean, scale * last) for mean, last in errors
+            ]
+            figures += [
+                Figure(f"l1_{shown}", _known(l1), shown, rival=_rival(start_l1, shown)),
+                Figure(f"rmse_at_end_{shown}", _known(end), shown, rival=_rival(start_end, shown)),
+                Figure(f"l1_fitted_trials_{shown}", _known(fitted_l1), shown),
+            ]
+        figures.append(Figure("wall_time_s", wall_time, "s"))
+        if self.corrected is not None:
+            scale, shown = UNITS.get(self.data.unit, (1.0, self.data.unit))
+            alone = self.corrected.physics.mean_absolute
+            ratio = _known(self.scored.mean_absolute / alone)
+            size = _known(self.corrected.correction.size)
+            figures += [
+                Figure(f"l1_physics_{shown}", _known(alone * scale), shown),
+                Figure("l1_ratio_to_physics", ratio, ""),
+                Figure("correction_size", size, ""),
+            ]
+        if self._is_chain():
+            (tip,) = _root_mean_square(_distances(self.scored)[..., -1].reshape(1, -1))
+            figures.append(Figure("tip_rmse_m", _known(float(tip)), "m"))
+        return figures
+
+    def settings(self) -> dict[str, Any]:
+        """What was scored, and what became of a correction, for the result."""
+        scored = self.data.validation_aligned
+        known = {
+            "observation_unit": units_of(self.data.unit, self.delivered)[0],
+            "scored_trials": len(scored.length),
+            "scored_duration_s": float(np.median(scored.length) - 1) * scored.period,
+            "end_s": float(self.scored.horizon[self.scored.last_seen]),
+        }
+        if self.corrected is None:
+            return known
+        correction, trials = self.corrected.correction, self.data.fitted.trials
+        scale, _ = UNITS.get(self.data.unit, (1.0, self.data.unit))
+        compared = correction.physics, correction.corrected
+        about = {
+            "kept": correction.kept,
+            "reason": correction.reason,
+            "size": correction.size,
+            "held_out": [trials[index].name for index in correction.held_out],
+            "held_out_l1": [scale * error.mean_absolute for error in compared],
+        }
+        return known | {CORRECTION: about}
+
+    def evidence(self) -> dict[str, np.ndarray]:
+        """The errors over the horizon, and for a chain of points the median validation trial."""
+        error = self.scored
+        arrays = {
+            "horizon.time": error.horizon,
+            "horizon.identified": error.rmse,
+            "horizon.start model": self.start.rmse,
+        }
+        if self.corrected is not None and self.corrected.correction.kept:
+            arrays["horizon.physics alone"] = self.corrected.physics.rmse
+        if self._is_chain():
+            low, high = quantiles(_root_mean_square(_distances(error)), (0.1, 0.9))
+            arrays |= {"horizon.identified.low": low, "horizon.identified.high": high}
+            scored = np.isfinite(error.by_trial).sum()  # the others, NaN, are sorted last
+            trial = int(np.argsort(error.by_trial)[scored // 2])
+            seen = np.asarray(error.segments.seen[trial])
+            arrays["motion.time"] = error.horizon
+            arrays["motion.observed"] = np.where(seen, error.segments.target[trial], np.nan)
+            arrays["motion.predicted"] = np.asarray(error.prediction[trial])
+        return arrays
+
+    def _units(self) -> dict[str, np.ndarray]:
+        """Which entries of the last axis of an observation are in each unit."""
+        units = units_of(self.data.unit, self.delivered)
+        return {unit: np.array([u == unit for u in units]) for unit in dict.fromkeys(units)}
+
+    def _is_chain(self) -> bool:
+        """Whether what is observed is points in space, the last of which is called the tip."""
+        shape = self.scored.segments.target.shape
+        return self.data.unit == "m" and len(shape) == 4 and shape[-1] == 3
+
+
+def _errors(model: Model, error: PredictionError, entries: np.ndarray) -> tuple[float, float]:
+    """Mean absolute error of some entries of the last axis, and root mean square at the end."""
+    if entries.all():
+        return error.mean_absolute, float(error.rmse[error.last_seen])
+    seen = np.asarray(error.segments.seen)[..., entries]
+    off = difference(model, error.prediction, np.asarray(error.segments.target))[..., entries]
+    off = np.where(seen, off, 0.0)
+    last = seen[:, error.last_seen]
+    square = np.square(off[:, error.last_seen]).sum()
+    return float(np.abs(off).sum() / or_nan(seen.sum())), float(
+        np.sqrt(square / or_nan(last.sum() / entries.sum()))
+    )
+
+
+def _distances(error: PredictionError) -> np.ndarray:
+    """Distance (trials, times, points) of each point from where it was seen, NaN if it was not."""
+    off = np.where(error.segments.seen, error.prediction - error.segments.target, np.nan)
+    return np.linalg.norm(off, axis=-1)
+
+
+def _root_mean_square(error: np.ndarray) -> np.ndarray:
+    """Over the last axis; NaN is left out, and comes out where there is nothing else."""
+    count = np.isfinite(error).sum(axis=-1)
+    return np.sqrt(np.nansum(error**2, axis=-1) / or_nan(count))
+
+
+def fitted_rows(found: Identified) -> list[dict[str, Any]]:
+    """The parameters for `result.json`: what `describe` says, with intervals and verdicts."""
+    return [
+        row
+        | {
+            "lower": _listed(found.lower.get(row["name"])),
+            "upper": _listed(found.upper.get(row["name"])),
+            "verdict": found.verdict.get(row["name"]),
+        }
+        for row in describe(found.model)
+        if np.size(row["value"])  # a model without wheels, links or contacts has none of theirs
+    ]
+
+
+def _listed(value: Any) -> Any:
+    return None if value is None else np.asarray(value).tolist()
+
+
+def describe_correction(correction: Mapping[str, Any]) -> str:
+    """The sentence for a person."""
+    size = f"; it is {correction['size']:.1%} of what the physics changes in a control period"
+    return f"correction by a network {correction['reason']}{size if correction['kept'] else ''}"
+
+
+# --- draws --------------------------------------------------------------------------------------
+
+
+def drawn_rows(posterior: Posterior) -> list[dict[str, Any]]:
+    """The parameters for `result.json`: medians, 90 % intervals and what the data left open."""
+    declared = posterior.target.coordinates.declarations
+    return [
+        {
+            "name": path,
+            "elements": [row.name for row in rows],
+            "value": [row.median for row in rows],
+            "unit": declared[path].unit,
+            "about": declared[path].about,
+            "fixed": False,
+            "shared": declared[path].shared,
+            "lower": [row.lower for row in rows],
+            "upper": [row.upper for row in rows],
+            "verdict": verdict(np.array([row.undecided for row in rows])),
+        }
+        for path, rows in posterior.rows_of.items()
+    ]
+
+
+def drawn_figures(
+    posterior: Posterior, score: Score, model: Model, wall_time: float, unit: str
+) -> list[Figure]:
+    """Errors of each unit that is observed, coverage, and how far the chains may be trusted."""
+    units = units_of(unit, model)
+    errors = {of: score.pooled(np.array(units) == of) for of in dict.fromkeys(units)}
+    return [
+        *(Figure(f"rmse_{of}", _known(error), of) for of, error in errors.items()),
+        Figure("coverage_90", score.coverage[LEVEL], ""),
+        Figure("log_score", score.log_score, "", better="higher"),
+        Figure("rhat_max_predictions", posterior.rhat_of_predictions, ""),
+        Figure("ess_min", posterior.size_of_predictions, "", better="higher"),
+        Figure("divergences", posterior.draws.divergences, ""),
+        Figure("wall_time_s", wall_time, "s"),
+    ]
+
+
+def expected_errors(predicted: Predicted, pieces: Segments, model: Model) -> dict[str, np.ndarray]:
+    """How the error of what comes first in an observation grows, and is expected to; NaN if unseen.
+
+    Of a pose that is the position.
+    """
+    unit = model.observation_units[0]
+    of = np.array([u == unit for u in model.observation_units])
+    seen = np.asarray(pieces.seen)[..., of]
+    off = difference(model, np.asarray(predicted.motion), np.asarray(pieces.target))[..., of]
+    mean = np.where(seen, off.mean(axis=0), 0.0)
+    axes = (0, *range(2, mean.ndim))
+    count = or_nan(seen.sum(axis=axes))
+    spread = np.where(seen, np.var(np.asarray(predicted.observed)[..., of], axis=0), 0.0)
+    return {
+        "horizon.time": model.control_period * np.arange(1, pieces.horizon + 1),
+        "horizon.error": np.sqrt(np.square(mean).sum(axis=axes) / count),
+        "horizon.expected": np.sqrt(spread.sum(axis=axes) / count),
+    }
+
+
+# --- both ---------------------------------------------------------------------------------------
+
+
+def _rival(value: float, unit: str) -> str:
+    return f"start model {value:.3g} {unit}"
+
+
+def _known(value: float) -> float | None:
+    """None for what JSON lacks: the error of a model that diverged, or of what nobody saw."""
+    return value if math.isfinite(value) else None
+
+
+def show(result: Result) -> None:
+    """Print hypotheses, parameters, what the data cannot tell, and the errors."""
+    settings = result.settings
+    probability = settings.get("probability", {})
+    compared = {**settings.get("by_itself", {}), "structure": probability}
+    for what, of in compared.items():
+        if len(of) > 1:
+            shares = ", ".join(f"{name} {share:.2g}" for name, share in of.items())
+            alone = "" if what == "structure" else " by itself"
+            likely = max(of, key=of.__getitem__)
+            print(f"{what}{alone}: {likely} (probability of each: {shares})")
+    cells = [("parameter", "identified", "90 % interval", "")]
+    cells += [line for row in result.parameters if not row["fixed"] for line in _lines(row)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for line in cells:
+        print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
+    if fixed := [row["name"] for row in result.parameters if row["fixed"]]:
+        print(f"not identified: {', '.join(fixed)} (as given)")
+    for row in result.parameters:
+        if row["verdict"]:
+            print(f"warning: {row['name']}: {row['verdict']}")
+    for warning in result.warnings:
+        print(f"warning: {warning}")
+    print(_scored_draws(result) if probability else _scored_fit(result))
+    if CORRECTION in settings:
+        print(describe_correction(settings[CORRECTION]))
+
+
+def _lines(row: dict[str, Any]) -> list[tuple[str, str, str, str]]:
+    """What is printed of a parameter: of draws a line for each element, of a fit one for all."""
+    if isinstance(row["value"], list) and ("elements" in row or row.get("derived")):
+        several = len(row["value"]) > 1
+        names = [
+            f"{row['name']}[{i}]" if several else row["name"] for i in range(len(row["value"]))
+        ]
+        names = row.get("elements", names)
+        values = zip(names, row["value"], row["lower"], row["upper"], strict=True)
+        return [
+            (name, format_value(value, row["unit"]), f"{low:.3g} to {high:.3g}", "")
+            for name, value, low, high in values
+        ]
+    note = "one value for all elements" if row["shared"] and np.size(row["value"]) > 1 else ""
+    return [(row["name"], format_value(row["value"], row["unit"]), _interval(row), note)]
+
+
+def _interval(row: dict[str, Any]) -> str:
+    """The interval of one value; of several, what is typical relative to their values."""
+    if str(row["verdict"]).startswith("not told by the data:"):
+        return "not told by the data"
+    value, low, high = (np.ravel(row[key]) for key in ("value", "lower", "upper"))
+    if low.size == 1 or (row["shared"] and np.ptp(low) <= 1e-6 * abs(low[0])):
+        return f"{low[0]:.3g} to {high[0]:.3g}"
+    below, above = (np.median((edge - value) / np.abs(value)) for edge in (low, high))
+    return f"typically {below:+.0%} to {above:+.0%}"
+
+
+def _scored_fit(result: Result) -> str:
+    settings = result.settings
+    whole = isinstance(result.split, dict) and isinstance(result.split["validation"], str)
+    count, on = settings["scored_trials"], "the fitted trials" if whole else "validation"
+    if whole and count == 1:
+        on = "the fitted trial"
+    errors = ", ".join(
+        "unknown" if figure.value is None else f"{figure.value:.3f} {figure.unit}"
+        for figure in result.figures
+        if figure.name == f"l1_{figure.unit}"
+    )
+    return (
+        f"mean absolute error (L1) {errors} over {count} {'trial' if count == 1 else 'trials'} of "
+        f"{round(settings['scored_duration_s'], 1):g} s ({on})"
+    )
+
+
+def _scored_draws(result: Result) -> str:
+    values = {figure.name: figure for figure in result.figures}
+    errors = ", ".join(
+        f"{'unknown' if figure.value is None else f'{figure.value:.3g}'} {figure.unit}"
+        for name, figure in values.items()
+        if name.startswith("rmse_")
+    )
+    return (
+        f"predicted over {PIECE:g} s: root mean square error {errors}; 90 % intervals hold "
+        f"{values['coverage_90'].value or 0.0:.0%} of what was seen "
+        f"({result.settings['scored_on']})"
+    )

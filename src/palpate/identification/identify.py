@@ -1,0 +1,123 @@
+"""Any method for any model: recordings in; a fitted model or draws, and how far to trust them, out.
+
+    found = identify(model, recording.align(model.control_period), "nuts")
+    found.lower["mass"], found.upper["mass"], found.verdict["mass"], found.warnings
+
+A fit descends through the model (`gradient.descent`) and has intervals by least squares; draws are
+those of a posterior (`posterior.posterior`). Several models are hypotheses about what was recorded,
+which draws compare and a fit cannot.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+
+from palpate.errors import PalpateError
+from palpate.family import check_name
+from palpate.identification.gradient import descent
+from palpate.identification.gradient.descent import Settings
+from palpate.identification.gradient.least_squares import intervals
+from palpate.identification.posterior.comparison import Comparison, compare, posterior_of
+from palpate.identification.posterior.posterior import SAMPLERS, Posterior
+from palpate.identification.verdicts import verdict
+from palpate.models.model import Model
+from palpate.parameters import FreeParameters
+from palpate.recordings import Aligned
+from palpate.runs import Run
+
+FITS = {"gradient": "adam", "levenberg-marquardt": "levenberg-marquardt"}  # how each descends
+METHODS = (*FITS, *SAMPLERS)
+INTERVAL = 0.05, 0.95  # of the draws
+
+
+@dataclasses.dataclass(frozen=True)
+class Identified:
+    """What was found of a model, and how far to trust it.
+
+    `model` is the fitted one, or the most probable of the draws. `lower` and `upper` are the ends
+    of 90 % intervals by parameter, in its unit and shape; `verdict` a sentence where the data left
+    it as the prior has it, else None. `comparison` holds draws, and how probable each hypothesis
+    is; it is None of a fit.
+    """
+
+    model: Model
+    lower: dict[str, np.ndarray]
+    upper: dict[str, np.ndarray]
+    verdict: dict[str, str | None]
+    warnings: tuple[str, ...]
+    comparison: Comparison | None = None
+
+    @property
+    def posterior(self) -> Posterior | None:
+        """The draws, None of a fit."""
+        return None if self.comparison is None else self.comparison.posterior
+
+
+def identify(
+    model: Model | Mapping[str, Model],
+    aligned: Aligned,
+    method: str = "gradient",
+    *,
+    settings: Settings | None = None,
+    chains: int | None = None,
+    draws: int | None = None,
+    seed: int = 0,
+    one_object: bool = False,
+    run: Run | None = None,
+) -> Identified:
+    """Identify the free parameters of a model from aligned trials by one of `METHODS`.
+
+    `model` is where it starts, and says what is free, shared or fixed; or hypotheses by name.
+    `settings` and `run` are those of a fit (`descent.identify`; its method and seed are taken from
+    here); `chains`, `draws` and `one_object` those of draws (`posterior.sample`, `posterior_of`).
+
+    Raises `PalpateError` for an unknown method, several hypotheses to a fit, and as those do.
+    """
+    check_name("method", method, METHODS)
+    hypotheses = {"": model} if isinstance(model, Model) else model
+    if method in FITS:
+        if len(hypotheses) > 1:
+            raise PalpateError(
+                f"{method} fits one model, and here are {', '.join(hypotheses)}: expected one of "
+                f"them, or a method that draws and compares: {', '.join(SAMPLERS)}"
+            )
+        settings = dataclasses.replace(settings or Settings(), method=FITS[method], seed=seed)
+        (start,) = hypotheses.values()
+        return fitted(start, aligned, settings, run)
+    targets = {
+        name: posterior_of(one, aligned, one_object=one_object) for name, one in hypotheses.items()
+    }
+    return drawn(compare(targets, draws, chains, seed, method))
+
+
+def fitted(start: Model, aligned: Aligned, settings: Settings, run: Run | None) -> Identified:
+    """A fit and its intervals; see `descent.identify`."""
+    model = descent.identify(start, aligned, settings, run)
+    coordinates = FreeParameters(model)
+    found = intervals(coordinates, coordinates.initial, aligned)
+    lower, upper = (
+        {path: np.asarray(edge) for path, edge in edges.items()}
+        for edges in (found.lower, found.upper)
+    )
+    return Identified(model, lower, upper, found.verdict, found.warnings)
+
+
+def drawn(comparison: Comparison) -> Identified:
+    """The draws of the most probable hypothesis with their intervals."""
+    posterior = comparison.posterior
+    lower, upper = (
+        {path: np.quantile(of, level, axis=(0, 1)) for path, of in posterior.values.items()}
+        for level in INTERVAL
+    )
+    best = posterior.flat[np.argmax(posterior.draws.density)]
+    rows = posterior.rows_of
+    return Identified(
+        posterior.target.model(jnp.asarray(best)),
+        lower,
+        upper,
+        {path: verdict(np.array([row.undecided for row in of])) for path, of in rows.items()},
+        posterior.warnings,
+        comparison,
+    )

@@ -155,7 +155,7 @@ def test_the_machine_is_described_without_naming_it():
 
 
 def test_reading_a_result_does_not_load_jax():
-    code = "import sys, palpate.result as r; r.machine(); assert 'jax' not in sys.modules"
+    code = "import sys, palpate.runs.result as r; r.machine(); assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

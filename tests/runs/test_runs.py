@@ -333,7 +333,7 @@ TRAINING = """
 import os, signal, sys, time
 import jax, jax.numpy as jnp, optax
 from palpate.runs import Run
-from palpate.storage import save_arrays
+from palpate.runs.storage import save_arrays
 
 out, pause, kill_at_checkpoint = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 replace, replaced = os.replace, 0

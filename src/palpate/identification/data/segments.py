@@ -181,7 +181,7 @@ class SegmentSource:
 
     @cached_property
     def _noise(self) -> np.ndarray:
-        return noise_scale(self.aligned, self.model)
+        return noise_scale(self.aligned, self.model, fast=True)
 
     @cached_property
     def _begun(self) -> dict[tuple[int, int, bool], tuple[np.ndarray, ...]]:
@@ -214,7 +214,7 @@ def cut(
             if last - first < min(shortest, int(length) - 1):
                 continue
             still = at_rest and first == 0
-            start = _smoothed(observed, model, first, period, spread, still)
+            start = _smoothed(observed, model, first, period, spread, still, reaches=1)
             if start is None:
                 continue  # nothing is seen around: the piece before it ends here
             pieces.append((*start, *_padded(observed, aligned.action[trial], first, last, horizon)))
@@ -237,13 +237,14 @@ def _joined(pieces: list[tuple[np.ndarray, ...]]) -> Segments:
     )
 
 
-def noise_scale(aligned: Aligned, model: Model) -> Float[np.ndarray, " last"]:
+def noise_scale(aligned: Aligned, model: Model, fast: bool = False) -> Float[np.ndarray, " last"]:
     """Standard deviation of the observation noise, for each entry of the last observation axis.
 
     From the third differences of consecutive frames, in which smooth motion all but vanishes and
     white noise has 20 times its variance; by their median, so that jerks do not count (Gasser,
-    Sroka and Jennen-Steinmetz, Biometrika 73, 1986). Where the sixth (924 times) show less than
-    half as much, it was motion that the third ones showed. Angles are differences of the model's.
+    Sroka and Jennen-Steinmetz, Biometrika 73, 1986). Of `fast` motion the sixth are asked too
+    (924 times): where they show less than half as much, it was motion that the third ones showed.
+    Angles are differences of the model's.
     """
     last = model.observation_shape[-1]
     floor = 1e-5 * max(float(np.nanmax(np.abs(aligned.observation), initial=0.0)), 1e-3)
@@ -264,7 +265,10 @@ def noise_scale(aligned: Aligned, model: Model) -> Float[np.ndarray, " last"]:
         medians = np.array([float(np.median(v)) if v.size else 0.0 for v in seen])
         return np.maximum(medians / 0.6745 / np.sqrt(growth), floor)
 
-    third, sixth = scale(3, 20.0), scale(6, 924.0)
+    third = scale(3, 20.0)
+    if not fast:
+        return third
+    sixth = scale(6, 924.0)
     return np.where((sixth < 0.5 * third) & (sixth > floor), sixth, third)
 
 
@@ -280,11 +284,13 @@ def _smoothed(
     period: float,
     spread: np.ndarray,
     still: bool = False,
+    reaches: int = 3,
 ) -> tuple[np.ndarray, ...] | None:
     """Pose, rate and their deviations at a frame; None where too little is seen around it.
 
-    Each channel from the longest reach over which the polynomial misses it by no more than noise
-    may; where it misses in all, the deviations grow by what it misses over the shortest.
+    Of several `reaches`, each half the one before, each channel has the longest over which the
+    polynomial misses it by no more than noise may; where it misses in all, the deviations grow by
+    what it misses over the shortest. With one, the deviations are those of the noise alone.
     """
     noise = np.broadcast_to(spread, observed.shape[1:])
     if still:
@@ -295,7 +301,7 @@ def _smoothed(
         pose, deviation, *_ = found
         return pose[0], np.zeros_like(noise), noise * deviation[0], np.zeros_like(noise)
     best, reach = None, max(ORDER, round(REACH / period))
-    for within in sorted({reach, reach // 2, reach // 4}):
+    for within in sorted({reach // 2**halved for halved in range(reaches)}):
         around = slice(max(0, first - within), first + within + 1)
         found = _fitted(observed, model, first, around, ORDER, period)
         if found is None:
@@ -303,6 +309,8 @@ def _smoothed(
         value, deviation, squares, freedom = found
         missed = squares / np.square(noise)
         start = (*value[:2], noise * deviation[0], noise * deviation[1])
+        if reaches == 1:
+            return start
         if best is None:
             grown = np.sqrt(np.maximum(1.0, missed / freedom))
             best = (*start[:2], grown * start[2], grown * start[3])

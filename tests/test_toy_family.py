@@ -9,6 +9,7 @@ import pytest
 from palpate import family
 from palpate.cli import main
 from palpate.networks import load_policy
+from palpate.report import read_evidence
 from palpate.runs.result import read_result
 from toy_pendulum import PendulumWorld
 
@@ -45,6 +46,20 @@ def test_what_is_identified_is_the_pendulum_that_was_recorded():
         assert row["upper"] - row["lower"] < 0.05 * true, row
 
 
+def test_the_policy_does_better_than_nothing_in_the_world(capsys):
+    do("evaluate pendulum-damping --policy policy --model model --out tried")
+    table = capsys.readouterr().out.splitlines()
+    assert table[0].startswith("controlled")
+    assert table[1].startswith("held still")
+    found = figures("tried")
+    assert found["success_rate"] > 0.8
+    assert found["success_rate.held_still"] < 0.2
+    assert found["in_model.success"] > 0.8
+    swing = read_evidence("tried").pieces["swing"]
+    ends = {label: np.abs(angle[-50:]).max() for label, angle in swing.values.items()}
+    assert ends["controlled"] < 0.2 * ends["held still"]
+
+
 def test_what_is_exported_brings_the_pendulum_to_rest_as_the_policy_does():
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
@@ -66,11 +81,14 @@ def test_what_is_exported_brings_the_pendulum_to_rest_as_the_policy_does():
 
 
 def test_the_page_tells_of_all_and_of_what_the_family_adds():
-    do("report model policy --out page.html --title Toys")
+    do("evaluate pendulum-damping --policy policy --out again --pendulums 1")
+    do("report model policy again --out page.html --title Toys")
     with open("page.html", encoding="utf-8") as file:
         page = file.read()
     assert all(f"<h2>{part}</h2>" in page for part in ("Results", "Parameters", "Learning"))
     assert "RMSE (rad)" in page
+    assert "<h2>Swing</h2>" in page
+    assert "The angle from hanging" in page
 
 
 @pytest.mark.parametrize("words", ["record toy-pendulum", "train pendulum-damping"])

@@ -19,5 +19,6 @@ FAMILY = Family(
         "record": {"toy-pendulum": "toy_pendulum:RecordPendulum"},
         "identify": {"toy-pendulum": "toy_pendulum:IdentifyPendulum"},
         "train": {"pendulum-damping": "toy_pendulum:TrainPendulumDamping"},
+        "evaluate": {"pendulum-damping": "toy_pendulum:EvaluatePendulumDamping"},
     },
 )

@@ -5,14 +5,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 
-from palpate.families.options import Identify, Record, Train
+from palpate.families.options import EvaluateInTrials, Identify, Record, Train
 from palpate.recordings import Aligned, Channel, Recording, Role
 from palpate.recordings import Trial as RecordedTrial
 from palpate.report import Curves, Piece, charts
+from palpate.trials import trial as trials
+from palpate.trials.controller import Controller, FeedbackController, HeldStill
 from palpate.worlds.world import World
-from toys import Pendulum, PendulumDamping
+from toys import Pendulum, PendulumDamping, PendulumState
 
 ANGLE, ACCELERATION = "angle", "acceleration"
 NOISE = 1e-4  # rad, standard deviation of the encoder
@@ -135,6 +138,90 @@ class TrainPendulumDamping(Train):
 
     def prepare(self, model: Pendulum) -> Pendulum:
         return model
+
+
+class Damper(FeedbackController):
+    """A policy, fed with the angle that is seen and its rate since the last."""
+
+    def __init__(self, policy: Any):
+        self.policy, self.period = policy, policy.period
+
+    def start(self, command: Any, observation: PendulumObservation, goal: Any) -> Any:
+        return self.policy.initial_carry(jnp.asarray(command, jnp.float32)), observation.angle
+
+    def decide(self, carry: Any, observation: PendulumObservation, goal: Any) -> Any:
+        memory, before = carry
+        rate = (observation.angle - before) / self.period
+        state = PendulumState(jnp.asarray(observation.angle), jnp.asarray(rate))
+        features = PendulumDamping().features(state, None).astype(jnp.float32)
+        memory, action = self.policy(memory, features, None, None)
+        return (memory, observation.angle), np.asarray(action)
+
+
+@dataclass(frozen=True)
+class Swings(trials.Record):
+    """Energies (trials, times) in J/kg, and the angles (drawn, times, 1) in rad that were seen."""
+
+    observed: ClassVar[str] = "angle"
+    energy: np.ndarray
+    angle: np.ndarray
+    failures: dict[int, str]
+
+
+@dataclass(frozen=True)
+class SwingTrial(trials.Trial[Swings]):
+    """A pendulum of some length that is to come to rest."""
+
+    seed: int
+    length: float
+    steps: int = 200
+    group = "swing"
+    control_period = PendulumWorld.control_period
+    reset_options: ClassVar[Mapping[str, Any]] = {}
+    command = np.zeros(1)
+
+    def world(self) -> PendulumWorld:
+        return PendulumWorld(self.length, 0.1)
+
+    def measure(self, observation: PendulumObservation, truth: PendulumTruth) -> dict[str, Any]:
+        return {"energy": truth.energy}
+
+    @classmethod
+    def record(cls, trials: Sequence[Any], steps: int, drawn: int) -> Swings:
+        energy = np.full((len(trials), steps + 1), np.nan)
+        return Swings(energy, np.full((drawn, steps + 1, 1), np.nan), {})
+
+    @classmethod
+    def score(cls, trials: Sequence[Any], record: Swings) -> dict[str, float]:
+        return {"success_rate": float(np.mean(record.energy[:, -1] < 0.02 * record.energy[:, 0]))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluatePendulumDamping(EvaluateInTrials):
+    """Try a controller in pendulums that it was not trained for.
+
+    1. After `palpate train`:           palpate evaluate pendulum-damping --policy POLICY
+    """
+
+    task: ClassVar[str] = PendulumDamping.name
+
+    pendulums: int = 10
+    """Drawn around one of 70 cm."""
+
+    def prepare(self, model: Pendulum) -> Pendulum:
+        return model
+
+    def trials(self) -> list[SwingTrial]:
+        lengths = np.random.default_rng(self.seed).uniform(0.6, 0.8, self.pendulums)
+        return [SwingTrial(seed, float(length)) for seed, length in enumerate(lengths)]
+
+    def controllers(self, policy: Any) -> dict[str, Controller]:
+        return {"controlled": Damper(policy), "held still": HeldStill()}
+
+    def show(self, trials: Any, evaluated: Mapping[str, Swings]) -> dict[str, np.ndarray]:
+        some = next(iter(evaluated.values()))
+        swings = {f"swing.{name}": record.angle[0, :, 0] for name, record in evaluated.items()}
+        return swings | {"swing.time": SwingTrial.control_period * np.arange(some.angle.shape[1])}
 
 
 def _swing(curves: Curves, looks: Mapping[str, int]) -> tuple[str, charts.Chart]:

@@ -7,6 +7,7 @@ Nothing here imports what computes, so that help is instant.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from palpate.networks import CommandPolicy
     from palpate.recordings import Aligned, Recording
     from palpate.runs import Figure, Run
+    from palpate.trials.controller import Controller
+    from palpate.trials.trial import Trial
 
 Number = Annotated[float | None, arg(metavar="NUMBER", help_behavior_hint="(default: none)")]
 Whole = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: as many as needed)")]
@@ -287,6 +290,62 @@ class Evaluate(Options, ABC):
     @abstractmethod
     def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
         """Try the policy in the world; leaves evidence and checkpoints in the run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateInTrials(Evaluate, ABC):
+    """A trained policy in the worlds of its family, beside others and beside doing nothing.
+
+    Each task names its trials and who decides in them; what its trials score is what counts.
+    """
+
+    @abstractmethod
+    def trials(self) -> Sequence[Trial]:
+        """What is tried, drawn by the seed."""
+
+    @abstractmethod
+    def controllers(self, policy: CommandPolicy) -> Mapping[str, Controller]:
+        """Who decides, by name: the policy, and then what it is held against."""
+
+    def show(self, trials: Sequence[Trial], evaluated: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Arrays for the run's page, named as `palpate.report.evidence` describes."""
+        return {}
+
+    def check(self, policy: CommandPolicy) -> None:
+        """Raise `PalpateError` where some world is controlled at another rate."""
+        from palpate.trials.controller import check_period
+
+        for controller in self.controllers(policy).values():
+            for trial in self.trials():
+                check_period(controller, trial.control_period)
+
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """Let each controller decide in the same trials; a figure for each score of each."""
+        from palpate.report import write_evidence
+        from palpate.runs import Figure
+        from palpate.trials.trial import evaluate_trials
+
+        trials = self.trials()
+        evaluated = evaluate_trials(self.controllers(policy), trials, run)
+        if shown := self.show(trials, evaluated):
+            write_evidence(run.path, shown)
+        figures, table = [], []
+        for number, (name, record) in enumerate(evaluated.items()):
+            suffix = f".{name.replace(' ', '_')}" if number else ""
+            scores = type(trials[0]).score(trials, record)
+            for score, value in scores.items():
+                better = "higher" if score == "success_rate" else "lower"
+                known = value if math.isfinite(value) else None
+                figures.append(Figure(f"{score}{suffix}", known, "", better=better))
+            scored = ", ".join(f"{score.replace('_', ' ')} {v:.3g}" for score, v in scores.items())
+            table.append(f"{name:28s} {scored}")
+            table += [f"  trial {trial}: {why}" for trial, why in sorted(record.failures.items())]
+        return Evaluation(
+            figures=figures,
+            table=table,
+            settings={"trials": len(trials)},
+            split={"evaluated": f"{len(trials)} trials, seed {self.seed}"},
+        )
 
 
 @dataclass(frozen=True)

@@ -97,6 +97,43 @@ class Model(eqx.Module):
         return self
 
 
+class Wrapper(Model):
+    """A model on top of another, `inner`, with the contract of that one but for what it overrides.
+
+    What a step does is its own, and so are `stepper`, `constrain` and `independent_parts`.
+    """
+
+    inner: eqx.AbstractVar[Model]
+
+    @property
+    def control_period(self) -> float:
+        return self.inner.control_period
+
+    @property
+    def action_shape(self) -> tuple[int, ...]:
+        return self.inner.action_shape
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        return self.inner.observation_shape
+
+    @property
+    def observation_units(self) -> tuple[str, ...]:
+        return self.inner.observation_units
+
+    def observe(self, state: Any) -> Array:
+        return self.inner.observe(state)
+
+    def difference(self, predicted: Array, observed: Array) -> Array:
+        return self.inner.difference(predicted, observed)
+
+    def initial_state(self, observations: Array) -> Any:
+        return self.inner.initial_state(observations)
+
+    def velocity(self, state: Any) -> Any:
+        return self.inner.velocity(state)
+
+
 def batch_size(model: Model, actions: Array) -> int | None:
     """Length of the batch axis of a sequence of actions (time after batch), None without one.
 

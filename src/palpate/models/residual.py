@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.models.model import Model
+from palpate.models.model import Model, Wrapper
 from palpate.parameters import Parameter
 
 PLACES = 4  # learned numbers that tell a site from another
@@ -178,8 +178,11 @@ def _with_neighbours(x: Array, neighbours: np.ndarray) -> Array:
     return jnp.concatenate([mean(group) for group in np.swapaxes(neighbours, 0, 1)], axis=-1)
 
 
-class Residual(Model):
-    """A model and the network that corrects it: a model too, with the physics' parameters."""
+class Residual(Wrapper):
+    """A model and the network that corrects it: a model too, with the physics' parameters.
+
+    One part (`Model.independent_parts`), whatever moves by itself: the network sees the whole.
+    """
 
     physics: Model
     network: SiteNetwork
@@ -212,28 +215,9 @@ class Residual(Model):
             )
 
     @property
-    def control_period(self) -> float:
-        """That of the physics, s."""
-        return self.physics.control_period
-
-    @property
-    def action_shape(self) -> tuple[int, ...]:
-        """That of the physics."""
-        return self.physics.action_shape
-
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """That of the physics."""
-        return self.physics.observation_shape
-
-    @property
-    def observation_units(self) -> tuple[str, ...]:
-        """Those of the physics."""
-        return self.physics.observation_units
-
-    def difference(self, predicted: Array, observed: Array) -> Array:
-        """See `Model.difference`."""
-        return self.physics.difference(predicted, observed)
+    def inner(self) -> Model:
+        """The physics."""
+        return self.physics
 
     def correction(self, state: Any, action: Array) -> Float[Array, "*batch sites axes"]:
         """What the network adds to the velocities of this state."""
@@ -252,22 +236,6 @@ class Residual(Model):
 
     def _kicked(self, state: Any, action: Array) -> Any:
         return correctable(self.physics).corrected(state, self.correction(state, action))
-
-    def observe(self, state: Any) -> Array:
-        """What a sensor would show in this state."""
-        return self.physics.observe(state)
-
-    def initial_state(self, observations: Array) -> Any:
-        """See `Model.initial_state`."""
-        return self.physics.initial_state(observations)
-
-    def velocity(self, state: Any) -> Any:
-        """See `Model.velocity`."""
-        return self.physics.velocity(state)
-
-    def independent_parts(self) -> tuple[tuple[Model, tuple[int, ...]], ...]:
-        """One, whatever moves by itself in the physics: the network belongs to the whole."""
-        return super().independent_parts()
 
     def constrain(self) -> "Residual":
         """The correction on top of the nearest legal physics."""

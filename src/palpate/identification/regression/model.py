@@ -17,7 +17,7 @@ from jaxtyping import Array
 from palpate.errors import PalpateError
 from palpate.identification.regression.gaussian_process import GaussianProcess, gaussian_process
 from palpate.identification.regression.locally_weighted import LocallyWeighted, locally_weighted
-from palpate.models.model import Model
+from palpate.models.model import Model, Wrapper
 from palpate.parameters import Parameter
 
 Regression = LocallyWeighted | GaussianProcess
@@ -43,29 +43,18 @@ class Features:
     condition: Callable[[Any], Array] | None = None
 
 
-class RegressedModel(Model):
+class RegressedModel(Wrapper):
     """Predicts by regression, and observes and starts as the `prototype` does."""
 
     prototype: Model
     regression: Regression  # leaves lead with the parts
     features: Features = eqx.field(static=True)
-    control_period: float = eqx.field(static=True)
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     @property
-    def action_shape(self) -> tuple[int, ...]:
-        """See `Model.action_shape`."""
-        return self.prototype.action_shape
-
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """See `Model.observation_shape`."""
-        return self.prototype.observation_shape
-
-    @property
-    def observation_units(self) -> tuple[str, ...]:
-        """See `Model.observation_units`."""
-        return self.prototype.observation_units
+    def inner(self) -> Model:
+        """The prototype."""
+        return self.prototype
 
     def step(self, state: Any, action: Array) -> Any:
         """See `Model.step`."""
@@ -73,18 +62,6 @@ class RegressedModel(Model):
         answer = eqx.filter_vmap(lambda part, x, c: part(x, c), in_axes=(0, -2, -2), out_axes=-2)
         change = answer(self.regression, inputs, _conditions(self.features, state, inputs))
         return self.features.apply(state, change)
-
-    def observe(self, state: Any) -> Array:
-        """See `Model.observe`."""
-        return self.prototype.observe(state)
-
-    def difference(self, predicted: Array, observed: Array) -> Array:
-        """See `Model.difference`."""
-        return self.prototype.difference(predicted, observed)
-
-    def initial_state(self, observations: Array) -> Any:
-        """See `Model.initial_state`."""
-        return self.prototype.initial_state(observations)
 
 
 def regressed(
@@ -131,12 +108,7 @@ def regressed(
             for part in range(inputs.shape[1])
         ]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-    return RegressedModel(
-        prototype=prototype,
-        regression=stacked,
-        features=features,
-        control_period=prototype.control_period,
-    )
+    return RegressedModel(prototype=prototype, regression=stacked, features=features)
 
 
 @eqx.filter_jit

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from palpate.identification.regression.locally_weighted import LocallyWeighted, locally_weighted
 from palpate.identification.regression.model import Features, RegressedModel
-from palpate.models.model import Model
+from palpate.models.model import Model, Wrapper
 from palpate.models.planar import Planar, PlanarState, furniture
 from palpate.parameters import Parameter, declare, parameters_of, value_of, with_values
 from palpate.recordings import Aligned
@@ -32,7 +32,7 @@ FRAMES = round(DECISION / CONTROL_PERIOD)  # observed in a decision
 SUBSTEPS = 2  # of a decision, in planning
 
 
-class Handled(Model):
+class Handled(Wrapper):
     """A scene in which one piece is held: an action is a share (along, across, turn) of its wrench.
 
     Forces act at the piece's handle, in its axes as it stands when the decision is taken, and keep
@@ -43,18 +43,12 @@ class Handled(Model):
     held: Int[Array, ""]
     strength: Float[Array, "bodies 3"]
     handle: Float[Array, "bodies 2"]
-    control_period: float = eqx.field(static=True, default=DECISION)
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     @property
     def action_shape(self) -> tuple[int]:
         """(3,): along, across, turn."""
         return (3,)
-
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """Those of the scene."""
-        return self.inner.observation_shape
 
     def wrench(self, pose: Array, action: Array) -> Float[Array, "*batch bodies 3"]:
         """What acts on each body, in the room's axes about the bodies' origins."""
@@ -71,18 +65,6 @@ class Handled(Model):
     def step(self, state: PlanarState, action: Array) -> PlanarState:
         """See `Model.step`."""
         return self.inner.step(state, self.wrench(state.pose, action))
-
-    def observe(self, state: PlanarState) -> Array:
-        """See `Model.observe`."""
-        return self.inner.observe(state)
-
-    def difference(self, predicted: Array, observed: Array) -> Array:
-        """See `Model.difference`."""
-        return self.inner.difference(predicted, observed)
-
-    def initial_state(self, observations: Array) -> PlanarState:
-        """See `Model.initial_state`."""
-        return self.inner.initial_state(observations)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,10 +262,7 @@ class RegressionAgent:
         parts = [part if part is not None else self._parts[held] for part in self._parts]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
         return RegressedModel(
-            prototype=self._prototype,
-            regression=stacked,
-            features=self._features,
-            control_period=DECISION,
+            prototype=self._prototype, regression=stacked, features=self._features
         )
 
 

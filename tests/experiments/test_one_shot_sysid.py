@@ -44,9 +44,6 @@ def test_the_mass_is_found_from_a_few_seconds_without_noise():
     assert fit.converged
     assert fit.parameters.mass == pytest.approx(true.mass, rel=0.02)
     assert (fit.parameters.locked, fit.parameters.anchor) == (true.locked, true.anchor)
-    assert 1 <= fit.pieces <= 4
-    assert fit.evaluations > 10
-    assert fit.wall_time_s > 0
 
 
 def test_a_caster_beside_a_hinge_need_not_show_where_it_points():
@@ -58,7 +55,6 @@ def test_a_caster_beside_a_hinge_need_not_show_where_it_points():
     known = [known for _, known in caster_tracks(scene, aligned.observation[0, :, 0])]
     assert max(known[2]) < KNOWN
     fit = fit_scene(recording, KINDS["hinged"], true.locked, true.anchor)
-    assert fit.pieces > 0
     assert fit.parameters.mass == pytest.approx(true.mass, rel=0.1)
 
 
@@ -72,7 +68,7 @@ def predicted_pushes(kind, draws):
     segments = cut(aligned, model, 2.0, at_rest=True)
     exact = jnp.asarray(aligned.observation[:, 0], jnp.float32)
     segments = dataclasses.replace(segments, pose=exact)
-    return predict_pieces(SysidFit(scene, true, 0.0, 1, True, 1, 1.0), segments, draws), segments
+    return predict_pieces(SysidFit(scene, true, True), segments, draws), segments
 
 
 def test_with_the_true_constants_a_sliding_piece_is_predicted_to_the_micrometre():

@@ -18,7 +18,6 @@ import functools
 import io
 import math
 import os
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -62,21 +61,14 @@ class CastersUnknownError(PalpateError):
 
 @dataclasses.dataclass(frozen=True)
 class SysidFit:
-    """What mujoco.sysid found.
+    """What mujoco.sysid found: the constants of what it was told of the `scene`.
 
-    `scene` is what it was told and `parameters` the constants with it. `error` is the root mean
-    square of residuals over their standard deviations, `pieces` how many were fitted.
-    `evaluations` counts how often all of them were simulated, for derivatives too. `converged`
-    says that it ended by its tolerances, and not because it had tried often enough.
+    `converged` says that it ended by its tolerances, and not because it had tried often enough.
     """
 
     scene: ToldScene
     parameters: PieceParameters
-    error: float
-    pieces: int
     converged: bool
-    evaluations: int
-    wall_time_s: float
 
 
 def fit_scene(
@@ -106,11 +98,10 @@ def fit_scene(
         raise PalpateError(
             f"a '{kind.name}' is bolted down, so that nothing of it can be fitted: leave it out"
         )
-    began = time.perf_counter()
     aligned = recording.align(CONTROL_PERIOD)
     _check(recording, aligned)
     scene = ToldScene(kind, locked, anchor, tuple(aligned.observation[0, 0, 0].tolist()))
-    sequences, pieces = _sequences(sysid, scene, aligned)
+    sequences = _sequences(sysid, scene, aligned)
     model = functools.lru_cache(maxsize=GUESSES)(scene.model)  # it asks anew for every piece
     whole = sysid.build_residual_fn(
         models_sequences=[sequences],
@@ -120,7 +111,6 @@ def fit_scene(
         n_threads=THREADS,
     )
     middle, width = scene.prior
-    evaluations = 0
 
     def residual(vector: np.ndarray, current: Any) -> Any:
         """What mujoco.sysid compares, and how far the constants are from what is usual.
@@ -128,8 +118,6 @@ def fit_scene(
         Without the latter what the recording does not determine, such as the friction of wheels
         that never slip, ends anywhere.
         """
-        nonlocal evaluations
-        evaluations += vector.shape[1] if vector.ndim == 2 else 1
         errors, *compared = whole(vector, current)
         return [*errors, ((vector.T - middle) / width).T], *compared
 
@@ -140,15 +128,7 @@ def fit_scene(
     for difference in DIFFERENCES:
         found = _optimized(residual, _counted(sysid, scene, shares), difference)
         shares = found.x
-    return SysidFit(
-        scene=scene,
-        parameters=scene.parameters(*shares.tolist()),
-        error=float(np.sqrt(np.mean(np.square(found.fun)))),
-        pieces=pieces,
-        converged=found.status > 0,
-        evaluations=evaluations,
-        wall_time_s=time.perf_counter() - began,
-    )
+    return SysidFit(scene, scene.parameters(*shares.tolist()), found.status > 0)
 
 
 def predict_pieces(
@@ -240,8 +220,8 @@ def _optimized(residual: Callable[..., Any], parameters: Any, difference: float)
     return found
 
 
-def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int]:
-    """The pieces of a recording as mujoco.sysid takes them, and how many they are.
+def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> Any:
+    """The pieces of a recording as mujoco.sysid takes them.
 
     Measured is at each frame the pose and the standard deviation of what a perfect model's would
     differ by: the noise, and the start's deviation with that of its velocity, as it grows. Pieces
@@ -257,7 +237,15 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int
     after = CONTROL_PERIOD * np.arange(1, horizon + 1)[:, None]
     mapping = {MEASURED: (sysid.SignalType.CustomObs, np.arange(6))}
     names, states, controls, measured = [], [], [], []
-    least = max(1, _told_at_best(scene, aligned, horizon)) if scene.free else 0
+    tracks = [
+        caster_tracks(scene, poses[:length, 0])
+        for poses, length in zip(aligned.observation, aligned.length, strict=True)
+    ]
+    known = [
+        np.sum([known[: len(known) - 1 : horizon] >= KNOWN for _, known in track], axis=0)
+        for track in tracks
+    ]
+    least = max(1, *map(np.max, known)) if scene.free else 0
     for trial, length in enumerate(aligned.length):
         one = Aligned(
             aligned.period,
@@ -266,12 +254,11 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int
             aligned.length[trial : trial + 1],
         )
         pieces = jax.tree.map(np.asarray, cut(one, planar, PIECE, at_rest=True))
-        tracks = caster_tracks(scene, one.observation[0, :, 0])
         for piece in range(pieces.count):
             frame = piece * horizon
-            if sum(known[frame] >= KNOWN for _, known in tracks) < least:
+            if scene.free and known[trial][piece] < least:
                 continue
-            angles = np.array([angle[frame] for angle, _ in tracks])
+            angles = np.array([angle[frame] for angle, _ in tracks[trial]])
             pose, rate = pieces.pose[piece, 0], pieces.rate[piece, 0]
             states.append(rolling_state(sysid, scene, model, settled, pose, rate, angles))
             held = _held(pieces.action[piece])
@@ -291,19 +278,7 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> tuple[Any, int
             f"the {scene.kind.name} is nowhere moved far enough to tell where its casters point: "
             "expected a recording of 10 s or so in which it is"
         )
-    sequences = sysid.ModelSequences("furniture", spec, names, states, controls, measured)
-    return sequences, len(names)
-
-
-def _told_at_best(scene: ToldScene, aligned: Aligned, horizon: int) -> int:
-    """Of how many free casters it is known where they point, at the best start of a piece."""
-    known = [
-        np.array(
-            [known[: length - 1 : horizon] for _, known in caster_tracks(scene, poses[:length, 0])]
-        )
-        for poses, length in zip(aligned.observation, aligned.length, strict=True)
-    ]
-    return int(max((each >= KNOWN).sum(axis=0).max() for each in known))
+    return sysid.ModelSequences("furniture", spec, names, states, controls, measured)
 
 
 def _residual(

@@ -7,14 +7,11 @@ second on a core, the model some 10,000.
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import equinox as eqx
-import gymnasium
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.learning import Training
@@ -38,25 +35,12 @@ class Actor(CommandPolicy):
         cls, key: PRNGKeyArray, observations: Float[Array, "samples features"], **sizes: Any
     ) -> "Actor":
         """Arguments as of `CommandPolicy.create`."""
-        policy = CommandPolicy.create(key, observations, **sizes)
-        of = policy.network
+        actor = cls.create(key, observations, **sizes)
+        of = actor.network
         network = eqx.nn.MLP(
-            of.in_size,
-            of.out_size,
-            of.width_size,
-            of.depth,
-            activation=jax.nn.relu,
-            final_activation=jnp.tanh,
-            key=key,
+            of.in_size, of.out_size, of.width_size, of.depth, jax.nn.relu, jnp.tanh, key=key
         )
-        return cls(
-            network=network,
-            mean=policy.mean,
-            scale=policy.scale,
-            observations=policy.observations,
-            actions=policy.actions,
-            period=policy.period,
-        )
+        return dataclasses.replace(actor, network=network)
 
     def told(
         self, command: Float[Array, "*batch driven 3"], features: Float[Array, "*batch features"]
@@ -135,18 +119,6 @@ class Episodes(eqx.Module):
     def length(self) -> int:
         """Steps of an episode."""
         return round(self.task.duration / self.model.control_period)
-
-    @property
-    def observation_space(self) -> gymnasium.spaces.Box:
-        """Of one episode: what the actor is told."""
-        inputs = self.actor.mean.shape[0] + math.prod(self.actor.action_shape)
-        return gymnasium.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
-
-    @property
-    def action_space(self) -> gymnasium.spaces.Box:
-        """Of one episode: see `Actor`."""
-        outputs = math.prod(self.actor.action_shape)
-        return gymnasium.spaces.Box(-1.0, 1.0, (outputs,), np.float32)
 
     @eqx.filter_jit
     def begin(self, key: PRNGKeyArray, count: int) -> tuple[Situation, Float[Array, "batch seen"]]:

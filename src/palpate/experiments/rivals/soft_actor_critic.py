@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gymnasium.spaces import Box
 from stable_baselines3 import SAC  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
@@ -56,7 +57,9 @@ class _SideBySide(VecEnv):
     """The episodes as the library takes them: all begin, and run out of time, together."""
 
     def __init__(self, episodes: Episodes, count: int, seed: int):
-        super().__init__(count, episodes.observation_space, episodes.action_space)
+        network = episodes.actor.network
+        told = Box(-np.inf, np.inf, (network.in_size,), np.float32)
+        super().__init__(count, told, Box(-1.0, 1.0, (network.out_size,), np.float32))
         self._episodes, self._key = episodes, jax.random.key(seed)
         self.rewards = np.zeros(0)  # of the last whole episode of each, the mean of its steps
 
@@ -181,15 +184,9 @@ def as_actor(untrained: Actor, weights: Mapping[str, Any]) -> Actor:
     """The actor with the weights of the library's: what it does when it does not explore."""
     layers = len(untrained.network.layers)
     names = [f"latent_pi.{2 * layer}" for layer in range(layers - 1)] + ["mu"]
-    found = [
-        jnp.array(weights[f"{name}.{part}"].numpy())
-        for name in names
-        for part in ("weight", "bias")
-    ]
+    ends = [f"{name}.{part}" for name in names for part in ("weight", "bias")]
     return eqx.tree_at(
-        lambda actor: [
-            leaf for layer in actor.network.layers for leaf in (layer.weight, layer.bias)
-        ],
+        lambda actor: [leaf for of in actor.network.layers for leaf in (of.weight, of.bias)],
         untrained,
-        found,
+        [jnp.array(weights[end].numpy()) for end in ends],
     )

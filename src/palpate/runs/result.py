@@ -13,6 +13,8 @@ import re
 import statistics
 import subprocess
 import sys
+import types
+import typing
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -158,7 +160,7 @@ class Result:
     settings: dict[str, Any]
     seeds: list[int]
     split: str | dict[str, Any] | None
-    wall_time_s: float | int
+    wall_time_s: int | float
     machine: dict[str, Any] = field(default_factory=machine)
     versions: dict[str, str] = field(default_factory=versions)
     commit: str | None = field(default_factory=commit)
@@ -199,11 +201,11 @@ def read_result(path: str | Path) -> Result:
     Raises `PalpateError` naming the file, the key and what was expected there.
     """
     try:
-        document = _checked(read_json(path), "the result", _RESULT, _OPTIONAL)
+        document = _checked(read_json(path), "the result", _RESULT)
         figures = []
         for index, item in enumerate(document["figures"]):
             where = f"figures[{index}]"
-            entry = dict(_checked(item, where, _FIGURE, {}))
+            entry = dict(_checked(item, where, _FIGURE))
             met = entry.pop("met")
             figure = Figure(**entry)
             if met != figure.met:
@@ -220,52 +222,36 @@ def read_result(path: str | Path) -> Result:
         raise type(error)(message) from error
 
 
-_NUMBER = (int, float)
-_NONE = type(None)
-_FIGURE: dict[str, tuple[type, ...]] = {
-    "name": (str,),
-    "value": (*_NUMBER, _NONE),
-    "unit": (str,),
-    "bar": (*_NUMBER, _NONE),
-    "better": (str,),
-    "met": (bool, _NONE),
-    "seed_document": (*_NUMBER, str, _NONE),
-    "rival": (*_NUMBER, str, _NONE),
-    "spread": (*_NUMBER, _NONE),
-}
-_RESULT: dict[str, tuple[type, ...]] = {
-    "name": (str,),
-    "figures": (list,),
-    "settings": (dict,),
-    "seeds": (list,),
-    "split": (str, dict, _NONE),
-    "wall_time_s": _NUMBER,
-    "machine": (dict,),
-    "versions": (dict,),
-    "commit": (str, _NONE),
-}
-_OPTIONAL: dict[str, tuple[type, ...]] = {"parameters": (list,), "warnings": (list,)}
+def _kinds(annotations: dict[str, Any]) -> dict[str, tuple[type, ...]]:
+    """What JSON may hold for each field of a class, by what its annotations say."""
+    return {
+        name: tuple(
+            typing.get_origin(kind) or kind
+            for kind in (typing.get_args(of) if isinstance(of, types.UnionType) else [of])
+        )
+        for name, of in annotations.items()
+    }
 
 
-def _checked(
-    document: Any,
-    where: str,
-    schema: dict[str, tuple[type, ...]],
-    optional: dict[str, tuple[type, ...]],
-) -> dict[str, Any]:
+_FIGURE = _kinds(Figure.__annotations__ | {"met": bool | None})
+_RESULT = _kinds(Result.__annotations__)
+_OPTIONAL = {"parameters", "warnings"}
+
+
+def _checked(document: Any, where: str, schema: dict[str, tuple[type, ...]]) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise PalpateError(f"{where} is a {type(document).__name__}: expected a JSON object")
     for problem, names in (
-        ("lacks", schema.keys() - document.keys()),
-        ("has the unknown key", document.keys() - schema.keys() - optional.keys()),
+        ("lacks", schema.keys() - document.keys() - _OPTIONAL),
+        ("has the unknown key", document.keys() - schema.keys()),
     ):
         if names:
             raise PalpateError(f"{where} {problem} {', '.join(sorted(names))}")
     for name, value in document.items():
-        types = schema.get(name) or optional[name]
         # bool is an int to Python, but not a number to anyone else
-        if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
-            expected = " or ".join("null" if kind is _NONE else kind.__name__ for kind in types)
+        kinds = schema[name]
+        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+            expected = " or ".join("null" if of is type(None) else of.__name__ for of in kinds)
             raise PalpateError(f"{where} has {name} {value!r}: expected {expected}")
     return document
 

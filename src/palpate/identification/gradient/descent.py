@@ -7,8 +7,7 @@ Segments start in smoothed states; in the last stage these are fitted beside the
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -82,25 +81,6 @@ class Descent(eqx.Module):
     finite: int = 0  # iterations in a row since the horizon was last changed
 
 
-@runtime_checkable
-class Method(Protocol):
-    """One way to go downhill."""
-
-    def start(self, free: Free, offset: Array) -> Any:
-        """The method's own state."""
-        ...
-
-    def step(
-        self, descent: Descent, segments: Segments, rows: Array, remaining: float
-    ) -> tuple[Free, Array, Any, Array]:
-        """New free values, offsets and own state, and the loss before.
-
-        `rows`: which of the offsets those of the segments are, -1 for a start that is not fitted;
-        `remaining`: share of the last stage.
-        """
-        ...
-
-
 def identify(
     model: SomeModel,
     aligned: Aligned,
@@ -155,7 +135,7 @@ def _iterate(
     descent: Descent,
     step: int,
     horizon: int,
-    method: Method,
+    method: "Adam | LevenbergMarquardt",
     source: SegmentSource,
     tiles: np.ndarray,
     settings: Settings,
@@ -197,70 +177,70 @@ def _position(descent: Descent, settings: Settings) -> int:
     return sum(settings.iterations[: descent.stage]) + descent.within
 
 
-class Adam:
+class Adam(eqx.Module):
     """Adam in whitened coordinates, the last stage's rate falling to zero along a cosine."""
 
+    objective: Objective
+    clip: float
+    rate: float
+
     def __init__(self, objective: Objective, settings: Settings) -> None:
-        self._objective, self._settings = objective, settings
+        self.objective, self.clip, self.rate = objective, settings.clip, settings.learning_rate
+
+    @property
+    def transform(self) -> optax.GradientTransformation:
+        return optax.chain(optax.clip_by_global_norm(self.clip), optax.scale_by_adam())
 
     def start(self, free: Free, offset: Array) -> Any:
-        """Adam's moments of the parameters, and of the starts."""
-        transform = _transform(self._settings.clip)
-        return transform.init(free), transform.init(offset)
+        """The method's own state: moments of the parameters, and of the starts."""
+        return self.transform.init(free), self.transform.init(offset)
 
-    def step(self, descent: Descent, segments: Segments, rows: Array, remaining: float):
-        """One Adam update."""
-        rate = self._settings.learning_rate * 0.5 * (1.0 - np.cos(np.pi * remaining))
+    def step(
+        self, descent: Descent, segments: Segments, rows: Array, remaining: float
+    ) -> tuple[Free, Array, Any, Array]:
+        """New free values, offsets and own state, and the loss before.
+
+        `rows`: which of the offsets those of the segments are, -1 for a start that is not fitted;
+        `remaining`: share of the last stage.
+        """
+        rate = self.rate * 0.5 * (1.0 - np.cos(np.pi * remaining))
         state = devices.everywhere((descent.free, descent.offset, descent.optimiser))
-        rate = jnp.asarray(rate, descent.offset.dtype)
-        return _adam(self._objective, state, (segments, rows), rate, self._settings.clip)
+        return self._update(state, (segments, rows), jnp.asarray(rate, descent.offset.dtype))
 
+    @eqx.filter_jit
+    def _update(
+        self, state: tuple[Free, Array, Any], batch: tuple[Segments, Array], rate: Array
+    ) -> tuple[Free, Array, Any, Array]:
+        free, offset, (moments, start_moments) = state
+        visited = jnp.zeros(len(offset), bool).at[_inside(batch[1], offset)].set(True, mode="drop")
 
-def _transform(clip: float) -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(clip), optax.scale_by_adam())
+        def loss_and_gradient(shared: tuple[Objective, Free, Array], batch: tuple[Segments, Array]):
+            objective, *point = shared
+            segments, rows = batch
 
+            def loss(point: list[Any]) -> tuple[Array, Array]:
+                return objective.loss(point[0], _chosen(point[1], rows), segments)
 
-@eqx.filter_jit
-def _adam(
-    objective: Objective,
-    state: tuple[Free, Array, Any],
-    batch: tuple[Segments, Array],
-    rate: Array,
-    clip: float,
-) -> tuple[Free, Array, Any, Array]:
-    free, offset, (moments, start_moments) = state
-    visited = jnp.zeros(len(offset), bool).at[_inside(batch[1], offset)].set(True, mode="drop")
+            return jax.value_and_grad(loss, has_aux=True)(point)
 
-    def loss_and_gradient(shared: tuple[Objective, Free, Array], batch: tuple[Segments, Array]):
-        objective, *point = shared
-        segments, rows = batch
+        shared = self.objective, free, offset
+        (_, mean), slope = devices.data_parallel(loss_and_gradient)(shared, batch)
+        finite = jnp.isfinite(mean) & jnp.isfinite(optax.tree.norm(slope))
+        direction, moments_after = self.transform.update(slope[0], moments)
+        free_after = jax.tree.map(lambda x, d: x - rate * d, free, direction)
+        direction, start_moments_after = self.transform.update(slope[1], start_moments)
 
-        def loss(point: list[Any]) -> tuple[Array, Array]:
-            return objective.loss(point[0], _chosen(point[1], rows), segments)
+        def where_visited(new: Array, old: Array) -> Array:
+            rows = visited.reshape(-1, *(1,) * (new.ndim - 1)) if new.ndim else jnp.any(visited)
+            return jnp.where(rows, new, old)
 
-        return jax.value_and_grad(loss, has_aux=True)(point)
-
-    (_, mean), slope = devices.data_parallel(loss_and_gradient)((objective, free, offset), batch)
-    finite = jnp.isfinite(mean) & jnp.isfinite(optax.tree.norm(slope))
-    transform = _transform(clip)
-    direction, moments_after = transform.update(slope[0], moments)
-    free_after = jax.tree.map(lambda x, d: x - rate * d, free, direction)
-    direction, start_moments_after = transform.update(slope[1], start_moments)
-
-    def where_visited(new: Array, old: Array) -> Array:
-        rows = visited.reshape(-1, *(1,) * (new.ndim - 1)) if new.ndim else jnp.any(visited)
-        return jnp.where(rows, new, old)
-
-    before = offset, start_moments
-    after = offset - rate * direction, start_moments_after
-    offset_after, start_moments_after = jax.tree.map(where_visited, after, before)
-    found = (
-        objective.coordinates.project(free_after),
-        offset_after,
-        (moments_after, start_moments_after),
-    )
-    free, offset, moments = jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, state)
-    return free, offset, moments, jnp.where(finite, mean, jnp.nan)
+        before = offset, start_moments
+        after = offset - rate * direction, start_moments_after
+        offset_after, start_moments_after = jax.tree.map(where_visited, after, before)
+        projected = self.objective.coordinates.project(free_after)
+        found = projected, offset_after, (moments_after, start_moments_after)
+        found = jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, state)
+        return *found, jnp.where(finite, mean, jnp.nan)
 
 
 def _inside(rows: Array, offset: Array) -> Array:
@@ -277,25 +257,24 @@ class LevenbergMarquardt:
     """Damped Gauss-Newton steps; the damping falls when a step lowers the loss, else it rises."""
 
     def __init__(self, objective: Objective, settings: Settings) -> None:
-        self._objective = objective
+        self.objective = objective
 
     def start(self, free: Free, offset: Array) -> Any:
         """The damping, relative to the curvature."""
         return jnp.asarray(1e-2)
 
-    def step(self, descent: Descent, segments: Segments, rows: Array, remaining: float):
-        """One accepted or refused step on these segments."""
+    def step(
+        self, descent: Descent, segments: Segments, rows: Array, remaining: float
+    ) -> tuple[Free, Array, Any, Array]:
+        """One accepted or refused step on these segments; see `Adam.step`."""
         offset = descent.offset
-        free, moved, damping, loss = self._objective.step(
+        free, moved, damping, loss = self.objective.step(
             descent.free, _chosen(offset, rows), descent.optimiser, segments
         )
         return free, offset.at[_inside(rows, offset)].set(moved, mode="drop"), damping, loss
 
 
-METHODS: dict[str, Callable[[Objective, Settings], Method]] = {
-    "adam": Adam,
-    "levenberg-marquardt": LevenbergMarquardt,
-}
+METHODS = {"adam": Adam, "levenberg-marquardt": LevenbergMarquardt}
 
 
 def check_shapes(model: Model, aligned: Aligned) -> None:

@@ -98,16 +98,12 @@ class Model(eqx.Module):
 
 
 class Wrapper(Model):
-    """A model on top of another, `inner`, with the contract of that one but for what it overrides.
+    """A model on top of another, `inner`, which observes and starts as that one does.
 
-    What a step does is its own, and so are `stepper`, `constrain` and `independent_parts`.
+    How it moves is its own: `step`, `stepper`, `constrain` and `independent_parts`.
     """
 
     inner: eqx.AbstractVar[Model]
-
-    @property
-    def control_period(self) -> float:
-        return self.inner.control_period
 
     @property
     def action_shape(self) -> tuple[int, ...]:

@@ -219,6 +219,11 @@ class Residual(Wrapper):
         """The physics."""
         return self.physics
 
+    @property
+    def control_period(self) -> float:
+        """That of the physics, s."""
+        return self.physics.control_period
+
     def correction(self, state: Any, action: Array) -> Float[Array, "*batch sites axes"]:
         """What the network adds to the velocities of this state."""
         physics = correctable(self.physics)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -45,7 +45,7 @@ class CommandPolicy(DeclaredController):
         observations: Sequence[Channel] = (),
         width: int = 256,
         depth: int = 2,
-    ) -> Self:
+    ) -> "CommandPolicy":
         """An untrained policy that hardly acts, normalised by examples of what it will see.
 
         `observations` are the features' channels (default: one, called "features"), `period` is in
@@ -92,7 +92,7 @@ class CommandPolicy(DeclaredController):
         return {"width": self.network.width_size, "depth": self.network.depth}
 
     @classmethod
-    def from_settings(cls, folder: Path, **settings: Any) -> Self:
+    def from_settings(cls, folder: Path, **settings: Any) -> "CommandPolicy":
         """See `DeclaredController.from_settings`."""
         features = count_of(settings["observations"])
         return cls.create(jax.random.key(0), jnp.zeros((2, features)), **settings)

@@ -35,7 +35,7 @@ class Actor(CommandPolicy):
         cls, key: PRNGKeyArray, observations: Float[Array, "samples features"], **sizes: Any
     ) -> "Actor":
         """Arguments as of `CommandPolicy.create`."""
-        actor = cls.create(key, observations, **sizes)
+        actor: Any = cls.create(key, observations, **sizes)  # an `Actor`, as this class is
         of = actor.network
         network = eqx.nn.MLP(
             of.in_size, of.out_size, of.width_size, of.depth, jax.nn.relu, jnp.tanh, key=key

@@ -6,6 +6,7 @@ it acts in, and never differentiates it. Needs the extra `sac`.
 
 import dataclasses
 import importlib.metadata
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -57,9 +58,10 @@ class _SideBySide(VecEnv):
     """The episodes as the library takes them: all begin, and run out of time, together."""
 
     def __init__(self, episodes: Episodes, count: int, seed: int):
-        network = episodes.actor.network
-        told = Box(-np.inf, np.inf, (network.in_size,), np.float32)
-        super().__init__(count, told, Box(-1.0, 1.0, (network.out_size,), np.float32))
+        outputs = math.prod(episodes.actor.action_shape)
+        inputs = len(episodes.actor.mean) + outputs
+        observed = Box(-np.inf, np.inf, (inputs,), np.float32)
+        super().__init__(count, observed, Box(-1.0, 1.0, (outputs,), np.float32))
         self._episodes, self._key = episodes, jax.random.key(seed)
         self.rewards = np.zeros(0)  # of the last whole episode of each, the mean of its steps
 

@@ -55,18 +55,23 @@ class Settings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if len(self.horizons) != len(self.iterations) or not self.horizons:
-            raise PalpateError(
-                f"one number of iterations is needed for each horizon, got {len(self.horizons)} "
-                f"horizons and {len(self.iterations)} numbers"
-            )
+        check_curriculum(self.horizons, self.iterations)
         if min(self.iterations) < 1 or self.windows < 1:
             raise PalpateError(
                 "an identification needs at least one iteration at each horizon and one window, "
                 f"got iterations {self.iterations} and {self.windows} windows"
             )
-        if not all(0.0 < share <= 1.0 for share in self.horizons):
-            raise PalpateError(f"horizons are shares between 0 and 1, got {self.horizons}")
+
+
+def check_curriculum(horizons: tuple[float, ...], iterations: tuple[int, ...]) -> None:
+    """Raise `PalpateError` unless horizons are shares, with a number of iterations for each."""
+    if len(horizons) != len(iterations) or not horizons:
+        raise PalpateError(
+            f"one number of iterations is needed for each horizon, got {len(horizons)} horizons "
+            f"and {len(iterations)} numbers of iterations"
+        )
+    if not all(0.0 < share <= 1.0 for share in horizons):
+        raise PalpateError(f"horizons are shares between 0 and 1, got {horizons}")
 
 
 class Descent(eqx.Module):
@@ -79,102 +84,6 @@ class Descent(eqx.Module):
     within: int = 0  # iterations done in this stage
     halvings: int = 0  # of this stage's horizon, for losses or gradients that were not finite
     finite: int = 0  # iterations in a row since the horizon was last changed
-
-
-def identify(
-    model: SomeModel,
-    aligned: Aligned,
-    settings: Settings = Settings(),
-    run: Run | None = None,
-) -> SomeModel:
-    """The model whose free parameters predict the recorded trials best.
-
-    `model` is the starting point and says what is free, shared or fixed. With a `run`, progress is
-    logged and saved there and resumes to the same result. Raises `PalpateError` for recordings
-    whose shapes do not fit the model, in which nothing moves, or that no prediction can start in.
-    """
-    check_shapes(model, aligned)
-    coordinates = FreeParameters(model)
-    source = SegmentSource.of(aligned, model)
-    if settings.method not in METHODS:
-        raise PalpateError(f"unknown method '{settings.method}'; there are: {', '.join(METHODS)}")
-    scale = observation_scale(aligned, model)
-    objective = Objective(coordinates, scale, KNEE, settings.prior_weight)
-    method = METHODS[settings.method](objective, settings)
-    tiles = source.tiles(_horizon(source, settings.horizons[-1]))
-    offset = jnp.zeros((len(tiles), 2, *model.observation_shape))
-    free = coordinates.initial
-    descent = Descent(free, offset, method.start(free, offset))
-    step = 0
-    if run is not None:
-        step, descent = run.restore(descent) or (0, descent)
-    with interruptible() as stop:
-        bar = progress(sum(settings.iterations), "identifying", done=_position(descent, settings))
-        ticks = iter(bar)
-        while descent.stage < len(settings.horizons) and not stop:
-            before = _position(descent, settings)
-            horizon = _horizon(source, settings.horizons[descent.stage] / 2**descent.halvings)
-            descent, loss = _iterate(descent, step, horizon, method, source, tiles, settings)
-            step += 1
-            for _ in range(_position(descent, settings) - before):
-                next(ticks, None)
-            bar.show(loss=loss, horizon=horizon)
-            if run is not None:
-                run.log(step, loss=loss if np.isfinite(loss) else None, horizon=horizon)
-                if stop or descent.within == 0 or step % 50 == 0:
-                    run.save(step, descent)
-    return coordinates.build(jax.tree.map(jnp.asarray, jax.device_get(descent.free)))
-
-
-def _horizon(source: SegmentSource, share: float) -> int:
-    """Control periods of a share of the longest horizon."""
-    return max(1, round(share * source.longest))
-
-
-def _iterate(
-    descent: Descent,
-    step: int,
-    horizon: int,
-    method: "Adam | LevenbergMarquardt",
-    source: SegmentSource,
-    tiles: np.ndarray,
-    settings: Settings,
-) -> tuple[Descent, float]:
-    """One iteration on segments that depend on the seed and the step alone."""
-    rng = np.random.default_rng((settings.seed, step))
-    last = descent.stage == len(settings.horizons) - 1
-    if last:
-        rows = np.sort(rng.permutation(len(tiles))[: settings.windows])
-        segments = source.at(tiles[rows], horizon)
-    else:
-        segments = source.sample(rng, settings.windows, horizon)
-        rows = np.full(segments.count, -1)
-    remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
-    free, offset, optimiser, loss = method.step(descent, segments, jnp.asarray(rows), remaining)
-    loss = float(loss)
-    halvings, finite = descent.halvings, descent.finite + 1
-    if not np.isfinite(loss):
-        halvings, finite = halvings + 1, 0
-    elif halvings and finite >= RECOVERY:
-        halvings, finite = halvings - 1, 0
-    if halvings > MAX_HALVINGS:
-        raise PalpateError(
-            f"the loss or its gradient is not finite at iteration {step + 1}, however short the "
-            f"horizon ({horizon} control periods): start from other parameters, or check the "
-            "recording's units and rate"
-        )
-    within = descent.within + 1
-    # What is easily met at a shortened horizon says nothing about the stage's own.
-    good = loss < settings.threshold and descent.halvings == 0 and not last
-    ended = within >= settings.iterations[descent.stage] or good
-    if ended:
-        return Descent(free, offset, optimiser, descent.stage + 1), loss
-    return Descent(free, offset, optimiser, descent.stage, within, halvings, finite), loss
-
-
-def _position(descent: Descent, settings: Settings) -> int:
-    """How many iterations of the whole plan are behind, skipped ones counted."""
-    return sum(settings.iterations[: descent.stage]) + descent.within
 
 
 class Adam(eqx.Module):
@@ -275,6 +184,102 @@ class LevenbergMarquardt:
 
 
 METHODS = {"adam": Adam, "levenberg-marquardt": LevenbergMarquardt}
+
+
+def identify(
+    model: SomeModel,
+    aligned: Aligned,
+    settings: Settings = Settings(),
+    run: Run | None = None,
+) -> SomeModel:
+    """The model whose free parameters predict the recorded trials best.
+
+    `model` is the starting point and says what is free, shared or fixed. With a `run`, progress is
+    logged and saved there and resumes to the same result. Raises `PalpateError` for recordings
+    whose shapes do not fit the model, in which nothing moves, or that no prediction can start in.
+    """
+    check_shapes(model, aligned)
+    coordinates = FreeParameters(model)
+    source = SegmentSource.of(aligned, model)
+    if settings.method not in METHODS:
+        raise PalpateError(f"unknown method '{settings.method}'; there are: {', '.join(METHODS)}")
+    scale = observation_scale(aligned, model)
+    objective = Objective(coordinates, scale, KNEE, settings.prior_weight)
+    method = METHODS[settings.method](objective, settings)
+    tiles = source.tiles(_horizon(source, settings.horizons[-1]))
+    offset = jnp.zeros((len(tiles), 2, *model.observation_shape))
+    free = coordinates.initial
+    descent = Descent(free, offset, method.start(free, offset))
+    step = 0
+    if run is not None:
+        step, descent = run.restore(descent) or (0, descent)
+    with interruptible() as stop:
+        bar = progress(sum(settings.iterations), "identifying", done=_position(descent, settings))
+        ticks = iter(bar)
+        while descent.stage < len(settings.horizons) and not stop:
+            before = _position(descent, settings)
+            horizon = _horizon(source, settings.horizons[descent.stage] / 2**descent.halvings)
+            descent, loss = _iterate(descent, step, horizon, method, source, tiles, settings)
+            step += 1
+            for _ in range(_position(descent, settings) - before):
+                next(ticks, None)
+            bar.show(loss=loss, horizon=horizon)
+            if run is not None:
+                run.log(step, loss=loss if np.isfinite(loss) else None, horizon=horizon)
+                if stop or descent.within == 0 or step % 50 == 0:
+                    run.save(step, descent)
+    return coordinates.build(jax.tree.map(jnp.asarray, jax.device_get(descent.free)))
+
+
+def _horizon(source: SegmentSource, share: float) -> int:
+    """Control periods of a share of the longest horizon."""
+    return max(1, round(share * source.longest))
+
+
+def _iterate(
+    descent: Descent,
+    step: int,
+    horizon: int,
+    method: Adam | LevenbergMarquardt,
+    source: SegmentSource,
+    tiles: np.ndarray,
+    settings: Settings,
+) -> tuple[Descent, float]:
+    """One iteration on segments that depend on the seed and the step alone."""
+    rng = np.random.default_rng((settings.seed, step))
+    last = descent.stage == len(settings.horizons) - 1
+    if last:
+        rows = np.sort(rng.permutation(len(tiles))[: settings.windows])
+        segments = source.at(tiles[rows], horizon)
+    else:
+        segments = source.sample(rng, settings.windows, horizon)
+        rows = np.full(segments.count, -1)
+    remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
+    free, offset, optimiser, loss = method.step(descent, segments, jnp.asarray(rows), remaining)
+    loss = float(loss)
+    halvings, finite = descent.halvings, descent.finite + 1
+    if not np.isfinite(loss):
+        halvings, finite = halvings + 1, 0
+    elif halvings and finite >= RECOVERY:
+        halvings, finite = halvings - 1, 0
+    if halvings > MAX_HALVINGS:
+        raise PalpateError(
+            f"the loss or its gradient is not finite at iteration {step + 1}, however short the "
+            f"horizon ({horizon} control periods): start from other parameters, or check the "
+            "recording's units and rate"
+        )
+    within = descent.within + 1
+    # What is easily met at a shortened horizon says nothing about the stage's own.
+    good = loss < settings.threshold and descent.halvings == 0 and not last
+    ended = within >= settings.iterations[descent.stage] or good
+    if ended:
+        return Descent(free, offset, optimiser, descent.stage + 1), loss
+    return Descent(free, offset, optimiser, descent.stage, within, halvings, finite), loss
+
+
+def _position(descent: Descent, settings: Settings) -> int:
+    """How many iterations of the whole plan are behind, skipped ones counted."""
+    return sum(settings.iterations[: descent.stage]) + descent.within
 
 
 def check_shapes(model: Model, aligned: Aligned) -> None:

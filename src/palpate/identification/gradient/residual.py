@@ -27,7 +27,7 @@ from palpate.identification.data.prediction import (
     residuals,
 )
 from palpate.identification.data.segments import Segments, SegmentSource
-from palpate.identification.gradient.descent import check_shapes
+from palpate.identification.gradient.descent import check_curriculum, check_shapes
 from palpate.identification.gradient.least_squares import KNEE, pseudo_huber
 from palpate.models.model import Model
 from palpate.models.residual import Residual, SiteNetwork, correctable
@@ -70,13 +70,7 @@ class ResidualSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if len(self.horizons) != len(self.iterations) or not self.horizons:
-            raise PalpateError(
-                f"one number of iterations is needed for each horizon, got {len(self.horizons)} "
-                f"horizons and {len(self.iterations)} numbers of iterations"
-            )
-        if not all(0.0 < share <= 1.0 for share in self.horizons):
-            raise PalpateError(f"horizons are shares between 0 and 1, got {self.horizons}")
+        check_curriculum(self.horizons, self.iterations)
         if not (0.0 < self.share <= 1.0 and 0.0 < self.held_out < 1.0):
             raise PalpateError(
                 "the share that a correction may reach lies above 0 and at most at 1, and that of "
@@ -138,15 +132,8 @@ def fit_residual(
     corrected = prediction_error(best, judge)
     size = float(_size(best, SegmentSource.of(judge, model).whole()))
     kept, reason = _verdict(physics, corrected, size)
-    return Correction(
-        model=best if kept else model,
-        kept=kept,
-        reason=reason,
-        physics=physics,
-        corrected=corrected,
-        size=size,
-        held_out=tuple(held_out.tolist()),
-    )
+    found = best if kept else model
+    return Correction(found, kept, reason, physics, corrected, size, tuple(held_out.tolist()))
 
 
 def check_correctable(model: Model, aligned: Aligned) -> None:
@@ -222,11 +209,19 @@ def _descend(
             rng = np.random.default_rng((settings.seed, descent.iteration))
             segments = source.sample(rng, settings.windows, horizon)
             state = (descent.network, descent.optimiser, descent.average, model, scale)
-            *state, loss = _iteration(devices.everywhere(state), segments, settings)
-            step = descent.iteration + 1
-            looked = step % CHECK == 0 or step == len(stages)
-            found = _held_out_error(model, state[-1], judge) if looked else None
-            descent = _advanced(descent, *state, found)
+            network, moments, average, loss = _iteration(
+                devices.everywhere(state), segments, settings
+            )
+            step, found = descent.iteration + 1, None
+            best, least, stale = descent.best, descent.least, descent.stale
+            if looked := step % CHECK == 0 or step == len(stages):
+                corrected = Residual(physics=model, network=_on_default_device(average))
+                found = prediction_error(corrected, judge).mean_absolute
+                found = found if np.isfinite(found) else None
+                stale += found is not None
+                if found is not None and found < least:
+                    best, least, stale = average, found, 0
+            descent = Descent(network, moments, average, best, least, step, stale)
             bar.show(loss=loss, held_out=descent.least / physics.mean_absolute)
             if run is not None:
                 known = float(loss) if np.isfinite(loss) else None
@@ -240,17 +235,17 @@ def _descend(
 
 def _optimiser(settings: ResidualSettings) -> optax.GradientTransformation:
     """Adam, its rate falling along a cosine, with weights that shrink unless the data object."""
+
+    def weights_only(network: SiteNetwork) -> SiteNetwork:
+        """True for the weights, False for all other leaves."""
+        nothing = jax.tree.map(lambda _: False, network)
+        return eqx.tree_at(lambda n: n.weights, nothing, (True,) * len(network.weights))
+
     rate = optax.cosine_decay_schedule(settings.learning_rate, sum(settings.iterations))
     return optax.chain(
         optax.clip_by_global_norm(settings.clip),
-        optax.adamw(rate, weight_decay=settings.weight_decay, mask=_weights_only),
+        optax.adamw(rate, weight_decay=settings.weight_decay, mask=weights_only),
     )
-
-
-def _weights_only(network: SiteNetwork) -> SiteNetwork:
-    """True for the weights, False for all other leaves."""
-    nothing = jax.tree.map(lambda _: False, network)
-    return eqx.tree_at(lambda n: n.weights, nothing, (True,) * len(network.weights))
 
 
 @eqx.filter_jit
@@ -289,24 +284,6 @@ def _iteration(
 def _on_default_device(tree: SiteNetwork) -> SiteNetwork:
     """The arrays on the default device alone."""
     return jax.tree.map(jnp.asarray, jax.device_get(tree))
-
-
-def _held_out_error(model: Model, network: SiteNetwork, judge: Aligned) -> float | None:
-    """Mean absolute error of the open-loop predictions of the held-out trials."""
-    corrected = Residual(physics=model, network=_on_default_device(network))
-    error = prediction_error(corrected, judge).mean_absolute
-    return error if np.isfinite(error) else None
-
-
-def _advanced(
-    descent: Descent, network: SiteNetwork, moments: Any, average: SiteNetwork, found: float | None
-) -> Descent:
-    """The descent one iteration on; `found` is the error on the held-out trials, if looked at."""
-    following = descent.iteration + 1
-    if found is not None and found < descent.least:
-        return Descent(network, moments, average, average, found, following)
-    stale = descent.stale + (found is not None)
-    return Descent(network, moments, average, descent.best, descent.least, following, stale)
 
 
 def _verdict(physics: PredictionError, corrected: PredictionError, size: float) -> tuple[bool, str]:

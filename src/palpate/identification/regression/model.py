@@ -44,17 +44,13 @@ class Features:
 
 
 class RegressedModel(Wrapper):
-    """Predicts by regression, and observes and starts as the `prototype` does."""
+    """Predicts by regression, and observes and starts as the model `inner` does."""
 
-    prototype: Model
+    inner: Model
     regression: Regression  # leaves lead with the parts
     features: Features = eqx.field(static=True)
+    control_period: float = eqx.field(static=True)
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
-
-    @property
-    def inner(self) -> Model:
-        """The prototype."""
-        return self.prototype
 
     def step(self, state: Any, action: Array) -> Any:
         """See `Model.step`."""
@@ -108,7 +104,12 @@ def regressed(
             for part in range(inputs.shape[1])
         ]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-    return RegressedModel(prototype=prototype, regression=stacked, features=features)
+    return RegressedModel(
+        inner=prototype,
+        regression=stacked,
+        features=features,
+        control_period=prototype.control_period,
+    )
 
 
 @eqx.filter_jit

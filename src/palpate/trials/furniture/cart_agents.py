@@ -43,6 +43,7 @@ class Handled(Wrapper):
     held: Int[Array, ""]
     strength: Float[Array, "bodies 3"]
     handle: Float[Array, "bodies 2"]
+    control_period: float = eqx.field(static=True, default=DECISION)
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     @property
@@ -262,7 +263,10 @@ class RegressionAgent:
         parts = [part if part is not None else self._parts[held] for part in self._parts]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
         return RegressedModel(
-            prototype=self._prototype, regression=stacked, features=self._features
+            inner=self._prototype,
+            regression=stacked,
+            features=self._features,
+            control_period=DECISION,
         )
 
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,7 @@ from palpate.errors import PalpateError
 from palpate.report import charts
 from palpate.report.evidence import (
     RENDERINGS,
-    Curves,
     Evidence,
-    Motion,
     Parameter,
     Piece,
     pieces,
@@ -32,7 +31,6 @@ from palpate.report.evidence import (
 from palpate.report.parameter_chart import number, parameters
 from palpate.report.player import scene
 from palpate.report.style import STYLES, numbered
-from palpate.runs import Figure
 from palpate.runs.storage import write_text
 
 Section = tuple[str, str]  # title, HTML
@@ -68,16 +66,20 @@ def build_report(
 def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
     """Every section that has evidence, in the order a reader asks."""
     parts = (
-        ("Results", lambda e, looks: _results(e.figures)),
+        ("Results", _results),
         ("Pictures", lambda e, looks: _pictures(e) if e is found[0] else ""),
         ("Motion", _motion),
         ("Path of the tip", _tips),
-        ("Error against horizon", lambda e, looks: _horizon(e.horizon, looks, e.unit)),
-        ("Parameters", lambda e, looks: _parameters(e.parameters)),
-        ("Learning", lambda e, looks: _learning(e.metrics)),
+        ("Error against horizon", _horizon),
+        ("Parameters", _parameters),
+        ("Learning", _learning),
         *((piece.heading, partial(_piece, name, piece)) for name, piece in pieces().items()),
     )
-    looks = [numbered(_labels(evidence)) for evidence in found]
+    looks = []
+    for evidence in found:
+        curves = [curves for curves in (evidence.horizon, *evidence.pieces.values()) if curves]
+        labelled = (*(motion.chains for motion in evidence.motions), *(c.values for c in curves))
+        looks.append(numbered(chain.from_iterable(labelled)))
     for heading, part in parts:
         contents = [(e.name, part(e, look)) for e, look in zip(found, looks, strict=True)]
         contents = [(name, content) for name, content in contents if content]
@@ -86,13 +88,6 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
         if contents:
             yield heading, "".join(content for _, content in contents)
     yield "What was run", "".join(map(_provenance, found))
-
-
-def _labels(evidence: Evidence) -> Iterator[str]:
-    for motion in evidence.motions:
-        yield from motion.chains
-    for curves in (evidence.horizon, *evidence.pieces.values()):
-        yield from curves.values if curves else ()
 
 
 # --- sections ---------------------------------------------------------------------------------
@@ -113,26 +108,25 @@ def _header(found: Sequence[Evidence], title: str, notes: Sequence[str]) -> Iter
     yield "".join(f'<p class="note">{_text(note)}</p>' for note in notes) + "</header>\n"
 
 
-def _results(figures: Sequence[Figure]) -> str:
-    if not figures:
-        return ""
+def _results(evidence: Evidence, looks: dict[str, int]) -> str:
     rows = []
-    for figure in figures:
+    for figure in evidence.figures:
         sign = "≤" if figure.better == "lower" else "≥"
         value = f"<b>{_number(figure.value)}</b> {_text(figure.unit)}"
         if figure.spread is not None:
             value += f" <small>± {figure.spread:.2g}</small>"
         met = {True: "✓ met", False: "✗ not met", None: "–"}[figure.met]
-        cells = (
-            ("", f'<span title="{_text(figure.name)}">{_readable(figure.name)}</span>', "th"),
-            ("value", value, "td"),
-            ("bar", "none" if figure.bar is None else f"{sign} {_number(figure.bar)}", "td"),
-            ("verdict", f'<span class="{met[2:].replace(" ", "-")}">{met}</span>', "td"),
-            ("seed document", _number(figure.seed_document, "not printed"), "td"),
-            ("rival", _number(figure.rival, "none"), "td"),
+        rows.append(
+            (
+                f'<span title="{_text(figure.name)}">{_readable(figure.name)}</span>',
+                value,
+                "none" if figure.bar is None else f"{sign} {_number(figure.bar)}",
+                f'<span class="{met[2:].replace(" ", "-")}">{met}</span>',
+                _number(figure.seed_document, "not printed"),
+                _number(figure.rival, "none"),
+            )
         )
-        rows.append(cells)
-    return _table(rows, "results")
+    return _table("results", ("", "value", "bar", "verdict", "seed document", "rival"), rows)
 
 
 def _pictures(evidence: Evidence) -> str:
@@ -150,7 +144,7 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
     content = ""
     if evidence.motions:
         labels = list(dict.fromkeys(label for m in evidence.motions for label in m.chains))
-        caption = f"The object {_listed(labels)}"
+        caption = f"The object {' and '.join(filter(None, [', '.join(labels[:-1]), labels[-1]]))}"
         if _OBSERVED in labels and len(labels) > 1:
             caption += ": where the lines part, the prediction is wrong"
         caption += "; the trail is the path of its tip. Drag to look from another side."
@@ -165,25 +159,25 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
 
 
 def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
-    height = 400 if len(evidence.motions) == 1 else 300
-    return "".join(_tip(motion, looks, height) for motion in evidence.motions)
+    content, height = "", 400 if len(evidence.motions) == 1 else 300
+    for motion in evidence.motions:
+        caption = "where the object's last point is over time"
+        observed, distances = motion.chains.get(_OBSERVED), []
+        for label, points in motion.chains.items():
+            if observed is not None and label != _OBSERVED:
+                squares = np.sum((points[:, -1] - observed[:, -1]) ** 2, axis=-1)
+                known = squares[np.isfinite(squares)]
+                distance = math.sqrt(known.mean()) if known.size else math.nan
+                distances.append(f"{number(distance)} m ({label})")
+        if distances:
+            caption += f"; root-mean-square distance from what was observed: {', '.join(distances)}"
+        caption = f"{motion.group}: {caption}" if motion.group else caption[0].upper() + caption[1:]
+        content += _caption(f"{caption}.") + _chart(charts.tip(motion, looks, height))
+    return content
 
 
-def _tip(motion: Motion, looks: dict[str, int], height: int) -> str:
-    caption = "where the object's last point is over time"
-    observed = motion.chains.get(_OBSERVED)
-    distances = [
-        f"{number(_root_mean_square(chain[:, -1] - observed[:, -1]))} m ({label})"
-        for label, chain in motion.chains.items()
-        if observed is not None and label != _OBSERVED
-    ]
-    if distances:
-        caption += f"; root-mean-square distance from what was observed: {', '.join(distances)}"
-    caption = f"{motion.group}: {caption}" if motion.group else caption[0].upper() + caption[1:]
-    return _caption(f"{caption}.") + _chart(charts.tip(motion, looks, height))
-
-
-def _horizon(curves: Curves | None, looks: dict[str, int], unit: str) -> str:
+def _horizon(evidence: Evidence, looks: dict[str, int]) -> str:
+    curves, unit = evidence.horizon, evidence.unit
     if curves is None:
         return ""
     ends = []
@@ -199,8 +193,8 @@ def _horizon(curves: Curves | None, looks: dict[str, int], unit: str) -> str:
     return _caption(caption) + _chart(charts.horizon(curves, looks, unit))
 
 
-def _parameters(rows: Sequence[Parameter]) -> str:
-    rows = [row for row in rows if row.value.size]  # a model may have none of a kind
+def _parameters(evidence: Evidence, looks: dict[str, int]) -> str:
+    rows = [row for row in evidence.parameters if row.value.size]  # a model may have none of a kind
     if not rows:
         return ""
     own = [row for row in rows if not row.derived]
@@ -208,27 +202,24 @@ def _parameters(rows: Sequence[Parameter]) -> str:
     caption = f"{free} of {len(own)} parameters were identified; a short whisker is one that the "
     caption += "data determine, a long or missing one is not to be trusted."
     chart = parameters(own)
-    drawn = _chart(chart) if chart else ""
     cells = []
     for row in rows:
         status = "fixed" if row.fixed else "shared" if row.shared else "free"
-        status = "derived" if row.derived else status
-        about = f"{_readable(row.name)}<br><small>{_text(row.about)}</small>"
-        verdict = _text(row.verdict or "–")
         cells.append(
-            [
-                ("", about, "th"),
-                ("value", f"{_elements(row.value)} {_text(row.unit)}", "td"),
-                ("90 % interval", "–" if row.fixed else _interval(row), "td"),
-                ("kind", status, "td"),
-                ("verdict", verdict, "td"),
-            ]
+            (
+                f"{_readable(row.name)}<br><small>{_text(row.about)}</small>",
+                f"{_elements(row.value)} {_text(row.unit)}",
+                "–" if row.fixed else _interval(row),
+                "derived" if row.derived else status,
+                _text(row.verdict or "–"),
+            )
         )
-    return _caption(caption) + drawn + _table(cells, "parameters")
+    table = _table("parameters", ("", "value", "90 % interval", "kind", "verdict"), cells)
+    return _caption(caption) + (_chart(chart) if chart else "") + table
 
 
-def _learning(metrics: Sequence[dict[str, Any]]) -> str:
-    chart = charts.learning(metrics)
+def _learning(evidence: Evidence, looks: dict[str, int]) -> str:
+    chart = charts.learning(evidence.metrics)
     if chart is None:
         return ""
     caption = "The loss as it was minimised"
@@ -252,11 +243,12 @@ def _provenance(evidence: Evidence) -> str:
         if name in evidence.result and name not in shown:
             shown[name] = evidence.result[name]
     shown["configuration"] = evidence.configuration
-    rows = "".join(
-        f"<dt>{_readable(name)}</dt><dd><pre>{_text(_pretty(value))}</pre></dd>"
-        for name, value in shown.items()
-        if value not in (None, {}, [])
-    )
+    rows = ""
+    for name, value in shown.items():
+        if value not in (None, {}, []):
+            pretty = json.dumps(value, indent=2, ensure_ascii=False)
+            text = value if isinstance(value, str) else pretty
+            rows += f"<dt>{_readable(name)}</dt><dd><pre>{_text(text)}</pre></dd>"
     return f"<details><summary>{_text(evidence.name)}</summary><dl>{rows}</dl></details>"
 
 
@@ -301,13 +293,16 @@ def _data(content: Any) -> str:
     return f'<script type="application/json">{text}</script>'
 
 
-def _table(rows: Sequence[Sequence[tuple[str, str, str]]], kind: str) -> str:
-    """Rows of (heading, HTML, "th" or "td"); a narrow screen shows the heading in each cell."""
-    head = "".join(f"<th>{_text(name)}</th>" for name, _, _ in rows[0])
-    body = "".join(
-        "<tr>" + "".join(f'<{t} data-name="{_text(n)}">{c}</{t}>' for n, c, t in row) + "</tr>"
-        for row in rows
-    )
+def _table(kind: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows of HTML under `columns`, or nothing; a narrow screen shows the heading in each cell."""
+    if not rows:
+        return ""
+    headings, tags = [_text(name) for name in columns], ["th", *["td"] * (len(columns) - 1)]
+    head = "".join(f"<th>{name}</th>" for name in headings)
+    body = ""
+    for row in rows:
+        cells = zip(tags, headings, row, strict=True)
+        body += "<tr>" + "".join(f'<{t} data-name="{n}">{c}</{t}>' for t, n, c in cells) + "</tr>"
     return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 
@@ -350,17 +345,3 @@ def _interval(row: Parameter) -> str:
     value = row.value[known]
     sides = (np.median((edge[known] - value) / np.abs(value)) for edge in (row.lower, row.upper))
     return "typically " + " to ".join(f"{side:+.0%}" for side in sides).replace("-", "−")
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
-
-
-def _pretty(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, indent=2, ensure_ascii=False)
-
-
-def _root_mean_square(difference: np.ndarray) -> float:
-    squares = np.sum(difference**2, axis=-1)
-    known = squares[np.isfinite(squares)]
-    return math.sqrt(known.mean()) if known.size else math.nan

@@ -18,6 +18,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, resumable
+from palpate.experiments.furniture.calibration_figure import rank_figure
 from palpate.identification.posterior.calibration import (
     Problem,
     histogram,
@@ -28,7 +29,6 @@ from palpate.identification.posterior.calibration import (
 from palpate.models.planar import Planar, furniture
 from palpate.models.planar.shapes import rectangle
 from palpate.parameters import LogNormal, Normal, declare
-from palpate.report.posterior_chart import rank_figure
 from palpate.runs import Figure, Result, Run
 
 NAME = "calibration"

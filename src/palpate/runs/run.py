@@ -107,12 +107,21 @@ class Run:
                     )
         lock = _locked(path)
         try:
-            _remove_unfinished_writes(path)
+            ours = [f".{name}.*.part" for name in (CONFIGURATION, ENVIRONMENT, METRICS, RESULT)]
+            for unfinished in (*ours, f"{CHECKPOINTS}/.????????*.safetensors.*.part"):
+                for part in path.glob(unfinished):
+                    part.unlink()
             if fresh and _is_run(path):
                 _remove_run(path)
             before = None
             if _is_run(path):
-                _check_same(path, asked)
+                if differences := _differences(read_json(path / CONFIGURATION), asked):
+                    more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+                    raise PalpateError(
+                        f"{path} holds a run of another configuration "
+                        f"({'; '.join(differences[:3])}{more}): give another --out, or --fresh to "
+                        "start over"
+                    )
                 _note_other_versions(path)
             else:
                 before = _names(path)
@@ -326,24 +335,6 @@ def _remove_run(path: Path) -> None:
         (path / name).unlink(missing_ok=True)
 
 
-def _remove_unfinished_writes(path: Path) -> None:
-    ours = [f".{name}.*.part" for name in (CONFIGURATION, ENVIRONMENT, METRICS, RESULT)]
-    for pattern in (*ours, f"{CHECKPOINTS}/.????????*.safetensors.*.part"):
-        for part in path.glob(pattern):
-            part.unlink()
-
-
-def _check_same(path: Path, configuration: dict[str, Any]) -> None:
-    kept = read_json(path / CONFIGURATION)
-    differences = _differences(kept, configuration)
-    if differences:
-        more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
-        raise PalpateError(
-            f"{path} holds a run of another configuration ({'; '.join(differences[:3])}{more}): "
-            "give another --out, or --fresh to start over"
-        )
-
-
 def _differences(kept: Any, asked: Any, name: str = "") -> list[str]:
     if not isinstance(kept, dict) or not isinstance(asked, dict):
         same = kept == asked and isinstance(kept, bool) == isinstance(asked, bool)
@@ -367,10 +358,9 @@ def _short(value: Any) -> str:
 
 def _note_other_versions(path: Path) -> None:
     began, now = read_json(path / ENVIRONMENT)["versions"], measured.versions()
+    shared = [name for name in began if name in now]
     changed = [
-        f"{name} {began[name]} -> {now[name]}"
-        for name in began
-        if name in now and began[name] != now[name]
+        f"{name} {began[name]} -> {now[name]}" for name in shared if began[name] != now[name]
     ]
     if changed:
         print(

@@ -40,27 +40,22 @@ class LogNormal:
     median: float | None
     sigma: float
 
-    support = "positive"
-
     def __post_init__(self) -> None:
         if self.sigma <= 0 or (self.median is not None and self.median <= 0):
             raise PalpateError(f"a LogNormal needs a positive median and sigma, got {self}")
-
-    def to_free(self, value: Array, reference: Array) -> Array:
-        """Whitened coordinate of a value; `reference` is the instance's value."""
-        return jnp.log(value / self._centre(reference)) / self.sigma
-
-    def to_value(self, free: Array, reference: Array) -> Array:
-        """Value at a whitened coordinate."""
-        return self._centre(reference) * jnp.exp(self.sigma * free)
 
     @property
     def centre(self) -> float | None:
         """The median, None where it is the instance's own value."""
         return self.median
 
-    def _centre(self, reference: Array) -> Array | float:
-        return reference if self.median is None else self.median
+    def to_free(self, value: Array, reference: Array) -> Array:
+        """Whitened coordinate of a value; `reference` is the instance's value."""
+        return jnp.log(value / _centre(self, reference)) / self.sigma
+
+    def to_value(self, free: Array, reference: Array) -> Array:
+        """Value at a whitened coordinate."""
+        return _centre(self, reference) * jnp.exp(self.sigma * free)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +64,6 @@ class Normal:
 
     mean: float | None
     sigma: float
-
-    support = "real"
 
     def __post_init__(self) -> None:
         if self.sigma <= 0:
@@ -83,11 +76,15 @@ class Normal:
 
     def to_free(self, value: Array, reference: Array) -> Array:
         """Whitened coordinate of a value; `reference` is the instance's value."""
-        return (value - (reference if self.mean is None else self.mean)) / self.sigma
+        return (value - _centre(self, reference)) / self.sigma
 
     def to_value(self, free: Array, reference: Array) -> Array:
         """Value at a whitened coordinate."""
-        return (reference if self.mean is None else self.mean) + self.sigma * free
+        return _centre(self, reference) + self.sigma * free
+
+
+def _centre(prior: LogNormal | Normal, reference: Array) -> Array | float:
+    return reference if prior.centre is None else prior.centre
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,8 +93,6 @@ class Uniform:
 
     lower: float
     upper: float
-
-    support = "interval"
 
     def __post_init__(self) -> None:
         if not self.lower < self.upper:
@@ -187,8 +182,8 @@ def _walk(module: Any, prefix: str, outer: dict[str, Parameter]) -> Iterator[tup
     overrides = {prefix + name: declaration for name, declaration in own} | outer
     for field in dataclasses.fields(module):
         path = prefix + field.name
-        if _METADATA in field.metadata:
-            yield path, overrides.get(path, field.metadata[_METADATA])
+        if declared := field.metadata.get(_METADATA):
+            yield path, overrides.get(path, declared)
         elif isinstance(part := getattr(module, field.name, None), eqx.Module):
             yield from _walk(part, path + ".", overrides)
 

@@ -9,7 +9,6 @@ from palpate.models.model import Model
 from palpate.parameters import (
     LogNormal,
     Normal,
-    Prior,
     Uniform,
     declare,
     parameters_of,
@@ -18,6 +17,12 @@ from palpate.parameters import (
 )
 
 SomeModel = TypeVar("SomeModel", bound=Model)
+
+_NUMBERS = {
+    LogNormal: "median and standard deviation of the logarithm",
+    Normal: "mean and standard deviation",
+    Uniform: "lower and upper bound",
+}
 
 
 def with_declarations(
@@ -48,25 +53,15 @@ def with_declarations(
         raise PalpateError(f"'{both[0]}' cannot be fixed and identified at the same time")
     for words in priors:
         name, _, numbers = words.partition("=")
-        kind = declared[check_name("parameter", name, declared)].prior
-        changes.setdefault(name, {})["prior"] = _prior(words, kind, numbers)
+        prior = type(declared[check_name("parameter", name, declared)].prior)
+        try:
+            first, second = map(float, numbers.split(","))
+        except ValueError as error:
+            raise PalpateError(
+                f"'{words}' is no prior: expected NAME=A,B, here the {_NUMBERS[prior]}"
+            ) from error
+        changes.setdefault(name, {})["prior"] = prior(first, second)
     return declare(model, **changes)
-
-
-def _prior(words: str, kind: Prior, numbers: str) -> Prior:
-    """A prior of the same kind with these numbers."""
-    meaning = {
-        LogNormal: "median and standard deviation of the logarithm",
-        Normal: "mean and standard deviation",
-        Uniform: "lower and upper bound",
-    }[type(kind)]
-    try:
-        first, second = map(float, numbers.split(","))
-    except ValueError as error:
-        raise PalpateError(
-            f"'{words}' is no prior: expected NAME=A,B, here the {meaning}"
-        ) from error
-    return type(kind)(first, second)
 
 
 def with_values_of(model: SomeModel, other: Model) -> SomeModel:

@@ -106,9 +106,8 @@ class Progress:
     def _print(self, elapsed: float) -> None:
         from tqdm import tqdm
 
-        line = f"{self._description}: {self._done} steps"
-        if self._total is not None:
-            line = f"{self._description}: {self._done}/{self._total} steps"
+        total = "" if self._total is None else f"/{self._total}"
+        line = f"{self._description}: {self._done}{total} steps"
         line += f", {tqdm.format_interval(elapsed)} passed"
         if self._total is not None and self._done > self._first:
             left = elapsed * (self._total - self._done) / (self._done - self._first)

@@ -38,13 +38,13 @@ class Figure:
     """
 
     name: str
-    value: float | int | None
+    value: int | float | None
     unit: str
-    bar: float | int | None = None
+    bar: int | float | None = None
     better: str = "lower"
-    seed_document: float | int | str | None = None
-    rival: float | int | str | None = None
-    spread: float | int | None = None
+    seed_document: int | float | str | None = None
+    rival: int | float | str | None = None
+    spread: int | float | None = None
 
     def __post_init__(self) -> None:
         if self.better not in ("lower", "higher"):
@@ -257,7 +257,7 @@ def _checked(document: Any, where: str, schema: dict[str, tuple[type, ...]]) -> 
 
 
 def _cells(figure: Figure) -> list[str]:
-    def shown(number: float | int | str | None, missing: str) -> str:
+    def shown(number: int | float | str | None, missing: str) -> str:
         if number is None:
             return missing
         return number if isinstance(number, str) else f"{number:.4g}"

@@ -47,7 +47,14 @@ def write_bytes(path: str | Path, data: bytes) -> None:
         except BaseException:
             part.unlink(missing_ok=True)
             raise
-        _sync_folder(path.parent)
+        if (
+            os.name == "posix"
+        ):  # elsewhere a folder cannot be opened, and the rename is all there is
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
     except OSError as error:
         raise PalpateError(f"cannot write {path}: {error.strerror or error}") from error
 
@@ -152,7 +159,7 @@ def save_arrays(path: str | Path, tree: Any, manifest: Mapping[str, Any]) -> Non
             continue
         if name in arrays:
             raise PalpateError(f"the tree has two leaves named {name!r}: rename one of its keys")
-        if _is_key(leaf):
+        if hasattr(leaf, "dtype") and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             keys[name] = str(jax.random.key_impl(leaf))
         values = jax.random.key_data(leaf) if name in keys else leaf
         # safetensors copies raw memory, so a transposed or strided view must be laid out first
@@ -219,12 +226,6 @@ def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
 
 def _is_saved(leaf: Any) -> bool:
     return isinstance(leaf, int | float) or (hasattr(leaf, "shape") and hasattr(leaf, "dtype"))
-
-
-def _is_key(leaf: Any) -> bool:
-    import jax
-
-    return hasattr(leaf, "dtype") and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _as_like(path: str | Path, name: str, stored: Any, key: str | None, like: Any) -> Any:
@@ -300,13 +301,3 @@ def _listed(names: set[str], most: int = 4) -> str:
     ordered = sorted(names)
     more = f" and {len(ordered) - most} more" if len(ordered) > most else ""
     return ", ".join(repr(name) for name in ordered[:most]) + more
-
-
-def _sync_folder(folder: Path) -> None:
-    if os.name != "posix":
-        return  # elsewhere a folder cannot be opened, and the rename is all there is
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,5 +1,7 @@
 """What palpate raises when the fault is in what it was given."""
 
+from collections.abc import Iterable
+
 
 class PalpateError(ValueError):
     """Bad input: one sentence that says what was expected, what came and what would work.
@@ -7,3 +9,10 @@ class PalpateError(ValueError):
     The command line prints the sentence and exits with status 2; a library user sees an
     ordinary `ValueError`.
     """
+
+
+def listed(names: Iterable[str], most: int = 6) -> str:
+    """The first of `names`, and how many more there are, for a sentence."""
+    every = list(names)
+    more = f" and {len(every) - most} more" if len(every) > most else ""
+    return ", ".join(every[:most]) + more

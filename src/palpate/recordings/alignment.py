@@ -155,16 +155,10 @@ def _span(period: float, trial: Trial, *channels: Channel) -> tuple[float, int]:
     return start, length
 
 
-def _interpolated(channel: Channel, grid: np.ndarray, gap: int, slack: float) -> np.ndarray:
-    """See `interpolate`; `gap` is in nominal periods."""
-    seconds = gap * channel.nominal_period * (1 + ON_STAMP)
-    return interpolate(channel.time, channel.values, grid, seconds, slack)
-
-
 def _actions(channel: Channel, grid: np.ndarray, trial: Trial, slack: float) -> np.ndarray:
     """What acts from each frame of `grid` to the next, (len(grid) - 1, *shape)."""
     if channel.role is Role.COMMAND:
-        return mean_in_force(channel.time, channel.values, grid, slack)
+        return _mean_in_force(channel, grid, slack)
     actions = _interpolated(channel, grid[1:], DRIVEN_GAP, slack)
     unknown = np.isnan(actions).reshape(len(actions), -1).any(axis=1)
     if unknown.any():
@@ -190,13 +184,12 @@ def _side_by_side(arrays: Mapping[str, np.ndarray], none: np.ndarray) -> np.ndar
     return np.concatenate(flat, axis=2) if flat else none
 
 
-def interpolate(
-    time: np.ndarray, values: np.ndarray, grid: np.ndarray, gap: float, slack: float
-) -> np.ndarray:
-    """Values (stamps, *shape) at `grid` (frames,); NaN by a neighbour unseen or over `gap` s away.
+def _interpolated(channel: Channel, grid: np.ndarray, gap: int, slack: float) -> np.ndarray:
+    """Values (frames, *shape) at `grid`; NaN by a neighbour unseen or over `gap` periods away.
 
     A frame within `slack` seconds of a stamp stands on it and needs no other neighbour.
     """
+    time, values = channel.time, channel.values
     right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
     left = right - 1
     span = time[right] - time[left]
@@ -208,18 +201,17 @@ def interpolate(
         return row.reshape(-1, *(1,) * (values.ndim - 1))
 
     between = (1 - per_row(weight)) * values[left] + per_row(weight) * values[right]
-    too_wide = span > gap
+    too_wide = span > gap * channel.nominal_period * (1 + ON_STAMP)
     between[too_wide & ~on_stamp] = np.nan
     return np.where(per_row(on_stamp) & np.isnan(between), nearest, between)
 
 
-def mean_in_force(
-    time: np.ndarray, values: np.ndarray, grid: np.ndarray, slack: float
-) -> np.ndarray:
+def _mean_in_force(channel: Channel, grid: np.ndarray, slack: float) -> np.ndarray:
     """The mean of orders from each frame of `grid` to the next, (len(grid) - 1, *shape).
 
     Each is in force until the next; a stamp within `slack` seconds of a frame is on it.
     """
+    time, values = channel.time, channel.values
     first = np.searchsorted(time, grid[:-1] + slack, side="right") - 1
     last = np.searchsorted(time, grid[1:] - slack, side="right") - 1
     held = values[first]

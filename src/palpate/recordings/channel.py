@@ -71,11 +71,8 @@ class Channel:
             )
         time, rows, notes = _in_order(time)
         values = values[rows]
-        time.setflags(write=False)
         values.setflags(write=False)
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "notes", (*self.notes, *notes))
+        vars(self).update(time=time, values=values, notes=(*self.notes, *notes))
 
     @property
     def nominal_period(self) -> float:
@@ -124,12 +121,10 @@ class Events:
         values = np.concatenate(arrays).astype(arrays[0].dtype.newbyteorder("="), copy=False)
         if values.dtype.kind == "f":
             _check_finite(values, label)
-        time.setflags(write=False)
         values.setflags(write=False)
         ends = np.cumsum([len(array) for array in arrays])
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "values", tuple(np.split(values, ends[:-1])))
-        object.__setattr__(self, "notes", (*self.notes, *notes))
+        parts = tuple(np.split(values, ends[:-1]))
+        vars(self).update(time=time, values=parts, notes=(*self.notes, *notes))
 
 
 def _stamps(time: np.ndarray, label: str) -> np.ndarray:
@@ -144,7 +139,7 @@ def _stamps(time: np.ndarray, label: str) -> np.ndarray:
 
 
 def _in_order(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Ascending stamps, the rows they were in (the last of equal stamps), and what was done."""
+    """Ascending read-only stamps, their rows (the last of equal stamps), and what was done."""
     notes = []
     rows = np.arange(len(time))
     behind = np.maximum.accumulate(time) - time
@@ -158,7 +153,9 @@ def _in_order(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     if repeated := int((~last).sum()):
         notes.append(f"{repeated} rows had the stamp of a later row and were dropped")
     rows = rows[last]
-    return time[rows], rows, tuple(notes)
+    time = time[rows]
+    time.setflags(write=False)
+    return time, rows, tuple(notes)
 
 
 def _floats(array: np.ndarray, what: str) -> np.ndarray:

@@ -10,13 +10,13 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, listed
 from palpate.recordings.tables import MarkerTable
 
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
@@ -112,14 +112,14 @@ def _plain(names: list[str], lines: _Lines) -> MarkerTable:
     if not triples:
         raise PalpateError(
             "no marker columns: expected three for each marker, such as m0_x, m0_y and m0_z, "
-            f"but the header has {some(names)}"
+            f"but the header has {listed(names)}"
         )
     markers = in_natural_order(list(triples))
     clock, second = clocks[0] if clocks else (None, 1.0)
     time, positions = _table(lines, len(names), clock, [triples[name] for name in markers])
     used = {clock, *chain.from_iterable(triples.values())}
     unused = [name for column, name in enumerate(names) if column not in used and name]
-    notes = (f"columns that are no markers were left out: {some(unused)}",) if unused else ()
+    notes = (f"columns that are no markers were left out: {listed(unused)}",) if unused else ()
     return MarkerTable(
         "CSV", None if clock is None else time * second, positions, markers, notes=notes
     )
@@ -153,7 +153,7 @@ def _motive(first: list[str], lines: _Lines) -> MarkerTable:
         ],
     )
     if not triples:
-        there = some(sorted({kind for kind in kinds[2:] if kind and kind.lower() != "type"}))
+        there = listed(sorted({kind for kind in kinds[2:] if kind and kind.lower() != "type"}))
         raise PalpateError(f"no columns of type Marker (there are: {there}): export the markers")
     labelled = {k: v for k, v in triples.items() if not k.lower().startswith("unlabeled")}
     notes = ()
@@ -184,7 +184,7 @@ def _vicon(first: list[str], lines: _Lines) -> MarkerTable:
         raise PalpateError(f"line {lines.number - 1} has no columns X, Y, Z")
     unit = {_unit(units[column], lines.number) for column in chain(*triples.values())}
     if len(unit) > 1:
-        raise PalpateError(f"line {lines.number} mixes the units {some(sorted(unit))}")
+        raise PalpateError(f"line {lines.number} mixes the units {listed(sorted(unit))}")
     markers = in_natural_order(list(triples))
     frame, positions = _table(lines, width, 0, [triples[name] for name in markers], block=True)
     return MarkerTable("Vicon CSV", frame / rate, positions, markers, unit.pop())
@@ -235,7 +235,7 @@ def _named(names: list[str], columns: list[int]) -> dict[str, list[int]]:
 
 def _unit(name: str, line: int) -> str:
     if name.lower() not in _UNITS:
-        raise PalpateError(f"line {line}: unknown unit '{name}'; known are {some(list(_UNITS))}")
+        raise PalpateError(f"line {line}: unknown unit '{name}'; known are {listed(list(_UNITS))}")
     return _UNITS[name.lower()]
 
 
@@ -247,9 +247,3 @@ def in_natural_order(names: list[str]) -> tuple[str, ...]:
         assert part is not None  # the pattern fits any text
         families.setdefault((part[1], part[3]), []).append((int(part[2] or -1), name))
     return tuple(name for family in families.values() for _, name in sorted(family))
-
-
-def some(names: Sequence[str], most: int = 6) -> str:
-    """The first of `names`, and how many more there are, for a sentence."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -71,15 +71,16 @@ def write_lerobot(
     folder = Path(folder)
     if folder.exists() and not fresh:
         raise PalpateError(f"{folder} exists: expected the name of a new folder")
-    names = {role: _names_of(recording, role) for role in Role}
+    sensors: dict[Role, list[str]] = {role: [] for role in Role}
+    for channel in recording.trials[0].channels.values():
+        sensors[channel.role].append(channel.name)
+    observed, acting = sensors[Role.OBSERVATION], sensors[Role.COMMAND] or sensors[Role.DRIVEN]
     if fps is None:
-        sensor = (names[Role.OBSERVATION] or list(recording.trials[0].channels))[0]
-        periods = [trial[sensor].nominal_period for trial in recording.trials]
+        periods = [trial[(observed or acting)[0]].nominal_period for trial in recording.trials]
         fps = max(1, round(1 / float(np.nanmedian(periods))))
     if fps < 1:
         raise PalpateError(f"a dataset has at least 1 frame per second, not {fps}")
-    acting = names[Role.COMMAND] or names[Role.DRIVEN]
-    aligned = recording.align(1 / fps, names[Role.OBSERVATION], acting)
+    aligned = recording.align(1 / fps, observed, acting)
     features = _features(recording, aligned, fps)
     part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
@@ -90,11 +91,6 @@ def write_lerobot(
         raise PalpateError(f"cannot write {folder}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
-
-
-def _names_of(recording: Recording, role: Role) -> list[str]:
-    channels = recording.trials[0].channels.values()
-    return [channel.name for channel in channels if channel.role is role]
 
 
 # --- columns ----------------------------------------------------------------------------------

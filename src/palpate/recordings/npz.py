@@ -38,7 +38,7 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     trials = []
     for i, trial in enumerate(recording.trials):
         channels = []
-        for j, channel in enumerate((*trial.channels.values(), *trial.events.values())):
+        for j, channel in enumerate(trial.parts):
             about = {
                 key: getattr(channel, key) for key in ("name", "unit", "frame", "axes", "notes")
             }

@@ -40,8 +40,7 @@ class Recording:
             twice = next(name for name in names if names.count(name) > 1)
             raise PalpateError(f"two trials are called '{twice}': trials need different names")
         provenance = {str(key): _plain(str(key), value) for key, value in self.provenance.items()}
-        object.__setattr__(self, "trials", trials)
-        object.__setattr__(self, "provenance", provenance)
+        vars(self).update(trials=trials, provenance=provenance)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -49,7 +48,7 @@ class Recording:
         return tuple(
             f"trial '{trial.name}', {channel.name}: {note}"
             for trial in self.trials
-            for channel in (*trial.channels.values(), *trial.events.values())
+            for channel in trial.parts
             for note in channel.notes
         )
 

@@ -10,7 +10,6 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.recordings.channel import Channel, Events
 from palpate.recordings.recording import Recording
-from palpate.recordings.trial import Trial
 from palpate.runs.storage import write_bytes
 
 PAUSE = 0.5  # s between trials
@@ -39,7 +38,7 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
     memory = stream.memory_recording()
     stream.set_log_time_enabled(False)  # when the file was written is of no interest
     stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for part in _parts(recording.trials[0]):
+    for part in recording.trials[0].parts:
         if _is_points(part):
             stream.log(_entity(part), rerun.Points3D.from_fields(radii=RADIUS), static=True)
     begin = 0.0
@@ -54,14 +53,10 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
                 stream.log(_entity(events), _drawn(events, array))
         begin += trial.duration
         stream.set_time(TIMELINE, duration=begin)
-        for part in _parts(trial):
+        for part in trial.parts:
             stream.log(_entity(part), rerun.Clear(recursive=False))
         begin += PAUSE
     write_bytes(path, memory.drain_as_bytes())
-
-
-def _parts(trial: Trial) -> list[Channel | Events]:
-    return [*trial.channels.values(), *trial.events.values()]
 
 
 def _entity(part: Channel | Events) -> str:

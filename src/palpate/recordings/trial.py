@@ -55,12 +55,16 @@ class Trial:
         return self.events[name]
 
     @property
+    def parts(self) -> tuple[Channel | Events, ...]:
+        """All channels, sampled ones first."""
+        return *self.channels.values(), *self.events.values()
+
+    @property
     def start(self) -> float:
         """The first stamp of any channel, s."""
-        return float(min(c.time[0] for c in (*self.channels.values(), *self.events.values())))
+        return float(min(part.time[0] for part in self.parts))
 
     @property
     def duration(self) -> float:
         """Seconds from the first stamp of any channel to the last of any."""
-        channels = (*self.channels.values(), *self.events.values())
-        return float(max(channel.time[-1] for channel in channels)) - self.start
+        return float(max(part.time[-1] for part in self.parts)) - self.start

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, listed
 
 # Our one entry in the safetensors header, because the library writes several in random order and
 # the same arrays should give the same bytes: {"manifest": ..., "keys": ..., "crc32": ...}.
@@ -195,8 +195,11 @@ def load_arrays(path: str | Path, like: Any) -> tuple[Any, dict[str, Any]]:
     wanted = {name for name, leaf in named if _is_saved(leaf)}
     lacking, surplus = wanted - arrays.keys(), arrays.keys() - wanted
     if lacking or surplus:
-        problems = [f"lacks {_listed(lacking)}"] * bool(lacking)
-        problems += [f"has besides {_listed(surplus)}"] * bool(surplus)
+        problems = [
+            f"{what} {listed(map(repr, sorted(names)), 4)}"
+            for what, names in (("lacks", lacking), ("has besides", surplus))
+            if names
+        ]
         raise PalpateError(f"{path} holds other leaves than expected: {' and '.join(problems)}")
     leaves = [
         _as_like(path, name, arrays[name], entry["keys"].get(name), leaf)
@@ -295,9 +298,3 @@ def _unreadable(path: str | Path, error: OSError) -> PalpateError:
     if Path(path).is_dir():
         return PalpateError(f"{path} is a folder: expected a file")
     return PalpateError(f"cannot read {path}: {error.strerror or error}")
-
-
-def _listed(names: set[str], most: int = 4) -> str:
-    ordered = sorted(names)
-    more = f" and {len(ordered) - most} more" if len(ordered) > most else ""
-    return ", ".join(repr(name) for name in ordered[:most]) + more

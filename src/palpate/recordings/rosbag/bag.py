@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, listed
 from palpate.recordings.alignment import DRIVEN_GAP, ON_STAMP
 from palpate.recordings.channel import Role
-from palpate.recordings.csv import some
 from palpate.recordings.rosbag.files import Bag, open_bag
 from palpate.recordings.rosbag.topics import Chosen, Track, choose, tracks_of
 from palpate.recordings.tables import InputTable, MarkerTable
@@ -119,8 +118,6 @@ def _pieces(times: list[np.ndarray], chosen: Chosen) -> list[tuple[float, float]
     if begin < end:
         pieces.append((begin, end))
     if not pieces:
-        raise PalpateError(
-            f"{some([track.topic for track in chosen.tracks])}: no time is covered by all of them "
-            "without gaps"
-        )
+        topics = listed(track.topic for track in chosen.tracks)
+        raise PalpateError(f"{topics}: no time is covered by all of them without gaps")
     return pieces

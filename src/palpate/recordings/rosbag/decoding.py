@@ -30,7 +30,7 @@ def ros_decoder(kind: str, definition: str, encoding: str) -> Decode:
 
     Raises `PalpateError` for a definition that cannot be used.
     """
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     from rosbags.typesys.msg import normalize_msgtype
 
     kind = normalize_msgtype(kind)
@@ -39,10 +39,14 @@ def ros_decoder(kind: str, definition: str, encoding: str) -> Decode:
     else:
         store = get_typestore(Stores.EMPTY)
         try:
-            if encoding == "ros2idl":
-                types = _types_from_idl(definition)
-            else:
+            if encoding != "ros2idl":
                 types = get_types_from_msg(definition, kind)
+            elif not definition.startswith(_IDL_RULE):
+                types = get_types_from_idl(definition)
+            else:  # of several files, under a rule and a line "IDL: name" each
+                types = {}
+                for part in definition.split(_IDL_RULE)[1:]:
+                    types |= get_types_from_idl(part.partition("\n")[2])
             _check(types)
             store.register(types)
         except PalpateError:
@@ -57,31 +61,21 @@ def ros_decoder(kind: str, definition: str, encoding: str) -> Decode:
     return lambda data: store.deserialize_cdr(data, kind)
 
 
-def _types_from_idl(definition: str) -> dict[str, Any]:
-    """The types of one or several IDL files, which a rule and a line "IDL: name" separate."""
-    from rosbags.typesys import get_types_from_idl
-
-    if not definition.startswith(_IDL_RULE):
-        return get_types_from_idl(definition)
-    types = {}
-    for part in definition.split(_IDL_RULE)[1:]:
-        types |= get_types_from_idl(part.partition("\n")[2])
-    return types
-
-
 def _check(types: dict[str, Any]) -> None:
     """Refuse names that are no identifiers, and arrays of fixed length that are too long."""
+    from rosbags.interfaces import Nodetype
+
     for kind, (constants, fields) in types.items():
         for name in (kind, *(name for _, field in fields for name in _references(field))):
             if not _TYPE_NAME.fullmatch(name):
                 raise PalpateError(f"its definition has a type called {name[:40]!r}")
-        for name in (*(constant[0] for constant in constants), *(field[0] for field in fields)):
+        for name, *_ in (*constants, *fields):
             if not _FIELD_NAME.fullmatch(name):
                 raise PalpateError(f"its definition has a field called {name[:40]!r}")
-        for name, field in fields:
-            if _length(field) > LONGEST_ARRAY:
+        for name, (node, details) in fields:
+            if node == Nodetype.ARRAY and details[1] > LONGEST_ARRAY:
                 raise PalpateError(
-                    f"its field '{name}' is an array of {_length(field)} elements; at most "
+                    f"its field '{name}' is an array of {details[1]} elements; at most "
                     f"{LONGEST_ARRAY} are read"
                 )
 
@@ -95,11 +89,3 @@ def _references(field: Any) -> Iterator[str]:
         yield details
     elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         yield from _references(details[0])
-
-
-def _length(field: Any) -> int:
-    """Of an array of fixed length; 0 for anything else."""
-    from rosbags.interfaces import Nodetype
-
-    node, details = field
-    return details[1] if node == Nodetype.ARRAY else 0

@@ -156,7 +156,13 @@ def _records(file: Any, summary: Any, skipped: Collection[str]) -> Iterator[Any]
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
-    if summary is None or not summary.chunk_indexes or not _knows_all(summary):
+    indexes = summary.chunk_indexes if summary else []
+    topics = {name for index in indexes for name in index.message_index_offsets}
+    # An index without every topic and definition lacks those that are in a chunk.
+    if not indexes or not (
+        topics <= summary.channels.keys()
+        and {c.schema_id for c in summary.channels.values()} - {0} <= summary.schemas.keys()
+    ):
         file.seek(0)
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=CHUNK)
         for record in reader.records:
@@ -165,7 +171,7 @@ def _records(file: Any, summary: Any, skipped: Collection[str]) -> Iterator[Any]
             else:
                 yield record
         return
-    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+    for index in sorted(indexes, key=lambda index: index.chunk_start_offset):
         topics = {summary.channels[identity].topic for identity in index.message_index_offsets}
         if not topics or not topics <= set(skipped):
             file.seek(index.chunk_start_offset)
@@ -173,13 +179,6 @@ def _records(file: Any, summary: Any, skipped: Collection[str]) -> Iterator[Any]
             if opcode != b"\x06" or length > CHUNK:
                 raise DamagedFileError("the index of the file does not fit its content")
             yield from _unpacked(Chunk.read(ReadDataStream(file)))
-
-
-def _knows_all(summary: Any) -> bool:
-    """Whether the index has every topic and definition, so that no chunk is needed for them."""
-    topics = {name for index in summary.chunk_indexes for name in index.message_index_offsets}
-    schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
-    return topics <= summary.channels.keys() and schemas <= summary.schemas.keys()
 
 
 def _unpacked(chunk: Any) -> list[Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import enum
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,24 +64,16 @@ def sights(message: Any) -> list[Sight]:
     return [found] if found else []
 
 
+def _content(item: Any) -> dict[str, Any]:
+    """The fields of an object or a dictionary by name; none of anything else."""
+    return item if isinstance(item, dict) else getattr(item, "__dict__", {})
+
+
 def _field(item: Any, *path: str) -> Any:
     """The field of a field of `item`; None where there is none."""
     for name in path:
-        item = item.get(name) if isinstance(item, dict) else getattr(item, name, None)
+        item = _content(item).get(name)
     return item
-
-
-def _fields(message: Any) -> Iterator[Any]:
-    """The values of all fields of `message`, and one level deeper."""
-    for value in _values(message):
-        yield value
-        yield from _values(value)
-
-
-def _values(item: Any) -> list[Any]:
-    if isinstance(item, dict):
-        return list(item.values())
-    return [getattr(item, name) for name in getattr(item, "__dataclass_fields__", ())]
 
 
 # --- many places ------------------------------------------------------------------------------
@@ -94,7 +85,10 @@ def _markers(message: Any) -> Sight | None:
     if _field(message, "fields") is not None:
         points = _cloud(message)
     else:
-        lists = (value for value in _fields(message) if isinstance(value, list) and value)
+        values = [
+            value for own in _content(message).values() for value in (own, *_content(own).values())
+        ]
+        lists = (value for value in values if isinstance(value, list) and value)
         items = next((value for value in lists if _place(value[0]) is not None), [])
         if not items or len(items) > MAX_POINTS:
             return None
@@ -229,23 +223,19 @@ def _place(item: Any) -> list[float] | None:
 
 def _point(item: Any) -> list[float] | None:
     """x, y, z of what has these and no w; null, which JSON has for NaN, is NaN."""
-    if item is None or _has(item, "w") or not all(_has(item, axis) for axis in "xyz"):
+    fields = _content(item)
+    if "w" in fields or not {*"xyz"} <= fields.keys():
         return None
-    values = [_field(item, axis) for axis in "xyz"]
+    values = [fields[axis] for axis in "xyz"]
     if not all(value is None or isinstance(value, int | float) for value in values):
         return None
     return [float("nan") if value is None else float(value) for value in values]
 
 
-def _has(item: Any, name: str) -> bool:
-    return name in item if isinstance(item, dict) else hasattr(item, name)
-
-
 def _header(message: Any) -> tuple[int | None, str | None]:
     """(ns, frame) of a message: `header` in ROS, `timestamp` and `frame_id` in Foxglove's JSON."""
-    frame = _field(message, "header", "frame_id")
-    for name in ("frame_id", "parent_frame_id"):
-        frame = _field(message, name) if frame is None else frame
+    places = ("header", "frame_id"), ("frame_id",), ("parent_frame_id",)
+    frame = next((f for place in places if (f := _field(message, *place)) is not None), None)
     stamp = _field(message, "header", "stamp") or _field(message, "timestamp")
     seconds = _field(stamp, "sec")
     fraction = _field(stamp, "nanosec")

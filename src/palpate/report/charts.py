@@ -54,7 +54,7 @@ def horizon(curves: Curves, looks: Mapping[str, int], unit: str) -> Chart:
 
 # --- learning ---------------------------------------------------------------------------------
 
-_LOSS_PANEL, _PANELS = "loss", {"horizon": "horizon (steps)", "amplitude": "amplitude (1)"}
+_PANELS = {"horizon": "horizon (steps)", "amplitude": "amplitude (1)"}
 
 
 def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
@@ -63,20 +63,23 @@ def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
     The top panel shows every metric whose name ends in "loss"; None where no line has one. The
     loss has the unit of what was minimised.
     """
-    losses = [name for name in _numeric(metrics) if name.endswith(_LOSS_PANEL)]
-    panels = [name for name in _PANELS if name in _numeric(metrics)]
+    names = dict.fromkeys(name for line in metrics for name in line)
+    columns = {name: _column(metrics, name) for name in (*names, "step", "horizon")}
+    numeric = [name for name in names if np.isfinite(columns[name]).any()]
+    losses = [name for name in numeric if name.endswith("loss")]
+    panels = [name for name in _PANELS if name in numeric]
     if not losses:
         return None
-    steps = _column(metrics, "step")
+    steps = columns["step"]
     every = max(1, math.ceil(len(steps) / _MOST_POINTS))
     data: list[dict[str, Any]] = []
     least, most = math.inf, -math.inf
     for index, name in enumerate(losses, start=1):
-        values = _column(metrics, name)
+        values = columns[name]
         least, most = min(least, np.nanmin(values)), max(most, np.nanmax(values))
         look = index % len(STYLES)
         looks = {name: look}
-        smooth = _smooth(values, _column(metrics, "horizon"), every)
+        smooth = _smooth(values, columns["horizon"], every)
         if len(values) >= _MANY:
             raw = curve_line(name, looks, steps[::every], values[::every], "%{y:.4g}")
             raw |= {"line": {"color": f"@series-{look}:0.35", "width": 1}, "hoverinfo": "skip"}
@@ -95,7 +98,7 @@ def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
     }
     share = bottom / len(panels) if panels else 0.0
     for row, name in enumerate(panels, start=1):
-        line = curve_line(name, {name: 3 + row}, steps, _column(metrics, name), "%{y:.4g}")
+        line = curve_line(name, {name: 3 + row}, steps, columns[name], "%{y:.4g}")
         line["line"] |= {"shape": "hv", "dash": "solid"}
         data.append(line | _panel(row) | {"showlegend": False})
         top = bottom - (row - 1) * share
@@ -107,17 +110,11 @@ def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
     last = f"y{len(panels) + 1}" if panels else "y"
     layout["xaxis"] = titled_axis("step") | {"anchor": last}
     if "horizon" in panels:
-        changes = steps[1:][np.diff(_column(metrics, "horizon")) != 0]
+        changes = steps[1:][np.diff(columns["horizon"]) != 0]
         edge = {"type": "line", "yref": "paper", "y0": 0, "y1": 1, "layer": "below"}
         edge["line"] = {"color": "@ink:0.35", "width": 1, "dash": "2px,3px"}
         layout["shapes"] = [edge | {"x0": x, "x1": x} for x in _numbers(changes)]
     return {"data": data, "layout": layout}
-
-
-def _numeric(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The metrics that are a number in some line, in order of appearance."""
-    names = dict.fromkeys(name for line in metrics for name in line)
-    return [name for name in names if np.isfinite(_column(metrics, name)).any()]
 
 
 def _column(metrics: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

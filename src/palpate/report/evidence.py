@@ -170,19 +170,19 @@ def read_evidence(run: str | Path) -> Evidence:
     motions, horizon, added = _arrays(run / EVIDENCE)
     result = _object(run / RESULT)
     settings = result.get("settings")
-    configuration = _object(run / CONFIGURATION)
+    unit = settings.get("observation_unit", "m") if isinstance(settings, dict) else "m"
     renderings = (run / f"rendering{suffix}" for suffix in RENDERINGS)
     return Evidence(
         path=run,
         name=str(result.get("name") or run.resolve().name),
         motions=motions,
         horizon=horizon,
-        unit=str(settings.get("observation_unit", "m") if isinstance(settings, dict) else "m"),
+        unit=str(unit),
         pieces=added,
         parameters=tuple(_rows(run / RESULT, result, "parameters", _parameter)),
         metrics=tuple(read_metrics(run)),
         figures=tuple(_rows(run / RESULT, result, "figures", _figure)),
-        configuration=configuration,
+        configuration=_object(run / CONFIGURATION),
         environment=_object(run / ENVIRONMENT),
         result=result,
         rendering=next((path for path in renderings if path.exists()), None),
@@ -239,44 +239,35 @@ def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
     motions, horizon, added = [], None, {}
     for (kind, group), values in sections.items():
         where = f"{kind}/{group}" if group else kind
-        time = _time(where, values)
+        time = values.pop("time", None)
+        if time is None or not values:
+            lacking = f"'{where}.time'" if time is None else f"anything beside '{where}.time'"
+            raise PalpateError(f"the evidence lacks {lacking}")
+        if time.ndim != 1 or not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
+            raise PalpateError(f"'{where}.time' has to be one axis of finite, increasing seconds")
+        own = {"motion": ("frames", "points", 3), "horizon": ("times",)}
+        axes = own[kind] if kind in own else known[kind].axes
+        _check_shapes(where, values, time, axes)
         if kind == "motion":
-            shape = ("frames", "points", 3)
-            motions.append(Motion(group, time, _fitting(where, values, time, shape, 0)))
+            motions.append(Motion(group, time, values))
         elif kind == "horizon":
-            horizon = _banded(time, _fitting(where, values, time, ("times",), 0))
+            horizon = _banded(time, values)
         else:
-            axes = known[kind].axes
-            added[kind] = Curves(time, _fitting(where, values, time, axes, axes.index("times")))
+            added[kind] = Curves(time, values)
     return tuple(motions), horizon, added
 
 
-def _time(where: str, values: dict[str, np.ndarray]) -> np.ndarray:
-    time = values.pop("time", None)
-    if time is None or not values:
-        lacking = f"'{where}.time'" if time is None else f"anything beside '{where}.time'"
-        raise PalpateError(f"the evidence lacks {lacking}")
-    if time.ndim != 1 or not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
-        raise PalpateError(f"'{where}.time' has to be one axis of finite, increasing seconds")
-    return time
-
-
-def _fitting(
-    where: str,
-    values: dict[str, np.ndarray],
-    time: np.ndarray,
-    shape: tuple[str | int, ...],
-    time_axis: int,
-) -> dict[str, np.ndarray]:
+def _check_shapes(
+    where: str, values: dict[str, np.ndarray], time: np.ndarray, shape: tuple[str | int, ...]
+) -> None:
+    along = "frames" if "frames" in shape else "times"
     for label, array in values.items():
-        fits = array.ndim == len(shape) and array.shape[time_axis] == len(time)
+        fits = array.ndim == len(shape) and array.shape[shape.index(along)] == len(time)
         if not fits or (shape[-1] == 3 and array.shape[-1] != 3):
             raise PalpateError(
                 f"'{where}.{label}' has the shape {array.shape}: expected "
-                f"({', '.join(map(str, shape))}) with {len(time)} {shape[time_axis]} as in "
-                f"'{where}.time'"
+                f"({', '.join(map(str, shape))}) with {len(time)} {along} as in '{where}.time'"
             )
-    return values
 
 
 def _banded(time: np.ndarray, values: dict[str, np.ndarray]) -> Curves:

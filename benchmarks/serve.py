@@ -39,7 +39,7 @@ from palpate.networks import load_policy
 from palpate.numerics import devices
 from palpate.runs import Figure, Result
 from palpate.runs.storage import write_json
-from palpate.trials.rope.trials import GRIPPER_AT_REST
+from palpate.trials.rope.stabilization import GRIPPER_AT_REST
 from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration
 
 PUSH = (0.25, 0.1)  # N, s; one every `EVERY` s, at the middle of the rope

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from palpate.networks import Channel
-from palpate.trials.controller import Controller
+from palpate.networks import Channel, Controller
 from palpate.worlds.rope.rope import RopeConfiguration, RopeObservation, RopeWorld
 
 STILL = np.zeros(3)

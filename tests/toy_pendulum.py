@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.families.options import EvaluateInTrials, Identify, Record, Train
+from palpate.networks import Controller
 from palpate.recordings import Aligned, Channel, Recording, Role
 from palpate.recordings import Trial as RecordedTrial
-from palpate.report import Curves, Piece, charts
+from palpate.report import Curves, Piece, charts, write_evidence
+from palpate.runs import Figure, Run
 from palpate.trials import trial as trials
-from palpate.trials.controller import Controller, FeedbackController, HeldStill
+from palpate.trials.controller import FeedbackController, HeldStill
 from palpate.worlds.world import World
 from toys import Pendulum, PendulumDamping, PendulumState
 
@@ -192,8 +194,9 @@ class SwingTrial(trials.Trial[Swings]):
         return Swings(energy, np.full((drawn, steps + 1, 1), np.nan), {})
 
     @classmethod
-    def score(cls, trials: Sequence[Any], record: Swings) -> dict[str, float]:
-        return {"success_rate": float(np.mean(record.energy[:, -1] < 0.02 * record.energy[:, 0]))}
+    def figures(cls, trials: Sequence[Any], record: Swings, suffix: str = "") -> list[Figure]:
+        rate = float(np.mean(record.energy[:, -1] < 0.02 * record.energy[:, 0]))
+        return [Figure(f"success_rate{suffix}", rate, "", better="higher")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,10 +221,11 @@ class EvaluatePendulumDamping(EvaluateInTrials):
     def controllers(self, policy: Any) -> dict[str, Controller]:
         return {"controlled": Damper(policy), "held still": HeldStill()}
 
-    def show(self, trials: Any, evaluated: Mapping[str, Swings]) -> dict[str, np.ndarray]:
+    def show(self, run: Run, trials: Any, evaluated: Mapping[str, Swings]) -> None:
         some = next(iter(evaluated.values()))
         swings = {f"swing.{name}": record.angle[0, :, 0] for name, record in evaluated.items()}
-        return swings | {"swing.time": SwingTrial.control_period * np.arange(some.angle.shape[1])}
+        time = SwingTrial.control_period * np.arange(some.angle.shape[1])
+        write_evidence(run.path, swings | {"swing.time": time})
 
 
 def _swing(curves: Curves, looks: Mapping[str, int]) -> tuple[str, charts.Chart]:

@@ -30,7 +30,7 @@ from palpate.runs import Figure, Result, Run
 from palpate.runs.result import read_result
 from palpate.runs.run import read_metrics
 from palpate.runs.storage import read_json, write_json
-from palpate.trials.rope import evaluation as rope_evaluation
+from palpate.trials.rope import stabilization
 from palpate.worlds.rope.rope import RopeWorld
 from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
 
@@ -450,7 +450,7 @@ def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
     def blind(world, width, height):
         raise PalpateError("no OpenGL here; install libegl1")
 
-    monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.7)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.7)
     monkeypatch.setattr(RopeWorld, "render", blind)
     tiny = Size(
         trials=2, duration=0.6, identification=(1, 1, 1), training=2, batch=2, starts=32, ropes=1

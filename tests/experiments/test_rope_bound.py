@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.experiments.rope import bound as rope_bound
+from palpate.experiments.rope import nominal
 from palpate.experiments.rope.bound import OWN, RESTARTS, Outcome, start_state
 from palpate.models.model import rollout
 from palpate.models.rope import Rope
@@ -16,7 +17,8 @@ from palpate.report.evidence import read_evidence
 from palpate.runs import Run
 from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
-from palpate.trials.rope.trials import StabilizationTrial
+from palpate.trials.rope import stabilization
+from palpate.trials.rope.stabilization import StabilizationTrial, lasting
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import SMALL, VELOCITY
 
@@ -34,12 +36,12 @@ def untrained() -> CommandPolicy:
 def small(monkeypatch):
     """A small world, a short trial, and searches that return their own beginning."""
     model = Rope.uniform(1.0, 0.1, 6, drive="velocity", substeps=4, bend_stiffness=1e-4)
-    monkeypatch.setattr(rope_bound, "BASE", BASE)
-    monkeypatch.setattr(rope_bound, "identified_rope", lambda *_: model)
-    monkeypatch.setattr(rope_bound, "shipped_policy", lambda: (untrained(), {"task": "-"}))
+    monkeypatch.setattr(nominal, "BASE", BASE)
+    monkeypatch.setattr(nominal, "identified_rope", lambda *_: model)
+    monkeypatch.setattr(nominal, "shipped_policy", lambda: (untrained(), {"task": "-"}))
     monkeypatch.setattr(rope_bound, "SEARCHED", 0.5)
     monkeypatch.setattr(rope_bound, "SHAPED", 0.25)
-    monkeypatch.setattr(rope_bound, "TRIAL_PERIODS", 1.0)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 1.0)
     return model
 
 
@@ -68,7 +70,7 @@ def test_a_replay_without_knots_is_the_controller_again(small, tmp_path, monkeyp
         return found
 
     monkeypatch.setattr(rope_bound, "search", search)
-    trials = [StabilizationTrial(BASE, start, 1) for start in ("straight", "shaken")]
+    trials = lasting([StabilizationTrial(BASE, start, 1) for start in ("straight", "shaken")])
     with Run.open(tmp_path, {}) as run:
         done = rope_bound.bounded(small, untrained(), trials, 80, 0, run)
     replayed = done["replayed_energy"][:, WARM]

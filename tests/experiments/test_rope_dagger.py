@@ -8,21 +8,27 @@ import numpy as np
 import pytest
 
 from palpate.experiments.rope import dagger as rope_dagger
-from palpate.experiments.rope import nominal as nominal_rope
-from palpate.experiments.rope.dagger import Follower, TakeOver, Work, nominal, whirled
+from palpate.experiments.rope import nominal
+from palpate.experiments.rope.dagger import (
+    TakeOver,
+    WhirledTrial,
+    Work,
+    nominal_trials,
+    watched,
+    whirled,
+)
 from palpate.learning import Training, dagger
 from palpate.learning.loss_monitor import Alarm
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
 from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
-from palpate.tasks.rope import RopeStabilization
 from palpate.trials.controller import HeldStill
-from palpate.trials.rope import evaluation as rope_evaluation
+from palpate.trials.rope import stabilization
 from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL, VELOCITY, commands, seen
 
-TINY = Work(rope_dagger.QUICK, Training(iterations=1, starts=20), 1, 2, 2, {"everything": 1})
+TINY = Work(nominal.QUICK, Training(iterations=1, starts=20), 1, 2, 2, {"everything": 1})
 MODEL = Rope.from_rest_lengths(np.full(5, 0.2), 0.1, drive="velocity", substeps=4)
 
 
@@ -47,12 +53,11 @@ def small(monkeypatch):
     def collected(alarm, comparison):
         return np.full(comparison.observed.shape, bool(left and left.pop()))
 
-    for module in (rope_dagger, nominal_rope):
-        monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
+    monkeypatch.setattr(nominal, "BASE", RopeConfiguration(**SMALL))
     monkeypatch.setattr(rope_dagger, "QUICK_WORK", TINY)
     monkeypatch.setattr(rope_dagger, "TRIAL_PERIODS", 0.6)
-    monkeypatch.setattr(rope_dagger, "identified_rope", lambda *_: MODEL)
-    monkeypatch.setattr(rope_dagger, "shipped_policy", lambda: (untrained(), {"seed": 0}))
+    monkeypatch.setattr(nominal, "identified_rope", lambda *_: MODEL)
+    monkeypatch.setattr(nominal, "shipped_policy", lambda: (untrained(), {"seed": 0}))
     monkeypatch.setattr(dagger, "train", train)
     monkeypatch.setattr(Alarm, "collected", collected)
     return pools
@@ -77,6 +82,7 @@ def test_stages_hand_on_what_they_made(small, tmp_path, monkeypatch):
     (tmp_path / "result.json").unlink()
 
     monkeypatch.setattr(rope_dagger, "run_trials", None)
+    monkeypatch.setattr("palpate.trials.trial.run_trials", None)
     monkeypatch.setattr(Alarm, "collected", lambda alarm, c: np.full(c.observed.shape, True))
     monkeypatch.setattr(rope_dagger, "ROUNDS", 1)
     again = rope_dagger.reproduce(tmp_path, quick=True, seed=3)
@@ -84,39 +90,38 @@ def test_stages_hand_on_what_they_made(small, tmp_path, monkeypatch):
 
 
 def test_whirls_are_drawn_by_their_seed_within_the_limits():
-    situation = whirled(6, 7)
-    np.testing.assert_array_equal(situation.whirl, whirled(6, 7).whirl)
-    assert not np.array_equal(situation.whirl, whirled(6, 8).whirl)
-    speed = np.linalg.norm(situation.whirl, axis=-1)
-    acceleration = np.linalg.norm(np.diff(situation.whirl, axis=1), axis=-1) / 0.01
+    trials = whirled(6, 7)
+    whirl = WhirledTrial.goals(trials)
+    np.testing.assert_array_equal(whirl, WhirledTrial.goals(whirled(6, 7)))
+    assert not np.array_equal(whirl, WhirledTrial.goals(whirled(6, 8)))
+    speed = np.linalg.norm(whirl, axis=-1)
+    acceleration = np.linalg.norm(np.diff(whirl, axis=1), axis=-1) / 0.01
     assert 0.7 < speed[:, -1].min() <= speed.max() < 0.8
-    assert acceleration.max() < situation.trials[0].configuration.acceleration_limit
-    turning = np.cross(situation.whirl[:, -2], situation.whirl[:, -1])[:, 2]
+    assert acceleration.max() < trials[0].configuration.acceleration_limit
+    turning = np.cross(whirl[:, -2], whirl[:, -1])[:, 2]
     assert turning.min() < 0 < turning.max()
 
 
 def test_a_policy_takes_over_knowing_what_was_seen(monkeypatch):
-    monkeypatch.setattr(rope_dagger, "BASE", RopeConfiguration(**SMALL))
+    monkeypatch.setattr(nominal, "BASE", RopeConfiguration(**SMALL))
     monkeypatch.setattr(rope_dagger, "WHIRL_DURATION", 0.3)
     monkeypatch.setattr(rope_dagger, "TRIAL_PERIODS", 0.02)
-    situation = whirled(2, 5)
-    follower = Follower(untrained(), RopeStabilization())
-    episodes = rope_dagger.tried(follower, situation)
-    seen = follower.observed(30)
-    assert seen.states.position.shape == (2, situation.steps, 6, 3)
-    assert episodes.energy.shape == (2, situation.steps + 1)
-    np.testing.assert_allclose(seen.command[:, 0], situation.whirl[:, -1], rtol=1e-5)
+    trials = whirled(2, 5)
+    whirl = WhirledTrial.goals(trials)
+    seen = watched(untrained(), trials)
+    assert seen.states.position.shape == (2, trials[0].steps - 30, 6, 3)
+    np.testing.assert_allclose(seen.command[:, 0], whirl[:, -1], rtol=1e-5)
     # One control period changes a command by no more than its limit: it went on from the whirl's.
     change = jnp.linalg.norm(seen.actions[:, 0] - seen.command, axis=-1)
     assert float(change.max()) < 0.1 + 1e-4
     # Velocities are those that the policy saw: of the gripper, nearly what it was told.
-    told = np.linalg.norm(situation.whirl[:, -2], axis=-1)
+    told = np.linalg.norm(whirl[:, -2], axis=-1)
     np.testing.assert_allclose(
         np.linalg.norm(seen.states.velocity[:, 0, 0], axis=-1), told, rtol=0.1
     )
 
 
-def test_who_is_no_follower_takes_over_as_well():
+def test_who_is_no_policy_takes_over_as_well():
     class Counting(HeldStill):
         asked = 0
 
@@ -125,15 +130,17 @@ def test_who_is_no_follower_takes_over_as_well():
             return super().__call__(*arguments)
 
     controller = Counting()
-    episodes = TakeOver(controller, np.full((1, 3, 3), 0.1))
-    decided = commands(episodes, [seen(np.zeros((1, 6, 3)), np.zeros((1, 3)))] * 5)
+    shown = [seen(np.zeros((1, 6, 3)), np.zeros((1, 3)))] * 5
+    decided = commands(TakeOver(controller), shown, np.full((1, 3, 3), 0.1))
     assert [float(command.max()) for command in decided] == [0.1, 0.1, 0.1, 0.0, 0.0]
     assert controller.asked == 2
 
 
 def test_nominal_trials_are_the_evaluations():
-    situation = nominal(2, 11)
-    assert situation.trials == rope_evaluation.evaluation_trials(rope_dagger.BASE, 2, 11)
-    assert situation.whirl.shape == (8, 0, 3)
-    assert situation.part(np.array([3])).trials == [situation.trials[3]]
-    assert dataclasses.replace(situation).steps == situation.part(np.array([0])).steps
+    trials = nominal_trials(2, 11)
+    (steps,) = {trial.steps for trial in trials}
+    assert {trial.steps - len(trial.whirl) for trial in whirled(2, 3)} == {steps}
+    usual = stabilization.evaluation_trials(nominal.BASE, 2, 11)
+    assert [dataclasses.replace(trial, steps=None) for trial in trials] == [
+        dataclasses.replace(trial, steps=None) for trial in usual
+    ]

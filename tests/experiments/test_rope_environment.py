@@ -12,7 +12,7 @@ from palpate.models.rope import Rope
 from palpate.parameters import parameters_of
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.trials import StabilizationTrial
+from palpate.trials.rope.stabilization import StabilizationTrial
 from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import RopeConfiguration
 

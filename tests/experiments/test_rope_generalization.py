@@ -5,14 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from palpate.experiments import experiment
 from palpate.experiments.rope import generalization as study
-from palpate.experiments.rope.generalization import ROWS, ObservedController, Row
+from palpate.experiments.rope import nominal
+from palpate.experiments.rope.generalization import ROWS, Row
 from palpate.experiments.rope.nominal import BASE, shipped_policy
 from palpate.models.rope import Rope
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.evaluation import summarise
-from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.trials.rope.learned import LearnedController, ObservedController
+from palpate.trials.rope.stabilization import Episodes, StabilizationTrial, summarise
 from palpate.trials.trial import run_trials
 
 TASK = RopeStabilization()
@@ -81,11 +82,11 @@ def test_a_rope_seen_ten_times_a_second_and_late_comes_to_rest():
 def test_every_row_is_tried_and_the_worst_counts(tmp_path, monkeypatch):
     rows = {"nominal": ROWS["nominal"], "weighted": ROWS["weighted"]}
     monkeypatch.setattr(study, "ROWS", rows)
-    monkeypatch.setattr(study, "identified_rope", lambda *_: MODEL)
+    monkeypatch.setattr(nominal, "identified_rope", lambda *_: MODEL)
     monkeypatch.setattr(study, "write_trial_evidence", lambda *_: None)
     tried = []
 
-    def evaluate(controllers, trials, run):
+    def evaluate_trials(controllers, trials, run):
         ((name, _),) = controllers.items()
         tried.append((name, len(trials), trials[0].configuration.tip_mass > 0))
         energy = np.ones((len(trials), 700))
@@ -95,7 +96,7 @@ def test_every_row_is_tried_and_the_worst_counts(tmp_path, monkeypatch):
             energy[0] = 1.0
         return {name: Episodes(energy, np.zeros_like(energy), np.empty((0,)), {})}
 
-    monkeypatch.setattr(study, "evaluate", evaluate)
+    monkeypatch.setattr(experiment, "evaluate_trials", evaluate_trials)
     result = study.reproduce(tmp_path, quick=True, seed=1)
     assert tried == [
         (name, 4, weighted)
@@ -110,7 +111,7 @@ def test_every_row_is_tried_and_the_worst_counts(tmp_path, monkeypatch):
     assert figures["time_ratio.nominal"].value == 1.0
     assert result.seeds == [1, study.SEEDS + 1]
     tried.clear()
-    study.reproduce(tmp_path, quick=True, seed=1)  # finished rows are read, by `evaluate`, again
+    study.reproduce(tmp_path, quick=True, seed=1)  # finished rows are only read
     assert len(tried) == 4
 
 

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from palpate.experiments.rope import markerless as rope_markerless
+from palpate.experiments.rope import nominal
 from palpate.experiments.rope.nominal import shipped_policy
 from palpate.models.rope import Rope, RopeState
 from palpate.runs.run import RESULT
 from palpate.trials.rope import filming as rope_filming
+from palpate.trials.rope import stabilization
 from palpate.trials.rope.filming import film
-from palpate.trials.rope.trials import StabilizationTrial
+from palpate.trials.rope.stabilization import StabilizationTrial
 from palpate.worlds.camera import Sensor
 from palpate.worlds.rope.rope import RopeConfiguration
 
@@ -20,9 +22,9 @@ MODEL = Rope.uniform(nodes=11, substeps=4, bend_stiffness=2e-3, bend_damping=5e-
 
 
 def test_a_trial_is_kept_beside_what_it_is_compared_with():
-    trial = StabilizationTrial(RopeConfiguration(), "straight", 3)
+    trial = StabilizationTrial(RopeConfiguration(), "straight", 3, 8)
     kept = film(
-        trial, model=MODEL, policy=None, steps=8, background="plain",
+        trial, model=MODEL, policy=None, background="plain",
         sensor=Sensor(sub_frames=2), shaken=False,
     )  # fmt: skip
     tracked, centre_line, alone, hanging = np.sqrt(kept.squared_error) * 100
@@ -45,7 +47,7 @@ def test_a_simulation_that_diverges_leaves_nan(monkeypatch):
 
     monkeypatch.setattr(rope_filming.FilmedRope, "step", diverge)
     kept = film(
-        StabilizationTrial(RopeConfiguration(), "straight", 3), model=MODEL, policy=None, steps=2,
+        StabilizationTrial(RopeConfiguration(), "straight", 3, 2), model=MODEL, policy=None,
         background="plain", sensor=Sensor(sub_frames=1), shaken=False,
     )  # fmt: skip
     assert np.isfinite(kept.energy).tolist() == [True, False, False]
@@ -60,8 +62,8 @@ def test_all_rows_are_filmed_once_and_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr(rope_markerless, "evaluation_trials", lambda *given: draw(*given)[:1])
     monkeypatch.setattr(rope_markerless, "START_POSES", ("straight",))
     monkeypatch.setattr(rope_markerless, "SWINGING", 0.08)
-    monkeypatch.setattr(rope_markerless, "TRIAL_PERIODS", 0.05)
-    monkeypatch.setattr(rope_markerless, "identified_rope", lambda *_: MODEL)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.05)
+    monkeypatch.setattr(nominal, "identified_rope", lambda *_: MODEL)
     monkeypatch.setattr(rope_filming, "COMPILED", 1)
     monkeypatch.setattr(rope_filming, "TIMED", 10)
     result = rope_markerless.reproduce(tmp_path, quick=True)

@@ -20,14 +20,14 @@ from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
 from palpate.tasks.rope.tracking import hanging_rope
 from palpate.trials.controller import HeldStill
-from palpate.trials.rope import evaluation as rope_evaluation
+from palpate.trials.rope import stabilization
 from palpate.trials.rope.planners import (
     PlannedStabiliser,
     as_of_model,
     energy_and_speed,
     stabilising_planner,
 )
-from palpate.trials.rope.trials import StabilizationTrial
+from palpate.trials.rope.stabilization import StabilizationTrial
 from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL, VELOCITY
@@ -104,16 +104,15 @@ def calls(monkeypatch):
         made.append(("train", model, training))
         return untrained(seed)
 
-    for module in (nominal, rope_rivals):
-        monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
+    monkeypatch.setattr(nominal, "BASE", RopeConfiguration(**SMALL))
     monkeypatch.setattr(nominal, "identify", identify)
     monkeypatch.setattr(nominal, "NODES", 6)
     monkeypatch.setattr(nominal, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr("palpate.commands.train.train", train)
-    monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.02)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.02)
     monkeypatch.setattr(rope_rivals, "SMALL", TINY)
     monkeypatch.setattr(rope_rivals, "UNHURRIED", {"gradient": 2})
-    monkeypatch.setattr(rope_rivals, "shipped_policy", lambda: (untrained(9), {"seed": 9}))
+    monkeypatch.setattr(nominal, "shipped_policy", lambda: (untrained(9), {"seed": 9}))
 
     def too_slow(*_):
         raise PalpateError("one iteration already takes 20 ms")
@@ -191,9 +190,7 @@ def install_sac(monkeypatch) -> list[tuple]:
 
 def test_a_part_of_the_episodes_keeps_its_failures() -> None:
     energy = np.arange(8.0).reshape(4, 2)
-    whole = rope_evaluation.Episodes(
-        energy, -energy, np.zeros((1, 2, 11, 3)), {2: "lost", 3: "too"}
-    )
-    part = rope_evaluation.part_of(whole, [0, 2])
+    whole = stabilization.Episodes(energy, -energy, np.zeros((1, 2, 11, 3)), {2: "lost", 3: "too"})
+    part = whole.part([0, 2])
     np.testing.assert_array_equal(part.energy, energy[[0, 2]])
     assert part.failures == {1: "lost"}

@@ -18,7 +18,7 @@ from palpate.networks import CommandPolicy, save_controller
 from palpate.report.evidence import read_evidence
 from palpate.runs.result import read_result
 from palpate.runs.storage import write_json
-from palpate.trials.rope import evaluation as rope_evaluation
+from palpate.trials.rope import stabilization
 from palpate.worlds.rope.rope import START_POSES, RopeConfiguration
 from small_rope import SMALL, VELOCITY
 
@@ -40,17 +40,15 @@ def calls(monkeypatch):
         made.append(("train", model, training))
         return untrained(6 * (model.nodes - 1), seed)
 
-    for module in (nominal, rope_stabilization, rope_ablation):
-        monkeypatch.setattr(module, "BASE", RopeConfiguration(**SMALL))
-    for module in (rope_stabilization, rope_ablation):
-        monkeypatch.setattr(module, "QUICK", TINY)
-        monkeypatch.setattr(module, "FULL", TINY)
+    monkeypatch.setattr(nominal, "BASE", RopeConfiguration(**SMALL))
+    monkeypatch.setattr(nominal, "QUICK", TINY)
+    monkeypatch.setattr(nominal, "FULL", TINY)
     monkeypatch.setattr(nominal, "NODES", 6)
     monkeypatch.setattr(nominal, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr(nominal, "identify", identify)
     monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_stabilization, "_left_when_still", lambda *_: figure())
-    monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.05)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.05)
     return made
 
 
@@ -140,11 +138,11 @@ def test_ablations_differ_in_one_switch_at_equal_budget(calls, tmp_path):
 
 
 def test_rope_held_still_is_looked_at_after_three_periods():
-    trials = rope_evaluation.evaluation_trials(RopeConfiguration(**SMALL), 1, 0)
+    trials = stabilization.evaluation_trials(RopeConfiguration(**SMALL), 1, 0)
     after = int(np.floor(3 * trials[0].period / 0.01))
     energy = np.full((4, after + 5), 0.25)
     energy[:, 0] = 0.5
     energy[2, after] = 0.05
     energy[3, after + 1] = 0.01
-    episodes = rope_evaluation.Episodes(energy, energy, np.zeros((4, 1, 11, 3)), {})
+    episodes = stabilization.Episodes(energy, energy, np.zeros((4, 1, 11, 3)), {})
     assert rope_stabilization._left_when_still(trials, episodes).value == pytest.approx(0.1)

@@ -11,6 +11,7 @@ from palpate.errors import PalpateError
 from palpate.experiments.rope import nominal
 from palpate.experiments.rope import tracking as rope_tracking
 from palpate.experiments.rope.nominal import Size
+from palpate.experiments.rope.tracking import METHODS
 from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
@@ -30,9 +31,8 @@ from palpate.trials.rope.tracking import (
     blind_controllers,
     path_trials,
     summarise,
-    table,
 )
-from palpate.trials.trial import evaluate_trials
+from palpate.trials.trial import evaluate_trials, table
 from palpate.worlds.rope.rope import RopeConfiguration
 from small_rope import SMALL, VELOCITY, commands, seen
 
@@ -153,7 +153,8 @@ def test_errors_are_distances_in_time_and_divergence_counts() -> None:
     assert summary.worst == pytest.approx(5.0)
     lost = summarise(trials, dataclasses.replace(followed, failures={1: "diverged"}))
     assert (lost.mean, lost.diverged) == (None, 1)
-    assert summarise(trials, dataclasses.replace(followed, failures={1: "d"}), [0, 2]).mean > 4
+    part = dataclasses.replace(followed, failures={1: "d"}).part([0, 2])
+    assert summarise([trials[0], trials[2]], part).mean > 4
 
 
 def test_trials_that_were_cut_off_go_on(tmp_path, monkeypatch) -> None:
@@ -187,14 +188,13 @@ def test_stages_hand_on_what_they_made(tmp_path, monkeypatch) -> None:
         made.append((task, training))
         return untrained(seed)
 
-    monkeypatch.setattr(rope_tracking, "BASE", BASE)
     monkeypatch.setattr(nominal, "BASE", BASE)
     monkeypatch.setattr(nominal, "NODES", 6)
     monkeypatch.setattr(nominal, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr(nominal, "identify", lambda start, *_: start)
     monkeypatch.setattr("palpate.commands.train.train", train)
     monkeypatch.setattr(rope_tracking, "SMALL", TINY)
-    monkeypatch.setattr(rope_tracking, "samples_within", lambda *_: (8, 0.001))
+    monkeypatch.setattr(rope_tracking, "METHODS", dict.fromkeys(METHODS, lambda *_: (8, 0.001)))
     monkeypatch.setattr(rope_tracking, "UNHURRIED", (8, 2))
     monkeypatch.setattr(
         rope_tracking, "path_trials", lambda *arguments: brief(path_trials(*arguments), 4)

@@ -1,5 +1,7 @@
 """A policy in closed loop sees a goal that moves on with time."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,6 @@ import numpy as np
 from jaxtyping import Array
 
 from palpate.learning import simulate
-from palpate.networks import Controller
 from palpate.tasks.task import Start
 from toys import Cart, CartState, CartToOrigin
 
@@ -24,9 +25,10 @@ class Follow(CartToOrigin):
         return goal
 
 
-class Echo(Controller):
+class Echo(eqx.Module):
     """What is seen, as it is: to see what that was."""
 
+    period: ClassVar[None] = None
     unused: Array = eqx.field(default_factory=lambda: jnp.zeros(()))
 
     def initial_carry(self, command):

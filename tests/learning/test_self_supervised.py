@@ -15,7 +15,7 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.learning import Training, simulate, train
-from palpate.networks import CommandPolicy, Controller
+from palpate.networks import CommandPolicy
 from palpate.parameters import randomise
 from palpate.runs import Run
 from palpate.runs.storage import plain
@@ -37,9 +37,10 @@ class Counting(CartToOrigin):
         return super().loss(models, start, states, actions)
 
 
-class Held(Controller):
+class Held(eqx.Module):
     """Always commands the same."""
 
+    period: ClassVar[None] = None
     command: jax.Array
 
     def initial_carry(self, command):

@@ -7,18 +7,22 @@ from palpate.errors import PalpateError
 from palpate.report.evidence import read_evidence
 from palpate.runs import Run
 from palpate.trials import trial as trial_module
-from palpate.trials.rope import evaluation as rope_evaluation
-from palpate.trials.rope.evaluation import (
-    by_pose,
-    evaluate,
+from palpate.trials.rope import stabilization
+from palpate.trials.rope.stabilization import (
+    Episodes,
+    StabilizationTrial,
     evaluation_trials,
-    figures,
+    lasting,
     summarise,
-    table,
     write_trial_evidence,
 )
-from palpate.trials.rope.trials import Episodes, StabilizationTrial
-from palpate.trials.trial import first_of_each_group, run_trials
+from palpate.trials.trial import (
+    by_group,
+    evaluate_trials,
+    first_of_each_group,
+    run_trials,
+    table,
+)
 from palpate.worlds.rope.rope import START_POSES, RopeConfiguration
 from small_rope import SMALL
 
@@ -41,10 +45,8 @@ class Slide:
 
 
 def four_trials() -> list[StabilizationTrial]:
-    return [
-        StabilizationTrial(BASE, start, seed)
-        for start, seed in (("straight", 1), ("straight", 2), ("helix", 3), ("helix", 4))
-    ]
+    starts = ("straight", 1), ("straight", 2), ("helix", 3), ("helix", 4)
+    return lasting([StabilizationTrial(BASE, start, seed) for start, seed in starts])
 
 
 CONTROLLERS = {"slow": Slide(0.1), "fast": Slide(0.4)}
@@ -53,7 +55,7 @@ CONTROLLERS = {"slow": Slide(0.1), "fast": Slide(0.4)}
 @pytest.fixture
 def short(monkeypatch):
     """Trials of a few steps, three at a time."""
-    monkeypatch.setattr(rope_evaluation, "TRIAL_PERIODS", 0.03)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.03)
     monkeypatch.setattr(StabilizationTrial, "side_by_side", 3)
 
 
@@ -69,7 +71,7 @@ def test_every_rope_starts_in_every_pose():
 
 def test_chunks_give_what_one_batch_gives(short):
     trials = four_trials()
-    evaluated = evaluate(CONTROLLERS, trials)
+    evaluated = evaluate_trials(CONTROLLERS, trials)
     steps = evaluated["slow"].energy.shape[1] - 1
     assert steps == np.ceil(0.03 * trials[0].period / BASE.control_period)
     whole = run_trials(trials, CONTROLLERS["fast"], steps, drawn=first_of_each_group(trials))
@@ -81,7 +83,7 @@ def test_chunks_give_what_one_batch_gives(short):
 
 def test_what_was_cut_off_goes_on_to_the_same_result(short, tmp_path, monkeypatch):
     trials = four_trials()
-    expected = evaluate(CONTROLLERS, trials)
+    expected = evaluate_trials(CONTROLLERS, trials)
     calls = []
 
     def dies_at_the_fourth(chosen, *arguments):
@@ -95,9 +97,9 @@ def test_what_was_cut_off_goes_on_to_the_same_result(short, tmp_path, monkeypatc
 
     monkeypatch.setattr(trial_module, "run_trials", dies_at_the_fourth)
     with Run.open(tmp_path, {}) as run, pytest.raises(RuntimeError):
-        evaluate(CONTROLLERS, trials, run)
+        evaluate_trials(CONTROLLERS, trials, run)
     with Run.open(tmp_path, {}) as run:
-        resumed = evaluate(CONTROLLERS, trials, run)
+        resumed = evaluate_trials(CONTROLLERS, trials, run)
         assert len(run.metrics()) == 4
     assert calls == [3, 1, 3, 1, 1]
     for name, episodes in expected.items():
@@ -107,7 +109,7 @@ def test_what_was_cut_off_goes_on_to_the_same_result(short, tmp_path, monkeypatc
     assert resumed["fast"].failures == {}
     with Run.open(tmp_path, {}) as run:  # nothing is left to do
         run.finish({})
-        again = evaluate(CONTROLLERS, trials, run)
+        again = evaluate_trials(CONTROLLERS, trials, run)
     assert len(calls) == 5
     np.testing.assert_array_equal(again["fast"].energy, expected["fast"].energy)
     assert again["slow"].failures == {3: "diverged"}
@@ -116,7 +118,7 @@ def test_what_was_cut_off_goes_on_to_the_same_result(short, tmp_path, monkeypatc
 def test_ropes_that_cannot_go_side_by_side_are_refused():
     other = RopeConfiguration(**SMALL, control_period=0.02)
     with pytest.raises(PalpateError, match="one control_period"):
-        evaluate(CONTROLLERS, [*four_trials(), StabilizationTrial(other, "straight", 0)])
+        lasting([*four_trials(), StabilizationTrial(other, "straight", 0)])
 
 
 def test_a_controller_for_another_period_is_refused_before_the_first_is_tried(monkeypatch):
@@ -124,7 +126,7 @@ def test_a_controller_for_another_period_is_refused_before_the_first_is_tried(mo
     slow = Slide(0.1)
     slow.period = 0.02
     with pytest.raises(PalpateError, match=r"decides every 0.02 s"):
-        evaluate({"fast": Slide(0.4), "slow": slow}, four_trials())
+        evaluate_trials({"fast": Slide(0.4), "slow": slow}, four_trials())
 
 
 def episodes_of(*settled_after: int | None) -> Episodes:
@@ -177,7 +179,7 @@ def test_without_a_success_there_is_no_time():
     summary = summarise(four_trials(), episodes_of(None, None, None, None))
     assert summary.periods is None
     assert "never" in summary.line("x")
-    rate, periods, seconds = figures(summary, bars=(0.99, 0.9))
+    rate, periods, seconds = summary.figures(bars=(0.99, 0.9))
     assert (rate.met, periods.met, seconds.met) == (False, False, None)
 
 
@@ -195,7 +197,7 @@ def test_when_every_simulation_ended_early_there_is_no_final_speed(recwarn):
 def test_poses_are_apart():
     trials, episodes = four_trials(), episodes_of(50, 100, None, None)
     episodes.failures[3] = "diverged"
-    poses = by_pose(trials, episodes)
+    poses = {pose: summarise(*part) for pose, part in by_group(trials, episodes).items()}
     assert poses["straight"].success_rate == 1.0
     assert poses["helix"].success_rate == 0.0
     assert (poses["straight"].diverged, poses["helix"].diverged) == (0, 1)
@@ -205,18 +207,18 @@ def test_poses_are_apart():
 
 def test_figures_have_the_names_and_bars_of_the_table():
     summary = summarise(four_trials(), episodes_of(50, 100, 120, 150))
-    named = {figure.name: figure for figure in figures(summary, bars=(0.99, 0.9))}
+    named = {figure.name: figure for figure in summary.figures(bars=(0.99, 0.9))}
     assert list(named) == ["success_rate", "time_to_1pct_periods", "time_to_1pct_s"]
     assert named["success_rate"].better == "higher"
     assert named["success_rate"].met
     assert named["time_to_1pct_periods"].met
     assert named["time_to_1pct_s"].value == pytest.approx(1.05)
-    assert figures(summary, ".swing_damper")[0].name == "success_rate.swing_damper"
+    assert summary.figures(".swing_damper")[0].name == "success_rate.swing_damper"
 
 
 def test_evidence_is_what_a_report_reads(short, tmp_path):
     trials = four_trials()
-    evaluated = evaluate(CONTROLLERS, trials)
+    evaluated = evaluate_trials(CONTROLLERS, trials)
     with Run.open(tmp_path, {}) as run:
         write_trial_evidence(run, trials, evaluated, ["fast"])
     evidence = read_evidence(tmp_path)
@@ -229,7 +231,7 @@ def test_evidence_is_what_a_report_reads(short, tmp_path):
 
 def test_a_rope_that_was_never_seen_is_not_drawn(short, tmp_path):
     trials = four_trials()
-    evaluated = evaluate(CONTROLLERS, trials)
+    evaluated = evaluate_trials(CONTROLLERS, trials)
     for episodes in evaluated.values():
         episodes.failures[2] = "diverged while it was shaken"
         for part in (episodes.energy[2], episodes.gripper_speed[2], episodes.markers[1]):

@@ -15,7 +15,7 @@ from palpate.trials.controller import HeldStill, check_period
 from palpate.trials.rope import trials as rope_trials
 from palpate.trials.rope.baselines import TUNED, Gains, SwingDamper
 from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.trials import StabilizationTrial, settling_time
+from palpate.trials.rope.stabilization import StabilizationTrial, settling_time
 from palpate.trials.trial import run_trials, wilson_interval
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from palpate.worlds.world import DivergedError

@@ -22,12 +22,13 @@ from typing import Any, SupportsFloat
 import jax
 import numpy as np
 
+from palpate.networks import Controller
 from palpate.runs import Figure, Result, Run
 from palpate.runs.progress import interruptible, progress
 from palpate.runs.result import two_standard_errors
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json
-from palpate.trials.trial import wilson_interval
+from palpate.trials.trial import RecordType, Trial, evaluate_trials, wilson_interval
 
 
 @dataclasses.dataclass
@@ -103,6 +104,35 @@ class Experiment:
             if not stage.finished:
                 stage.content = work()
         return read_json(stage.path / RESULT)
+
+    def evaluated(
+        self,
+        folder: str,
+        about: Mapping[str, Any],
+        controllers: Mapping[str, Controller],
+        trials: Sequence[Trial[RecordType]],
+        show: Callable[[Run, Sequence[Any], dict[str, RecordType]], None] | None = None,
+    ) -> tuple[dict[str, RecordType], dict[str, list[float]]]:
+        """What each controller does in all trials, and how long planners take to decide.
+
+        In a stage, of which `about` says what trials and controllers these are, and `show` leaves
+        evidence. The times are median and 99th percentile, ms, of controllers that note what they
+        have `spent`, s.
+        """
+        sizes = {"stage": folder, "seed": self.seed, "trials": len(trials)}
+        configuration = {**sizes, "controllers": list(controllers), **about}
+        with self.stage(folder, configuration) as stage:
+            found = evaluate_trials(controllers, trials, stage.run)
+            if not stage.finished:
+                if show is not None:
+                    show(stage.run, trials, found)
+                spent = {name: getattr(one, "spent", None) for name, one in controllers.items()}
+                stage.content["decision_ms"] = {
+                    name: (1e3 * np.quantile(times, (0.5, 0.99))).tolist()
+                    for name, times in spent.items()
+                    if times
+                }
+        return found, read_json(stage.path / RESULT)["decision_ms"]
 
     @contextlib.contextmanager
     def counted(self) -> Iterator[None]:

@@ -7,7 +7,6 @@ Nothing here imports what computes, so that help is instant.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,10 +22,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from palpate.models.model import Model
-    from palpate.networks import CommandPolicy
+    from palpate.networks import CommandPolicy, Controller
     from palpate.recordings import Aligned, Recording
     from palpate.runs import Figure, Run
-    from palpate.trials.controller import Controller
     from palpate.trials.trial import Trial
 
 Number = Annotated[float | None, arg(metavar="NUMBER", help_behavior_hint="(default: none)")]
@@ -296,7 +294,7 @@ class Evaluate(Options, ABC):
 class EvaluateInTrials(Evaluate, ABC):
     """A trained policy in the worlds of its family, beside others and beside doing nothing.
 
-    Each task names its trials and who decides in them; what its trials score is what counts.
+    Each task names its trials and who decides in them; the figures of its trials are what counts.
     """
 
     @abstractmethod
@@ -307,8 +305,11 @@ class EvaluateInTrials(Evaluate, ABC):
     def controllers(self, policy: CommandPolicy) -> Mapping[str, Controller]:
         """Who decides, by name: the policy, and then what it is held against."""
 
-    def show(self, trials: Sequence[Trial], evaluated: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Arrays for the run's page, named as `palpate.report.evidence` describes."""
+    def show(self, run: Run, trials: Sequence[Any], evaluated: Mapping[str, Any]) -> None:
+        """Leave evidence for the run's page, as `palpate.report.evidence` describes; here none."""
+
+    def constants(self) -> dict[str, Any]:
+        """Of the worlds, for the result."""
         return {}
 
     def check(self, policy: CommandPolicy) -> None:
@@ -320,30 +321,21 @@ class EvaluateInTrials(Evaluate, ABC):
                 check_period(controller, trial.control_period)
 
     def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
-        """Let each controller decide in the same trials; a figure for each score of each."""
-        from palpate.report import write_evidence
-        from palpate.runs import Figure
-        from palpate.trials.trial import evaluate_trials
+        """Let each controller decide in the same trials; the figures of each."""
+        from palpate.trials.trial import evaluate_trials, table
 
         trials = self.trials()
         evaluated = evaluate_trials(self.controllers(policy), trials, run)
-        if shown := self.show(trials, evaluated):
-            write_evidence(run.path, shown)
-        figures, table = [], []
-        for number, (name, record) in enumerate(evaluated.items()):
-            suffix = f".{name.replace(' ', '_')}" if number else ""
-            scores = type(trials[0]).score(trials, record)
-            for score, value in scores.items():
-                better = "higher" if score == "success_rate" else "lower"
-                known = value if math.isfinite(value) else None
-                figures.append(Figure(f"{score}{suffix}", known, "", better=better))
-            scored = ", ".join(f"{score.replace('_', ' ')} {v:.3g}" for score, v in scores.items())
-            table.append(f"{name:28s} {scored}")
-            table += [f"  trial {trial}: {why}" for trial, why in sorted(record.failures.items())]
+        self.show(run, trials, evaluated)
+        ends = ["", *(f".{name.replace(' ', '_')}" for name in [*evaluated][1:])]
+        figures = [
+            type(trials[0]).figures(trials, record, end)
+            for end, record in zip(ends, evaluated.values(), strict=True)
+        ]
         return Evaluation(
-            figures=figures,
-            table=table,
-            settings={"trials": len(trials)},
+            figures=[figure for own in figures for figure in own],
+            table=table(trials, evaluated),
+            settings={"trials": len(trials), **self.constants()},
             split={"evaluated": f"{len(trials)} trials, seed {self.seed}"},
         )
 

@@ -10,7 +10,7 @@ import sys
 from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -27,33 +27,40 @@ _OWN_KINDS = {_NETWORK: "palpate.networks.policy:CommandPolicy"}
 _DECLARED = ("observations", "actions", "period")
 
 
-class Controller(eqx.Module):
-    """The contract: `(carry, observation, goal, key) -> (carry, action)`, with or without a batch.
+@runtime_checkable
+class Controller(Protocol):
+    """Who decides: `(carry, observation, goal, key) -> (carry, action)`, with or without a batch.
 
-    `observation` is (*batch, features) as the task that the controller is made for gives it,
-    `goal` what the task asks for (None where nothing varies) and `key` randomness, for controllers
-    that use any (None otherwise). A batch is one leading axis of everything. A pure function of
-    what is carried and seen, so that the same object runs inside a differentiated rollout, over a
-    batch, and in a robot's control loop.
+    A function of what is carried and seen, so that the same object runs inside a differentiated
+    rollout, over a batch, and in a robot's control loop. `observation` is (*batch, features) as the
+    task that the controller is made for gives it; in a trial it is what the worlds hand out, and
+    what makes features of that stands in front of the controller and is carried with it. `goal` is
+    what the task asks for (None where nothing varies) and `key` randomness, for controllers that
+    use any (None otherwise). A batch is one leading axis of everything.
+
+    `period`: seconds from one decision to the next that it was made for; None: any.
     """
 
-    @abstractmethod
-    def initial_carry(self, command: Array) -> Any:
+    @property
+    def period(self) -> float | None: ...
+
+    def initial_carry(self, command: Any) -> Any:
         """What to carry into the first call.
 
         `command`, (*batch, *action_shape), is the action in force when the controller takes over:
         zero for a robot at rest.
         """
+        ...
 
-    @abstractmethod
     def __call__(
         self, carry: Any, observation: Any, goal: Any, key: Key[Array, "*batch"] | None
-    ) -> tuple[Any, Array]:
+    ) -> tuple[Any, Any]:
         """The next carry, and the action to hold for one control period."""
+        ...
 
 
-class DeclaredController(Controller):
-    """A controller that declares its channels, and so can be saved, loaded by kind and served.
+class DeclaredController(eqx.Module):
+    """A `Controller` that declares its channels, and so can be saved, loaded by kind and served.
 
     An observation is that of all `observations`, flat, one after the other. An action has the
     shape of its channel or, where `actions` are several, is all of them, flat, one after the
@@ -63,6 +70,16 @@ class DeclaredController(Controller):
     observations: eqx.AbstractVar[tuple[Channel, ...]]
     actions: eqx.AbstractVar[tuple[Channel, ...]]
     period: eqx.AbstractVar[float]
+
+    @abstractmethod
+    def initial_carry(self, command: Array) -> Any:
+        """See `Controller`."""
+
+    @abstractmethod
+    def __call__(
+        self, carry: Any, observation: Array, goal: Any, key: Key[Array, "*batch"] | None
+    ) -> tuple[Any, Array]:
+        """See `Controller`."""
 
     def settings(self, folder: Path) -> dict[str, Any]:
         """What `from_settings` needs besides the declaration and arrays: here all other fields.

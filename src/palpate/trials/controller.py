@@ -1,44 +1,20 @@
-"""Who decides in a closed loop: one protocol for policies, planners and hand-written laws."""
+"""Controllers of any worlds: those that begin with what they see, and those that look at nothing.
+
+In a trial every array of an observation, of the goal and of the action leads with the worlds. The
+goal is what is asked for from the start of a trial on: a controller carries how far it has come.
+"""
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Key
 
 from palpate.errors import PalpateError
+from palpate.networks import Controller
 
 SAME_PERIOD = 1e-3  # relative: that of a recording's clock is known no better
-
-
-@runtime_checkable
-class Controller(Protocol):
-    """Who decides: `(carry, observation, goal, key) -> (carry, action)`.
-
-    In a trial the observation is what the worlds hand out, and every array of it, of the goal and
-    of the action leads with the worlds. `goal` is what the task asks for from the start of a trial
-    on (None where nothing varies): a controller carries how far it has come. `key` is randomness
-    for those that use any (None otherwise).
-
-    A `palpate.networks.Policy` has the same signature with features for an observation; what makes
-    features of what is seen stands in front of it, and is carried with it (`LearnedController`).
-
-    `period`: seconds from one decision to the next that it was made for; None: any.
-    """
-
-    @property
-    def period(self) -> float | None: ...
-
-    def initial_carry(self, command: Any) -> Any:
-        """What to carry into the first call; `command` (worlds, ...) is the action in force."""
-        ...
-
-    def __call__(
-        self, carry: Any, observation: Any, goal: Any, key: Key[Array, "*worlds"] | None
-    ) -> tuple[Any, Any]:
-        """The next carry, and the action to hold for one control period."""
-        ...
 
 
 class _NotStarted(NamedTuple):
@@ -105,11 +81,31 @@ class OpenLoop(FeedbackController):
         return (actions, step + 1), actions[:, step]
 
 
+class Noted:
+    """A controller of which is kept what it sees, and its actions (worlds, ...), step by step."""
+
+    def __init__(self, controller: Controller):
+        self._controller, self.period = controller, controller.period
+        self.initial_carry = controller.initial_carry
+        self.observations: list[Any] = []
+        self.actions: list[Any] = []
+
+    def __call__(
+        self, carry: Any, observation: Any, goal: Any, key: Key[Array, "*worlds"] | None
+    ) -> tuple[Any, Any]:
+        """See `Controller`."""
+        carry, action = self._controller(carry, observation, goal, key)
+        self.observations.append(observation)
+        self.actions.append(action)
+        return carry, action
+
+
 def check_period(controller: Controller, control_period: float) -> None:
     """Raise `PalpateError` if the controller was made for another control period (s)."""
     period = controller.period
     if period is not None and not math.isclose(period, control_period, rel_tol=SAME_PERIOD):
         raise PalpateError(
             f"a controller that decides every {period:g} s does not fit a world with a control "
-            f"period of {control_period:g} s: train it with a model of that period"
+            f"period of {control_period:g} s: expected one that was trained through a model "
+            f"identified at {1 / control_period:g} Hz"
         )

@@ -16,10 +16,11 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from palpate.errors import PalpateError
+from palpate.networks import Controller
 from palpate.numerics import devices
-from palpate.runs import Run
+from palpate.runs import Figure, Run
 from palpate.runs.progress import interruptible, progress
-from palpate.trials.controller import Controller, check_period
+from palpate.trials.controller import check_period
 from palpate.worlds.world import DivergedError, World
 
 
@@ -34,6 +35,16 @@ class Record:
 
     observed: ClassVar[str]
     failures: dict[int, str]
+
+    def part(self, chosen: Sequence[int]) -> Any:
+        """The record of some of the trials, in this order; nothing is drawn of them."""
+        kept = {
+            name: array[:0] if name == self.observed else array[list(chosen)]
+            for name, array in self.arrays().items()
+        }
+        places = [place for place, trial in enumerate(chosen) if trial in self.failures]
+        failures = {place: self.failures[chosen[place]] for place in places}
+        return dataclasses.replace(self, **kept, failures=failures)  # type: ignore[type-var]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays by name."""
@@ -95,8 +106,21 @@ class Trial(ABC, Generic[RecordType]):
 
     @classmethod
     @abstractmethod
-    def score(cls, trials: Sequence[Any], record: RecordType) -> dict[str, float]:
-        """What is shown and logged while trials are run."""
+    def figures(cls, trials: Sequence[Any], record: RecordType, suffix: str = "") -> list[Figure]:
+        """What counts, in names that end in `suffix`; the first is shown while trials are run."""
+
+    @classmethod
+    def line(cls, name: str, trials: Sequence[Any], record: RecordType) -> str:
+        """How the controller `name` did, as a row of a table."""
+        values = [
+            f"{figure.name.replace('_', ' ')} {figure.value:.3g} {figure.unit}".rstrip()
+            for figure in cls.figures(trials, record)
+            if figure.value is not None
+        ]
+        return f"{name:28s} {', '.join(values)}"
+
+
+TrialType = TypeVar("TrialType", bound=Trial)
 
 
 def run_trials(
@@ -241,15 +265,37 @@ def evaluate_trials(
             failures = {chosen[place]: why for place, why in part.failures.items()}
             done[name].failures.update(failures)
             step += 1
-            score = kind.score(some, part)
-            bar.show(**score)
+            first, *_ = kind.figures(some, part)
+            if first.value is not None:
+                bar.show(**{first.name: first.value})
             if run is not None:
                 reasons = {str(trial): why for trial, why in failures.items()}
-                run.log(step, controller=name, **score, failures=reasons)
+                run.log(step, controller=name, failures=reasons, **{first.name: first.value})
                 run.save(step, _arrays(done))
             if stop:
                 break
     return done
+
+
+def by_group(
+    trials: Sequence[TrialType], record: RecordType
+) -> dict[str, tuple[list[TrialType], RecordType]]:
+    """The trials of each group, and their part of the record."""
+    return {
+        group: ([trials[index] for index in chosen], record.part(chosen))
+        for group, chosen in groups(trials).items()
+    }
+
+
+def table(trials: Sequence[Trial[RecordType]], evaluated: Mapping[str, RecordType]) -> list[str]:
+    """Lines for a person: every controller, over all trials and in each group."""
+    line, lines = type(trials[0]).line, []
+    for name, record in evaluated.items():
+        lines.append(line(name, trials, record))
+        if len(parts := by_group(trials, record)) > 1:
+            lines += [line(f"  {group}", *part) for group, part in parts.items()]
+        lines += [f"  trial {trial}: {why}" for trial, why in sorted(record.failures.items())]
+    return lines
 
 
 def _chunks(names: Mapping[str, Any], count: int, size: int) -> Iterator[tuple[str, list[int]]]:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.experiments.experiment import Experiment, mean_of, resumable, suffix
-from palpate.experiments.picture import band, canvas_of, curve, legend_of, save_picture
+from palpate.report.picture import band, canvas_of, curve, legend_of, save_picture
 from palpate.report.style import STYLES
 from palpate.runs import Figure, Result
 from palpate.runs.progress import progress

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.experiments.furniture.one_shot_regression import OURS, RIVALS
-from palpate.experiments.picture import canvas_of, curve, legend_of, save_picture
+from palpate.report.picture import canvas_of, curve, legend_of, save_picture
 from palpate.report.style import STYLES
 
 ACROSS = 3  # panels in a row

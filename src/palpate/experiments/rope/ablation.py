@@ -6,35 +6,23 @@ MuJoCo ropes. There is no bar: what a part is worth is what is to be found out.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from palpate.experiments.experiment import Experiment, suffix
-from palpate.experiments.picture import band, canvas_of, save_picture
-from palpate.experiments.rope.nominal import (
-    BASE,
-    FULL,
-    QUICK,
-    identified_rope,
-    identified_split,
-    trained_policy,
-)
+from palpate.experiments.rope import nominal
 from palpate.experiments.rope.stabilization import EVALUATION_SEEDS
+from palpate.report.picture import band, canvas_of, save_picture
 from palpate.report.style import STYLES
-from palpate.runs import Result
+from palpate.runs import Result, Run
 from palpate.tasks.rope import RopeStabilization
 from palpate.tasks.rope.stabilization import STABILISED
-from palpate.trials.rope.evaluation import (
-    evaluate,
-    evaluation_trials,
-    figures,
-    summarise,
-    table,
-    write_trial_evidence,
-)
+from palpate.trials.rope import stabilization
 from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.trials.rope.stabilization import Episodes, StabilizationTrial
+from palpate.trials.trial import table
 
 NAME = "rope-ablation"
 FIGURE = "ablation.png"
@@ -55,10 +43,10 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
     Raises `PalpateError` when `out` holds the stages of another run.
     """
-    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    experiment, size = Experiment(NAME, out, quick, seed), nominal.QUICK if quick else nominal.FULL
     ropes, count = ROPES["quick" if quick else "full"], 1 + len(LEFT_OUT)
     full = dataclasses.replace(size.training, iterations=size.training.iterations // BUDGET)
-    evaluating = round(count * size.minutes["evaluation"] / 3 * ropes / FULL.ropes) + 1
+    evaluating = round(count * size.minutes["evaluation"] / 3 * ropes / nominal.FULL.ropes) + 1
     training = round(count * size.minutes["training"] / BUDGET)
     minutes = size.part("recording", "identification")
     experiment.announce(minutes | {"training": training, "evaluation": evaluating})
@@ -67,28 +55,24 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         f"network of {full.depth} x {full.width}",
         flush=True,
     )
-    model = identified_rope(experiment, size)
+    model = nominal.identified_rope(experiment, size)
     controllers, abouts, task = {}, {}, RopeStabilization()
     for name, switch in {FULL_TRAINING: None, **LEFT_OUT}.items():
         without = dataclasses.replace(full, **({switch: False} if switch else {}))
         folder = f"train-{name.replace(' ', '-')}"
-        policy, abouts[name] = trained_policy(experiment, folder, task, model, without)
+        policy, abouts[name] = nominal.trained_policy(experiment, folder, task, model, without)
         controllers[name] = LearnedController(policy, task)
     first = experiment.uses(EVALUATION_SEEDS)
-    trials = evaluation_trials(BASE, ropes, first)
-    configuration = {"stage": "evaluate", "seed": seed, "trials": len(trials), "policies": abouts}
-    with experiment.stage("evaluate", configuration) as stage:
-        evaluated = evaluate(controllers, trials, stage.run)
-        if not stage.finished:
-            write_trial_evidence(stage.run, trials, evaluated, (FULL_TRAINING,))
-            draw(stage.path / FIGURE, trials, evaluated)
-        print(f"figure: {stage.path / FIGURE}")
+    trials = stabilization.evaluation_trials(nominal.BASE, ropes, first)
+    about = {"policies": abouts}
+    evaluated, _ = experiment.evaluated("evaluate", about, controllers, trials, show)
+    print(f"figure: {out / 'evaluate' / FIGURE}")
     print("\n".join(table(trials, evaluated)))
     return experiment.result(
         [
             row
             for name, episodes in evaluated.items()
-            for row in figures(summarise(trials, episodes), f".{suffix(name)}")
+            for row in StabilizationTrial.figures(trials, episodes, f".{suffix(name)}")
         ],
         {
             "training": dataclasses.asdict(full),
@@ -97,18 +81,19 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "training_seconds": {name: about["wall_time_s"] for name, about in abouts.items()},
         },
         {
-            "identified": identified_split(size, seed),
+            "identified": nominal.identified_split(size, seed),
             "evaluated": f"{ropes} sampled ropes, seed {first}",
         },
     )
 
 
-def draw(path: Path, trials: list[StabilizationTrial], evaluated: dict[str, Episodes]) -> None:
-    """A PNG: the energy with and without each part of the training, success rates and times.
+def show(run: Run, trials: Sequence[StabilizationTrial], evaluated: dict[str, Episodes]) -> None:
+    """Leave evidence, and a PNG: energies with and without each part of the training, and rates.
 
     Energies are medians over all trials with the band in which nine in ten lie, on a log scale.
     """
-    period = trials[0].configuration.control_period
+    stabilization.write_trial_evidence(run, trials, evaluated, (FULL_TRAINING,))
+    period = trials[0].control_period
     names = [name for name in evaluated if name != FULL_TRAINING]
     canvas = canvas_of(11, 7)
     grid = canvas.add_gridspec(2, len(names), height_ratios=(1.3, 1))
@@ -127,7 +112,7 @@ def draw(path: Path, trials: list[StabilizationTrial], evaluated: dict[str, Epis
             axis.set_ylabel("energy, share of the start's")
         else:
             axis.tick_params(labelleft=False)
-    summaries = {name: summarise(trials, episodes) for name, episodes in evaluated.items()}
+    summaries = {name: stabilization.summarise(trials, each) for name, each in evaluated.items()}
     half = len(names) // 2
     rates, times = canvas.add_subplot(grid[1, :half]), canvas.add_subplot(grid[1, half:])
     for place, (name, summary) in enumerate(summaries.items()):
@@ -145,4 +130,4 @@ def draw(path: Path, trials: list[StabilizationTrial], evaluated: dict[str, Epis
         axis.set_yticks(range(len(summaries)), list(summaries))
         axis.invert_yaxis()
     times.tick_params(labelleft=False)
-    save_picture(path, canvas)
+    save_picture(run.path / FIGURE, canvas)

@@ -11,22 +11,13 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from palpate.experiments.experiment import Experiment, ratio, resumable
-from palpate.experiments.rope.nominal import (
-    BASE,
-    FULL,
-    QUICK,
-    SHIPPED_SPLIT,
-    identified_rope,
-    identified_split,
-    shipped_policy,
-)
+from palpate.experiments.rope import nominal
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
@@ -36,10 +27,9 @@ from palpate.runs import Figure, Result, Run
 from palpate.tasks.rope import RopeStabilization
 from palpate.tasks.rope.stabilization import STABILISED, STAY
 from palpate.tasks.task import Start
-from palpate.trials.controller import Controller, OpenLoop
-from palpate.trials.rope.evaluation import TRIAL_PERIODS
+from palpate.trials.controller import Noted, OpenLoop
 from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.trials import StabilizationTrial, settling_time
+from palpate.trials.rope.stabilization import StabilizationTrial, lasting, settling_time
 from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import START_POSES, RopeWorld
 
@@ -80,35 +70,20 @@ _ALLOWED = STABILISED * np.array([restart.aim for restart in RESTARTS])
 REPLAYED = (0, 1, 3, 7)
 
 
-class Noted:
-    """A controller whose commands are kept, (worlds, 3) of each step."""
-
-    def __init__(self, controller: Controller):
-        self._controller, self.period = controller, controller.period
-        self.initial_carry = controller.initial_carry
-        self.commands: list[np.ndarray] = []
-
-    def __call__(self, carry: Any, observation: Any, goal: Any, key: Any) -> tuple[Any, np.ndarray]:
-        """See `Controller`."""
-        carry, command = self._controller(carry, observation, goal, key)
-        self.commands.append(command)
-        return carry, command
-
-
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     """Identify, search and replay below `out`; `quick` is the same work at a smaller size.
 
     Raises `PalpateError` when `out` holds the stages of another run, without the package `cma`, or
     when this installation has no shipped weights.
     """
-    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    experiment, size = Experiment(NAME, out, quick, seed), nominal.QUICK if quick else nominal.FULL
     minutes = size.part("recording", "identification")
     experiment.announce(minutes | {"search": 2 if quick else 4})
     cma_package()  # before minutes of work that would be in vain
-    policy, about = shipped_policy()
-    model = identified_rope(experiment, size)
+    policy, about = nominal.shipped_policy()
+    model = nominal.identified_rope(experiment, size)
     first = experiment.uses(SEEDS)
-    trials = [StabilizationTrial(BASE, start, first) for start in START_POSES]
+    trials = lasting([StabilizationTrial(nominal.BASE, start, first) for start in START_POSES])
     rollouts = ROLLOUTS // 20 if quick else ROLLOUTS
     configuration = {"stage": "search", "seed": seed, "policy": about, "rollouts": rollouts}
     with experiment.stage("search", configuration) as stage:
@@ -130,8 +105,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "at_rest_within_s": SEARCHED,
         },
         {
-            "identified": identified_split(size, seed),
-            "policy trained": SHIPPED_SPLIT,
+            "identified": nominal.identified_split(size, seed),
+            "policy trained": nominal.SHIPPED_SPLIT,
             "start states": f"nominal rope, four poses, seed {first}: used by nothing else",
         },
     )
@@ -161,7 +136,7 @@ def bounded(
         limit=task.action_limit,
         rate_limit=task.action_rate_limit,
     )
-    count, length = len(trials), math.ceil(TRIAL_PERIODS * trials[0].period / period)
+    count, length = len(trials), trials[0].steps or 0
     replays = count, len(RESTARTS), len(REPLAYED), sequence.steps + 1
     done = {
         "commands": np.zeros((count, length, 3), np.float32),
@@ -175,8 +150,8 @@ def bounded(
     for place, note in resumable(run, range(count), done, "searching"):
         if place == 0:
             noted = Noted(LearnedController(policy, task))
-            own = run_trials(trials, noted, length)
-            done["commands"][:] = np.stack(noted.commands, axis=1)
+            own = run_trials(trials, noted)
+            done["commands"][:] = np.stack(noted.actions, axis=1)
             done["energy"][:], done["speed"][:] = own.energy, own.gripper_speed
         trial = trials[place]
         reference = np.zeros((len(RESTARTS), length, 3), np.float32)
@@ -281,7 +256,7 @@ class Outcome:
     @classmethod
     def of(cls, done: dict[str, np.ndarray]) -> "Outcome":
         """What came of a search that is done: see `bounded`."""
-        period, shape = BASE.control_period, done["replayed_energy"].shape
+        period, shape = nominal.BASE.control_period, done["replayed_energy"].shape
         energy, speed = (
             done[name].reshape(-1, shape[-1]) for name in ("replayed_energy", "replayed_speed")
         )
@@ -370,7 +345,7 @@ def _evidence(done: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     fastest = energy.reshape(count, -1, length)[np.arange(count), times.argmin(axis=1)]
     own = done["energy"][:, :length]
     return {
-        "energy.time": np.arange(length) * BASE.control_period,
+        "energy.time": np.arange(length) * nominal.BASE.control_period,
         "energy.controlled": own / own[:, :1],
         "energy.best open loop": fastest / fastest[:, :1],
     }

@@ -13,38 +13,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from palpate.experiments.experiment import Experiment, ratio, share_of
-from palpate.experiments.rope.nominal import (
-    BASE,
-    FULL,
-    QUICK,
-    SHIPPED_SPLIT,
-    identified_rope,
-    identified_split,
-    shipped_policy,
-)
+from palpate.experiments.rope import nominal
+from palpate.experiments.rope.nominal import BASE
 from palpate.families.rope.recording import constants
-from palpate.models.rope import Rope, RopeState
-from palpate.networks import CommandPolicy
-from palpate.perception.rope.marker_observer import MarkerObserver
+from palpate.networks import Controller
 from palpate.runs import Figure, Result
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.evaluation import (
+from palpate.trials.rope.learned import LearnedController, ObservedController
+from palpate.trials.rope.stabilization import (
     TRIAL_PERIODS,
+    Episodes,
+    StabilizationTrial,
     Summary,
-    evaluate,
     evaluation_trials,
-    figures,
+    lasting,
     summarise,
     write_trial_evidence,
 )
-from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.trials import Episodes, StabilizationTrial
-from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration, RopeObservation
+from palpate.trials.trial import groups
+from palpate.worlds.rope.rope import Disturbance, RopeConfiguration
 
 NAME = "rope-generalization"
 SUCCESS_BAR, TIME_BAR = 0.95, 1.3
@@ -85,70 +75,27 @@ PLAIN_ROPES = 3  # of them, with the policy as it is used otherwise
 CONTROLLED, PLAIN = "controlled", "as shipped"
 
 
-class ObservedController(LearnedController):
-    """A policy for ropes of any length, seen late and seldom, all of them at the same instants.
-
-    How long a rope is, is measured in the first observation. `model` is driven by velocity at node
-    0: the rope that the policy was made for. `noise`: of the markers, m.
-    """
-
-    def __init__(
-        self, policy: CommandPolicy, task: RopeStabilization, model: Rope, noise: float
-    ) -> None:
-        super().__init__(policy, task)
-        self._model, self._noise = model, noise
-
-        @eqx.filter_jit
-        def decide(policy, carry, state, size):
-            length, velocity = size[:, None, None], jnp.sqrt(size)[:, None, None]
-            alike = RopeState(state.position / length, state.velocity / velocity)
-            return policy.similar(carry, task.features(alike, None), size)
-
-        self._decide_alike = decide
-
-    def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
-        """See `FeedbackController.start`."""
-        positions = jnp.asarray(self.observer.positions(observation))
-        length = jnp.sum(jnp.linalg.norm(jnp.diff(positions, axis=1), axis=-1), axis=1)
-        size = length / jnp.sum(self._model.rest_length)
-        rest_length = self._model.rest_length * size[:, None]
-        models = eqx.tree_at(lambda rope: rope.rest_length, self._model, rest_length).constrain()
-        memory = self.policy.initial_carry(jnp.asarray(command, jnp.float32)[:, None])
-        return MarkerObserver(models, self._noise), size, None, memory
-
-    def decide(
-        self, carry: Any, observation: RopeObservation, goal: None
-    ) -> tuple[Any, np.ndarray]:
-        """See `FeedbackController.decide`."""
-        observer, size, command, memory = carry
-        positions = jnp.asarray(self.observer.positions(observation))
-        if command is None:
-            state = observer.begin(positions, observation.time)
-        else:
-            state = observer.step(command, positions, observation.time)
-        memory, command = self._decide_alike(self.policy, memory, state, size)
-        return (observer, size, command, memory), np.asarray(command)[:, 0]
-
-
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     """Identify the nominal rope below `out` and try every row; `quick` is the same, smaller.
 
     Raises `PalpateError` when `out` holds another run's stages, or when this installation has no
     shipped policy.
     """
-    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
+    experiment, size = Experiment(NAME, out, quick, seed), nominal.QUICK if quick else nominal.FULL
     minutes = {"identification": 1, "rows": 2} if quick else {"identification": 2, "rows": 20}
     experiment.announce({"recording": 1} | minutes)
-    policy, about = shipped_policy()
-    model = identified_rope(experiment, size)
+    policy, about = nominal.shipped_policy()
+    model, task = nominal.identified_rope(experiment, size), RopeStabilization()
     ropes, first = ROPES["quick" if quick else "full"], experiment.uses(SEEDS)
     summaries, plain = {}, {}
     for name, row in ROWS.items():
         trials = _trials(row, ropes, first)
-        summaries[name], plain[name] = _evaluated(
-            experiment, name, row, trials, (policy, about), model
-        )
+        some = lasting([trials[i] for pose in groups(trials).values() for i in pose[:PLAIN_ROPES]])
+        observed = ObservedController(policy, task, model, row.base.observation_noise)
+        used = experiment, name, row, about
+        summaries[name] = _evaluated(*used, {CONTROLLED: observed}, trials)
         print(summaries[name].line(name), flush=True)
+        plain[name] = _evaluated(*used, {PLAIN: LearnedController(policy, task)}, some)
         print(plain[name].line(f"  {PLAIN}"), flush=True)
     return experiment.result(
         _figures(summaries, plain),
@@ -162,8 +109,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "trial_periods": TRIAL_PERIODS,
         },
         {
-            "identified": identified_split(size, seed),
-            "trained": SHIPPED_SPLIT,
+            "identified": nominal.identified_split(size, seed),
+            "trained": nominal.SHIPPED_SPLIT,
             "evaluated": f"{ropes} ropes drawn around each row's from each start pose, "
             f"seed {first}",
         },
@@ -198,48 +145,22 @@ def _evaluated(
     experiment: Experiment,
     name: str,
     row: Row,
+    about: dict[str, Any],
+    controllers: dict[str, Controller],
     trials: list[StabilizationTrial],
-    shipped: tuple[CommandPolicy, dict[str, Any]],
-    model: Rope,
-) -> tuple[Summary, Summary]:
-    """The row's trials, and a part of them with the policy as it is used otherwise."""
-    (policy, about), task = shipped, RopeStabilization()
-    poses = [[trial for trial in trials if trial.start == start] for start in START_POSES]
-    some = [trial for of_pose in poses for trial in of_pose[:PLAIN_ROPES]]
-    observed = ObservedController(policy, task, model, row.base.observation_noise)
-    summaries = []
-    for who, controller, chosen in (
-        (CONTROLLED, observed, trials),
-        (PLAIN, LearnedController(policy, task), some),
-    ):
-        configuration = {
-            "stage": name,
-            "controller": who,
-            "row": _changed(row),
-            "world": constants(row.base),
-            "trials": len(chosen),
-            "seed": experiment.seed,
-            "policy": about,
-        }
-        folder = f"{name}/{who}".replace(" ", "-")
-        with experiment.stage(folder, configuration) as stage:
-            episodes = evaluate({who: controller}, chosen, stage.run)[who]
-            if not stage.finished:
-                write_trial_evidence(stage.run, chosen, {who: episodes}, (who,))
-        summaries.append(summarise(chosen, _after_push(row, episodes)))
-    return summaries[0], summaries[1]
+) -> Summary:
+    """How a controller does in trials of the row."""
+    (who,) = controllers
+    folder = f"{name}/{who}".replace(" ", "-")
+    world = {"row": _changed(row), "world": constants(row.base), "policy": about}
+    evaluated, _ = experiment.evaluated(folder, world, controllers, trials, write_trial_evidence)
+    return summarise(trials, _after_push(row, evaluated[who]))
 
 
 def _after_push(row: Row, episodes: Episodes) -> Episodes:
     """From the end of the push on: its 1 % is of the energy that the rope has then."""
-    if row.pushed is None:
-        return episodes
-    start = round((row.pushed + PUSH_DURATION) / row.base.control_period)
-    return dataclasses.replace(
-        episodes,
-        energy=episodes.energy[:, start:],
-        gripper_speed=episodes.gripper_speed[:, start:],
-    )
+    pushed = 0.0 if row.pushed is None else row.pushed + PUSH_DURATION
+    return episodes.after(round(pushed / row.base.control_period))
 
 
 def _figures(summaries: dict[str, Summary], plain: dict[str, Summary]) -> list[Figure]:
@@ -258,9 +179,9 @@ def _figures(summaries: dict[str, Summary], plain: dict[str, Summary]) -> list[F
     ]  # fmt: skip
     for (name, summary), slower in zip(summaries.items(), ratios, strict=True):
         end = name.replace(" ", "_")  # Hz stays Hz
-        rows += figures(summary, f".{end}")
+        rows += summary.figures(f".{end}")
         rows.append(Figure(f"time_ratio.{end}", slower, ""))
-        rows += figures(plain[name], f".{end}.as_shipped")[:2]
+        rows += plain[name].figures(f".{end}.as_shipped")[:2]
     return rows
 
 

@@ -16,15 +16,8 @@ from typing import Any
 import numpy as np
 
 from palpate.experiments.experiment import Experiment, resumable, share_of, suffix
-from palpate.experiments.rope.nominal import (
-    BASE,
-    FULL,
-    QUICK,
-    SHIPPED_SPLIT,
-    identified_rope,
-    identified_split,
-    shipped_policy,
-)
+from palpate.experiments.rope import nominal
+from palpate.experiments.rope.nominal import BASE
 from palpate.families.rope.recording import constants
 from palpate.models.rope import Rope
 from palpate.networks import CommandPolicy
@@ -34,10 +27,15 @@ from palpate.runs import Figure, Result, Run
 from palpate.runs.result import two_standard_errors
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.controller import HeldStill
-from palpate.trials.rope.evaluation import TRIAL_PERIODS, evaluation_trials, summarise
 from palpate.trials.rope.filming import Filming, film, frame_times
 from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.trials import Episodes, StabilizationTrial
+from palpate.trials.rope.stabilization import (
+    TRIAL_PERIODS,
+    Episodes,
+    StabilizationTrial,
+    evaluation_trials,
+    summarise,
+)
 from palpate.trials.trial import run_trials
 from palpate.worlds.camera import Sensor
 from palpate.worlds.rope.filmed import TRIPOD, Background
@@ -82,12 +80,12 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     `quick` is the same work at a smaller size. Every row is a run below `out` and resumes there.
     Raises `PalpateError` when this installation has no shipped policy.
     """
-    experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
-    policy, about = shipped_policy()
+    experiment, size = Experiment(NAME, out, quick, seed), nominal.QUICK if quick else nominal.FULL
+    policy, about = nominal.shipped_policy()
     counts = TRIALS["quick" if quick else "full"]
     filming = {"swinging": 1, "stabilising": 1} if quick else {"swinging": 8, "stabilising": 12}
     experiment.announce({"identification": 1 if quick else 4} | filming)
-    model, first = identified_rope(experiment, size), experiment.uses(SEEDS)
+    model, first = nominal.identified_rope(experiment, size), experiment.uses(SEEDS)
     filmed: dict[str, dict[str, np.ndarray]] = {}
     for name, row in ROWS.items():
         trials = _trials(row, counts, first)
@@ -109,8 +107,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     marked = LearnedController(policy, RopeStabilization())
     with experiment.counted():
         rivals = {
-            "markers": run_trials(controlled, marked, _steps(controlled)),
-            "held still": run_trials(controlled, HeldStill(), _steps(controlled)),
+            "markers": run_trials(controlled, marked),
+            "held still": run_trials(controlled, HeldStill()),
         }
     return experiment.result(
         _figures(filmed, rivals, counts, first, frame_times(model)),
@@ -125,8 +123,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "trial_periods": TRIAL_PERIODS,
         },
         {
-            "identified": f"{identified_split(size, seed)}, with markers",
-            "trained": SHIPPED_SPLIT,
+            "identified": f"{nominal.identified_split(size, seed)}, with markers",
+            "trained": nominal.SHIPPED_SPLIT,
             "filmed": f"the nominal rope, seeds from {first}; for stabilising {counts['ropes']} "
             f"sampled ropes, {counts['ropes_without_depth']} without depth, seed {first}",
         },
@@ -140,15 +138,12 @@ def _trials(row: Row, counts: dict[str, int], seed: int) -> list[StabilizationTr
         ropes = counts["ropes" if row.depth else "ropes_without_depth"]
         return evaluation_trials(BASE, ropes, seed)[: poses * ropes]
     starts = ("hanging",) * poses if row.shaken else START_POSES[:poses]
+    steps = round(SWINGING / BASE.control_period)
     return [
-        StabilizationTrial(BASE, start, seed + 100 * repeat + place)
+        StabilizationTrial(BASE, start, seed + 100 * repeat + place, steps)
         for repeat in range(counts["swinging"])
         for place, start in enumerate(starts)
     ]
-
-
-def _steps(trials: list[StabilizationTrial]) -> int:
-    return math.ceil(TRIAL_PERIODS * max(trial.period for trial in trials) / BASE.control_period)
 
 
 def _filmed(
@@ -160,12 +155,11 @@ def _filmed(
     policy: CommandPolicy,
 ) -> dict[str, np.ndarray]:
     """What happened in the trials of a row: arrays as in `Filming`, (trials, ...)."""
-    steps = _steps(trials) if row.controlled else round(SWINGING / BASE.control_period)
-    arrays = Filming.empty(len(trials), steps, model.nodes)
+    arrays = Filming.empty(len(trials), trials[0].steps or 0, model.nodes)
     cores = devices.cores()
     work = [range(first, min(first + cores, len(trials))) for first in range(0, len(trials), cores)]
     one = functools.partial(
-        film, model=model, policy=policy if row.controlled else None, steps=steps,
+        film, model=model, policy=policy if row.controlled else None,
         background=row.background, sensor=Sensor(has_depth=row.depth), shaken=row.shaken,
     )  # fmt: skip
     with ThreadPoolExecutor(cores) as threads:
@@ -250,12 +244,7 @@ def _finite(value: float) -> float | None:
 
 
 def _episodes(arrays: dict[str, np.ndarray]) -> Episodes:
-    trials, times = arrays["energy"].shape
-    return dataclasses.replace(
-        Episodes.empty(trials, times, 0, 2),
-        energy=arrays["energy"],
-        gripper_speed=arrays["gripper_speed"],
-    )
+    return Episodes(arrays["energy"], arrays["gripper_speed"], np.empty((0,)), {})
 
 
 def _evidence(arrays: dict[str, np.ndarray]) -> dict[str, Any]:

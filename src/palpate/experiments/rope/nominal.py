@@ -5,6 +5,8 @@ is taken.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -140,6 +142,32 @@ def trained_policy(
             command = experiment.command
             trained(task, model, training, experiment.seed, stage.run, command=command)
         return load_policy(stage.path / POLICY)
+
+
+def sizes_within(
+    experiment: Experiment,
+    budget: float,
+    methods: Mapping[str, Callable[..., tuple[int, float]]],
+    decision: Callable[[str, int], Callable[[], Any]],
+) -> dict[str, int]:
+    """How many samples or iterations each planner has within the budget (s) on this machine.
+
+    From a stage; 0 where not even the least fits. `decision(method, size)` gives a function that
+    takes one, and each of the `methods` finds the size, as `samples_within` does.
+    """
+    configuration = {"stage": "planners", "seed": experiment.seed, "budget_s": budget}
+
+    def found() -> dict[str, Any]:
+        sizes = {}
+        for method, within in methods.items():
+            try:
+                sizes[method], _ = within(budget, functools.partial(decision, method))
+            except PalpateError as error:
+                print(f"{method} has no place within {budget:g} s: {error}", flush=True)
+                sizes[method] = 0
+        return {"sizes": sizes}
+
+    return experiment.found("planners", configuration, found)["sizes"]
 
 
 def shipped_policy() -> tuple[CommandPolicy, dict[str, Any]]:

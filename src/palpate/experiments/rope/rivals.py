@@ -16,21 +16,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.errors import PalpateError
+import jax.numpy as jnp
+
 from palpate.experiments.experiment import Experiment, decision_figures, suffix
+from palpate.experiments.rope import nominal
 from palpate.experiments.rope.model import undamped
-from palpate.experiments.rope.nominal import (
-    BASE,
-    FULL,
-    QUICK,
-    Size,
-    fitted_rope,
-    identified_rope,
-    identified_split,
-    recorded_markers,
-    shipped_policy,
-    trained_policy,
-)
+from palpate.experiments.rope.nominal import Size
 from palpate.families.rope.recording import constants
 from palpate.identification.gradient.descent import Settings
 from palpate.learning import Training
@@ -38,30 +29,23 @@ from palpate.models.rope import Rope
 from palpate.planning.gradient import iterations_within
 from palpate.planning.sampling import samples_within
 from palpate.runs import Figure, Result
-from palpate.runs.run import RESULT
-from palpate.runs.storage import read_json, write_json
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.controller import Controller, HeldStill
-from palpate.trials.rope.baselines import TUNED, SwingDamper
-from palpate.trials.rope.evaluation import (
-    evaluate,
-    evaluation_trials,
-    figures,
-    part_of,
-    summarise,
-    table,
-    write_trial_evidence,
-)
+from palpate.trials.rope.baselines import TUNED, baselines
 from palpate.trials.rope.learned import LearnedController
 from palpate.trials.rope.planners import (
     TUNING,
     PlannedStabiliser,
     decision_about,
-    decision_times,
     stabilising_planner,
 )
-from palpate.trials.rope.trials import Episodes, StabilizationTrial
-from palpate.trials.trial import first_of_each_group
+from palpate.trials.rope.stabilization import (
+    Episodes,
+    StabilizationTrial,
+    evaluation_trials,
+    lasting,
+    write_trial_evidence,
+)
+from palpate.trials.trial import first_of_each_group, table
 
 NAME = "rope-rivals"
 BUDGET = 0.01  # s, a decision of a planner in a hurry
@@ -70,13 +54,13 @@ SHIPPED, UNDAMPED, SAC = "policy", "undamped policy", "SAC"
 METHODS = {"mppi": samples_within, "cem": samples_within, "gradient": iterations_within}
 UNHURRIED = {"mppi": 2048, "cem": 2048, "gradient": 5}  # samples; iterations
 SIZE = dataclasses.replace(
-    FULL,
+    nominal.FULL,
     ropes=2,
     minutes={"recording": 1, "identification": 5, "training": 9, "SAC": 10, "evaluation": 10},
 )
 SMALL = dataclasses.replace(
-    QUICK,
-    training=dataclasses.replace(QUICK.training, iterations=60, batch=64, starts=1600),
+    nominal.QUICK,
+    training=dataclasses.replace(nominal.QUICK.training, iterations=60, batch=64, starts=1600),
     ropes=1,
     minutes={"recording and identification": 1, "training": 1, "SAC": 1, "evaluation": 2},
 )
@@ -98,19 +82,25 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     experiment.announce(size.part(*stages))
     if not installed:
         print(f"{SAC}: {NOT_RUN}", flush=True)
-    policy, about = shipped_policy()
-    model, task = identified_rope(experiment, size), RopeStabilization()
+    policy, about = nominal.shipped_policy()
+    model, task = nominal.identified_rope(experiment, size), RopeStabilization()
     lively = _identified_undamped(experiment, model, size)
-    rival, rival_about = trained_policy(experiment, "train-undamped", task, lively, size.training)
-    sizes = _sizes_within(experiment, model)
+    rival, rival_about = nominal.trained_policy(
+        experiment, "train-undamped", task, lively, size.training
+    )
+    sizes = nominal.sizes_within(
+        experiment, BUDGET, METHODS,
+        lambda method, size: decision_about(stabilising_planner(method, model, size), jnp.ones(())),
+    )  # fmt: skip
     hurried = _planned(model, sizes, "10 ms", seed)
     more = {method: -(-most // (LESS if quick else 1)) for method, most in UNHURRIED.items()}
     unhurried = _planned(model, more, "unhurried", seed)
     first = experiment.uses(EVALUATION_SEEDS)
-    trials = evaluation_trials(BASE, size.ropes, first)
-    trials = [trials[index] for index in first_of_each_group(trials)[:POSES]] if quick else trials
+    trials = evaluation_trials(nominal.BASE, size.ropes, first)
+    if quick:
+        trials = lasting([trials[index] for index in first_of_each_group(trials)[:POSES]])
     chosen = first_of_each_group(trials)[: SLOW_POSES if quick else None]
-    some = [trials[index] for index in chosen]
+    some = lasting([trials[index] for index in chosen])
     settings = {
         "quick": quick,
         "policies": {SHIPPED: about, UNDAMPED: rival_about},
@@ -118,40 +108,41 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         "within_10_ms": sizes,
         "unhurried": more,
         "swing_damper": dataclasses.asdict(TUNED),
-        "world": constants(BASE),
+        "world": constants(nominal.BASE),
         "ropes": size.ropes,
     }
     others = {
         SHIPPED: LearnedController(policy, task),
         UNDAMPED: LearnedController(rival, task),
-        "swing damper": SwingDamper(BASE),
-        "held still": HeldStill(),
+        **baselines(nominal.BASE),
     }
-    work = settings | {"seed": seed, "trials": len(trials)}
-    whole, times = _evaluated(experiment, "evaluate", work, others | hurried, trials)
-    slow, slow_times = _evaluated(experiment, "evaluate-unhurried", work, unhurried, some)
+    show = write_trial_evidence
+    whole, times = experiment.evaluated("evaluate", settings, others | hurried, trials, show)
+    slow, more_times = experiment.evaluated("evaluate-unhurried", settings, unhurried, some, show)
     free, free_about = {}, None
     if installed:
         rounds = FEW_ROUNDS if quick else ROUNDS
         free[SAC], free_about = _model_free(experiment, model, size, rounds, trials)
-    unknown = [] if installed else [f"{SAC:28s} {NOT_RUN}"]
-    print("\n".join([*table(trials, whole | free), *unknown, *table(some, slow)]))
-    same = {name: part_of(whole[name], chosen) for name in (SHIPPED, *hurried)}
+    lines, unmeasured = table(trials, whole | free), []
+    if not installed:
+        lines.append(f"{SAC:28s} {NOT_RUN}")
+        unmeasured.append(Figure(f"success_rate.{suffix(SAC)}", None, "", better="higher"))
+    print("\n".join([*lines, *table(some, slow)]))
+    same = {f"{name} same trials": whole[name].part(chosen) for name in (SHIPPED, *hurried)}
     return experiment.result(
         [
-            *(row for name in whole for row in _rows(trials, whole[name], name)),
-            *(row for name in slow for row in _rows(some, slow[name], name)),
-            *(row for name in same for row in _rows(some, same[name], f"{name} same trials")),
-            *decision_figures(times | slow_times),
-            *_model_free_rows(trials, free.get(SAC)),
+            *_rows(trials, whole | free),
+            *_rows(some, slow | same),
+            *unmeasured,
+            *decision_figures(times | more_times),
             *_effort(size.training, rival_about, free_about),
         ],
         settings | {SAC: free_about or NOT_RUN},
         {
-            "identified": identified_split(size, seed),
+            "identified": nominal.identified_split(size, seed),
             "trained": f"{UNDAMPED}: through the undamped model of the same recording alone",
             f"{SAC} trained": "in the damped model alone, drawn as in our own training",
-            "planners tuned": "ropes of seed 7100, see `rope_planners`",
+            "planners tuned": "ropes of seed 7100, see `palpate.trials.rope.planners`",
             "evaluated": (
                 f"{len(trials)} trials of {size.ropes} sampled ropes, seed {first}; "
                 "planners unhurried in the first of each pose"
@@ -173,34 +164,10 @@ def _identified_undamped(experiment: Experiment, model: Rope, size: Size) -> Rop
     settings = Settings(iterations=size.identification, seed=experiment.seed)
     configuration = {"stage": "identify undamped", **dataclasses.asdict(settings)}
     start = dataclasses.replace(undamped(model), drive="position").constrain()
-    seen = recorded_markers(experiment.out)
-    return fitted_rope(experiment, "identify-undamped", configuration, start, seen, settings)
-
-
-def _sizes_within(experiment: Experiment, model: Rope) -> dict[str, int]:
-    """How many samples or iterations each planner has within the budget on this machine.
-
-    Zero where not even the least fits.
-    """
-    configuration = {"stage": "planners", "seed": experiment.seed, "budget_s": BUDGET}
-    with experiment.stage("planners", configuration) as stage:
-        file = stage.path / "sizes.json"
-        if not stage.finished:
-            sizes = {}
-            for method, within in METHODS.items():
-                try:
-                    sizes[method], _ = within(
-                        BUDGET,
-                        lambda count, method=method: decision_about(
-                            stabilising_planner(method, model, count)
-                        ),
-                    )
-                except PalpateError as error:
-                    print(f"{method} has no place within {BUDGET:g} s: {error}", flush=True)
-                    sizes[method] = 0
-            write_json(file, sizes)
-            stage.content = {"sizes": sizes}
-        return read_json(file)
+    seen = nominal.recorded_markers(experiment.out)
+    return nominal.fitted_rope(
+        experiment, "identify-undamped", configuration, start, seen, settings
+    )
 
 
 def _model_free(
@@ -218,18 +185,11 @@ def _model_free(
         experiment.out / "train-sac", model, size.training, Sac(rounds), seed
     )
     experiment.seconds += about["wall_time_s"]
-    work = {"stage": "evaluate SAC", "seed": seed, "trials": len(trials), "policy": about}
     controllers = {SAC: LearnedController(actor, RopeStabilization())}
-    evaluated, _ = _evaluated(experiment, "evaluate-sac", work, controllers, trials)
+    evaluated, _ = experiment.evaluated(
+        "evaluate-sac", {"policy": about}, controllers, trials, write_trial_evidence
+    )
     return evaluated[SAC], about
-
-
-def _model_free_rows(
-    trials: Sequence[StabilizationTrial], episodes: Episodes | None
-) -> list[Figure]:
-    if episodes is None:  # not run
-        return [Figure(f"success_rate.{suffix(SAC)}", None, "", better="higher")]
-    return _rows(trials, episodes, SAC)
 
 
 def _effort(
@@ -237,7 +197,7 @@ def _effort(
 ) -> list[Figure]:
     """Control periods simulated to train, and the seconds that took: our method's and SAC's."""
     task = RopeStabilization()
-    steps = task.duration / BASE.control_period * sum(task.stages) / len(task.stages)
+    steps = task.duration / nominal.BASE.control_period * sum(task.stages) / len(task.stages)
     effort = {UNDAMPED: (training.iterations * training.batch * round(steps), own["wall_time_s"])}
     if free is not None:
         effort[SAC] = free["environment_steps"], free["wall_time_s"]
@@ -259,23 +219,9 @@ def _planned(
     }
 
 
-def _evaluated(
-    experiment: Experiment,
-    folder: str,
-    configuration: dict[str, Any],
-    controllers: Mapping[str, Controller],
-    trials: Sequence[StabilizationTrial],
-) -> tuple[dict[str, Episodes], dict[str, list[float]]]:
-    """What each controller does in a stage, and how long planners take to decide, ms."""
-    configuration = configuration | {"controllers": list(controllers)}
-    with experiment.stage(folder, configuration) as stage:
-        evaluated = evaluate(controllers, trials, stage.run)
-        if not stage.finished:
-            write_trial_evidence(stage.run, trials, evaluated, tuple(controllers))
-            planned = {n: c for n, c in controllers.items() if isinstance(c, PlannedStabiliser)}
-            stage.content = {"decision_ms": decision_times(planned)}
-    return evaluated, read_json(stage.path / RESULT)["decision_ms"]
-
-
-def _rows(trials: Sequence[StabilizationTrial], episodes: Episodes, name: str) -> list[Figure]:
-    return figures(summarise(trials, episodes), f".{suffix(name)}")
+def _rows(trials: Sequence[StabilizationTrial], evaluated: Mapping[str, Episodes]) -> list[Figure]:
+    return [
+        row
+        for name, episodes in evaluated.items()
+        for row in StabilizationTrial.figures(trials, episodes, f".{suffix(name)}")
+    ]

@@ -4,7 +4,6 @@ Walls are solid, objects numbered by the order in which they are moved; where an
 dashed, where it is left is filled. Ways are told apart by line as well as by colour.
 """
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,14 +26,13 @@ from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.maps.regions import regions_of
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan
-from palpate.runs.storage import write_bytes
+from palpate.report.picture import check_suffix, save_animation, save_picture
 
 _INK, _QUIET, _WALL = "#1c2127", "#5b6570", "#3d4650"
 _OBJECT, _MOVED, _ROBOT, _CARRY = "#f3d9a0", "#e8a33d", "#0062a8", "#c04d00"
 _TINTS = ("#e4eef7", "#e6f3ec", "#f6ebf3", "#fbf3df", "#ececf6", "#f0f0ea")
 _WIDE = 7.0  # inches of the longer side
 _GHOSTS = 6  # poses of an object that are shown on its way
-_SUFFIXES = (".png", ".svg")
 _STAR: Any = {
     "marker": "*", "ms": 11, "color": _ROBOT, "mec": _INK, "mew": 0.6, "ls": "", "zorder": 9
 }  # fmt: skip
@@ -58,8 +56,7 @@ def plan_picture(
     Raises `PalpateError` for another suffix.
     """
     out = Path(out)
-    if out.suffix not in _SUFFIXES:
-        raise PalpateError(f"{out} has the suffix '{out.suffix}': expected .png or .svg")
+    check_suffix(out)
     with matplotlib.rc_context(_SETTINGS):
         figure, axes = _scene(world)
         _draw_regions(axes, world)
@@ -86,7 +83,7 @@ def plan_picture(
         if goal is not None:
             axes.plot(*goal[:2], label="goal", **_STAR)
         _legend(figure, axes)
-        _write(figure, out)
+        save_picture(out, figure, "figure")
     return out
 
 
@@ -149,12 +146,7 @@ def scene_animation(
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
             colours = 64, Image.Quantize.FASTOCTREE
             pictures.append(picture.quantize(*colours, dither=Image.Dither.NONE))
-    buffer = io.BytesIO()
-    milliseconds = [round(1000 * period)] * (len(pictures) - 1) + [1500]
-    pictures[0].save(
-        buffer, "GIF", save_all=True, append_images=pictures[1:], duration=milliseconds, loop=0
-    )
-    write_bytes(out, buffer.getvalue())
+    save_animation(out, pictures, [round(1000 * period)] * (len(pictures) - 1) + [1500])
     return out
 
 
@@ -291,10 +283,3 @@ def _legend(figure: Figure, axes: Axes) -> None:
         handles.setdefault(label, handle)
     look: Any = {"loc": "outside upper center", "frameon": False, "handlelength": 2.6}
     figure.legend(list(handles.values()), list(handles), ncols=len(handles), **look)
-
-
-def _write(figure: Figure, out: Path) -> None:
-    buffer = io.BytesIO()
-    stamp = {"Date": None} if out.suffix == ".svg" else {"Software": None}
-    figure.savefig(buffer, format=out.suffix[1:], metadata=stamp)
-    write_bytes(out, buffer.getvalue())

@@ -15,7 +15,7 @@ from palpate.family import check_name
 from palpate.networks import Channel, CommandPolicy
 from palpate.perception.velocity import VelocityEstimator
 from palpate.runs import Figure
-from palpate.trials.rope.trials import settling_time
+from palpate.trials.rope.stabilization import settling_time
 
 
 class RopeDecision:

@@ -3,7 +3,6 @@
 What they show is what the page shows, in the same looks (`palpate.report.style`), on white.
 """
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +12,8 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.report.charts import quantiles
 from palpate.report.evidence import Curves, Motion
+from palpate.report.picture import check_suffix, save_picture
 from palpate.report.style import STYLES, Style, numbered
-from palpate.runs.storage import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 
 _NOTHING = "the motion holds nothing but gaps: there is nothing to draw"
 _INK, _QUIET, _RULE = "#1c2127", "#5b6570", "#dfe3e7"
-_SUFFIXES = (".png", ".svg")
 _SETTINGS: Any = {
     "font.size": 9,
     "axes.edgecolor": _RULE,
@@ -54,9 +52,7 @@ def motion_figure(
     from matplotlib.figure import Figure
 
     out = Path(out)
-    if out.suffix not in _SUFFIXES:
-        expected = " or ".join(_SUFFIXES)
-        raise PalpateError(f"{out} has the suffix '{out.suffix}': expected {expected}")
+    check_suffix(out)
     if not len(instants):
         raise PalpateError("a motion figure needs at least one instant, in seconds")
     labels = [*motion.chains, *(energy.values if energy else ())]
@@ -82,7 +78,7 @@ def motion_figure(
         if energy is not None:
             _draw_energy(axes[-1], energy, looks)
         _legend(figure)
-        _save(figure, out)
+        save_picture(out, figure, "figure")
     return out
 
 
@@ -158,10 +154,3 @@ def _legend(figure: "Figure") -> None:
         across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
         place = {"loc": "outside upper left", "ncols": across, "frameon": False}
         figure.legend(handles.values(), handles.keys(), handlelength=3.5, **place)
-
-
-def _save(figure: "Figure", out: Path) -> None:
-    buffer = io.BytesIO()
-    stamp = {"Date": None} if out.suffix == ".svg" else {"Software": None}
-    figure.savefig(buffer, format=out.suffix[1:], metadata=stamp)
-    write_bytes(out, buffer.getvalue())

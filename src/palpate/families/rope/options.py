@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import arg
 
 from palpate.errors import PalpateError
 from palpate.families.options import (
-    Evaluate,
+    EvaluateInTrials,
     Evaluation,
     Identify,
     Number,
@@ -22,13 +21,15 @@ from palpate.families.options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from palpate.models.model import Model
     from palpate.models.rope import Rope
-    from palpate.networks import CommandPolicy
+    from palpate.networks import CommandPolicy, Controller
     from palpate.recordings import Aligned, Recording
     from palpate.runs import Run
+    from palpate.trials.rope.stabilization import StabilizationTrial
+    from palpate.trials.rope.tracking import PathTrial
 
 NOISE = 5e-4  # m, standard deviation of a marker's coordinate in the simulated world
 RENDERED = 3.0  # s of a trial in the moving picture
@@ -202,15 +203,20 @@ class IdentifyRope(Identify):
         return dataclasses.replace(recording, trials=tuple(trials))
 
 
+def _driven_by_velocity(rope: Rope) -> Rope:
+    from palpate.models.rope import Rope as Physics
+
+    if not isinstance(rope, Physics):
+        raise PalpateError(
+            "a policy is trained and tried through the physics of a rope: expected a model "
+            "identified without --residual"
+        )
+    return dataclasses.replace(rope, drive="velocity")
+
+
 @dataclass(frozen=True, kw_only=True)
-class TrainRopeStabilization(Train):
-    """Train a controller that brings a swinging rope to rest by moving its gripper.
-
-    1. After `palpate identify rope R.npz`:     palpate train rope-stabilization
-                                                    --model runs/identify-rope-001
-    """
-
-    task: ClassVar[str] = "rope-stabilization"
+class TrainRope(Train):
+    """Training of a rope's gripper."""
 
     observation_noise: float = NOISE
     """Standard deviation of a marker's coordinate as the policy will see it, m."""
@@ -221,7 +227,55 @@ class TrainRopeStabilization(Train):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateRopeStabilization(Evaluate):
+class TrainRopeStabilization(TrainRope):
+    """Train a controller that brings a swinging rope to rest by moving its gripper.
+
+    1. After `palpate identify rope R.npz`:     palpate train rope-stabilization
+                                                    --model runs/identify-rope-001
+    """
+
+    task: ClassVar[str] = "rope-stabilization"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRopeTracking(TrainRope):
+    """Train a controller that leads the tip of a hanging rope along a path by moving its gripper.
+
+    It is trained on random smooth paths and follows any.
+
+    1. After `palpate identify rope R.npz`:     palpate train rope-tracking
+                                                    --model runs/identify-rope-001
+    """
+
+    task: ClassVar[str] = "rope-tracking"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRope(EvaluateInTrials):
+    """Evaluation in MuJoCo ropes, drawn around the one that is recorded by default."""
+
+    ropes: int
+
+    def prepare(self, model: Rope) -> Rope:
+        """The rope moved by its gripper's velocity."""
+        return _driven_by_velocity(model)
+
+    def check(self, policy: CommandPolicy) -> None:
+        """See `EvaluateInTrials.check`; there has to be a rope, too."""
+        if self.ropes < 1:
+            raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
+        super().check(policy)
+
+    def constants(self) -> dict[str, Any]:
+        """Of the rope that the others are drawn around."""
+        from palpate.families.rope.recording import constants
+        from palpate.worlds.rope.configuration import RopeConfiguration
+
+        return constants(RopeConfiguration())
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRopeStabilization(EvaluateRope):
     """Try a controller in MuJoCo ropes it was not trained for, from four start poses.
 
     Beside it, in the same trials: a gripper held still, and a tuned swing damper.
@@ -235,76 +289,47 @@ class EvaluateRopeStabilization(Evaluate):
     ropes: int = 10
     """Drawn around the rope that `palpate record` has by default; each from four poses."""
 
-    def prepare(self, model: Rope) -> Rope:
-        """The rope moved by its gripper's velocity."""
-        return _driven_by_velocity(model)
-
-    def check(self, policy: CommandPolicy) -> None:
-        """The simulated rope takes a command every so often, and there has to be one."""
-        _check_simulated(policy, self.ropes)
-
-    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
-        """See `rope_evaluation.evaluate`."""
-        from palpate.families.rope.recording import constants
-        from palpate.tasks.rope import RopeStabilization
-        from palpate.trials.controller import HeldStill
-        from palpate.trials.rope import evaluation as rope_evaluation
-        from palpate.trials.rope.baselines import SwingDamper
-        from palpate.trials.rope.learned import LearnedController
-        from palpate.trials.rope.rendering import render_trial
+    def trials(self) -> list[StabilizationTrial]:
+        """Each rope from each pose, for four first periods of the longest."""
+        from palpate.trials.rope.stabilization import evaluation_trials
         from palpate.worlds.rope.configuration import RopeConfiguration
 
-        base = RopeConfiguration()
-        trials = rope_evaluation.evaluation_trials(base, self.ropes, self.seed)
-        controllers = {
-            "controlled": LearnedController(policy, RopeStabilization()),
-            "held still": HeldStill(),
-            "swing damper": SwingDamper(base),
-        }
-        evaluated = rope_evaluation.evaluate(controllers, trials, run)
-        rope_evaluation.write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
+        return evaluation_trials(RopeConfiguration(), self.ropes, self.seed)
+
+    def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
+        """See `EvaluateInTrials.controllers`."""
+        from palpate.tasks.rope import RopeStabilization
+        from palpate.trials.rope.baselines import baselines
+        from palpate.trials.rope.learned import LearnedController
+        from palpate.worlds.rope.configuration import RopeConfiguration
+
+        controlled = LearnedController(policy, RopeStabilization())
+        return {"controlled": controlled, **baselines(RopeConfiguration())}
+
+    def show(
+        self, run: Run, trials: Sequence[StabilizationTrial], evaluated: Mapping[str, Any]
+    ) -> None:
+        """The energy left, and motions."""
+        from palpate.trials.rope.stabilization import write_trial_evidence
+
+        write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
+
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+        """See `EvaluateInTrials.evaluate`; one trial is rendered, too."""
+        from palpate.trials.rope.rendering import render_trial
+
+        found, (first, *_) = super().evaluate(policy, run), self.trials()
+        controller = self.controllers(policy)["controlled"]
         try:
-            picture = run.path / "rendering.webp"
-            render_trial(picture, trials[0], controllers["controlled"], RENDERED)
-            notes = ()
+            render_trial(run.path / "rendering.webp", first, controller, RENDERED)
         except PalpateError as error:  # a machine without OpenGL: the page draws the ropes itself
             notes = (f"the rope is drawn, not rendered: {error}",)
-        figures = []
-        for name, episodes in evaluated.items():
-            suffix = "" if name == "controlled" else f".{name.replace(' ', '_')}"
-            summary = rope_evaluation.summarise(trials, episodes)
-            figures += rope_evaluation.figures(summary, suffix)
-        return Evaluation(
-            figures=figures,
-            table=rope_evaluation.table(trials, evaluated),
-            settings={"trials": len(trials), **constants(base)},
-            split={"evaluated": f"{self.ropes} sampled ropes, seed {self.seed}"},
-            notes=notes,
-        )
+            return dataclasses.replace(found, notes=notes)
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainRopeTracking(Train):
-    """Train a controller that leads the tip of a hanging rope along a path by moving its gripper.
-
-    It is trained on random smooth paths and follows any.
-
-    1. After `palpate identify rope R.npz`:     palpate train rope-tracking
-                                                    --model runs/identify-rope-001
-    """
-
-    task: ClassVar[str] = "rope-tracking"
-
-    observation_noise: float = NOISE
-    """Standard deviation of a marker's coordinate as the policy will see it, m."""
-
-    def prepare(self, model: Rope) -> Rope:
-        """The rope moved by its gripper's velocity."""
-        return _driven_by_velocity(model)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateRopeTracking(Evaluate):
+class EvaluateRopeTracking(EvaluateRope):
     """Try a controller on paths and in MuJoCo ropes that it was not trained for.
 
     Beside it, in the same trials: a gripper held still, one that moves as the path does, and one
@@ -327,62 +352,25 @@ class EvaluateRopeTracking(Evaluate):
     )
     """Of these three, of random size, speed and direction, or from files, as they stand there."""
 
-    def prepare(self, model: Rope) -> Rope:
-        """The rope moved by its gripper's velocity."""
-        return _driven_by_velocity(model)
-
-    def check(self, policy: CommandPolicy) -> None:
-        """The simulated rope takes a command every so often, and there has to be one."""
-        _check_simulated(policy, self.ropes)
-
-    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
-        """See `palpate.trials.trial.evaluate_trials`."""
-        from palpate.families.rope.recording import constants
-        from palpate.tasks.rope import RopeTracking
-        from palpate.trials.rope import tracking
-        from palpate.trials.rope.learned import LearnedController
-        from palpate.trials.trial import evaluate_trials
+    def trials(self) -> list[PathTrial]:
+        """Each rope on each path."""
+        from palpate.trials.rope.tracking import path_trials
         from palpate.worlds.rope.configuration import RopeConfiguration
 
-        base = RopeConfiguration()
-        trials = tracking.path_trials(base, self.ropes, self.seed, self.paths)
-        controllers = {"controlled": LearnedController(policy, RopeTracking())}
-        controllers |= tracking.blind_controllers(base)
-        followed = evaluate_trials(controllers, trials, run)
-        tracking.write_path_evidence(run, trials, followed, "controlled")
-        figures = []
-        for name, whole in followed.items():
-            suffix = "" if name == "controlled" else f".{name.replace(' ', '_')}"
-            figures += tracking.figures(tracking.summarise(trials, whole), suffix)
-        return Evaluation(
-            figures=figures,
-            table=tracking.table(trials, followed),
-            settings={"trials": len(trials), **constants(base)},
-            split={"evaluated": f"{self.ropes} sampled ropes, seed {self.seed}"},
-        )
+        return path_trials(RopeConfiguration(), self.ropes, self.seed, self.paths)
 
+    def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
+        """See `EvaluateInTrials.controllers`."""
+        from palpate.tasks.rope import RopeTracking
+        from palpate.trials.rope.learned import LearnedController
+        from palpate.trials.rope.tracking import blind_controllers
+        from palpate.worlds.rope.configuration import RopeConfiguration
 
-def _check_simulated(policy: CommandPolicy, ropes: int) -> None:
-    """Raise `PalpateError` without a rope, or where one takes its commands at another rate."""
-    from palpate.worlds.rope.configuration import RopeConfiguration
+        controlled = LearnedController(policy, RopeTracking())
+        return {"controlled": controlled, **blind_controllers(RopeConfiguration())}
 
-    if ropes < 1:
-        raise PalpateError(f"an evaluation has at least one rope, not {ropes}")
-    period = RopeConfiguration().control_period
-    if not math.isclose(policy.period, period, rel_tol=1e-4):
-        raise PalpateError(
-            f"the policy decides every {policy.period:.4g} s and the simulated rope takes a "
-            f"command every {period:.4g} s: train through a model identified at "
-            f"{1 / period:.4g} Hz, the rate of `palpate record rope`"
-        )
+    def show(self, run: Run, trials: Sequence[PathTrial], evaluated: Mapping[str, Any]) -> None:
+        """Motions, and a picture of all tips."""
+        from palpate.trials.rope.tracking import write_path_evidence
 
-
-def _driven_by_velocity(rope: Rope) -> Rope:
-    from palpate.models.rope import Rope as Physics
-
-    if not isinstance(rope, Physics):
-        raise PalpateError(
-            "a policy is trained and tried through the physics of a rope: expected a model "
-            "identified without --residual"
-        )
-    return dataclasses.replace(rope, drive="velocity")
+        write_path_evidence(run, trials, evaluated)

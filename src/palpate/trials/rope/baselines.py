@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from palpate.networks import Controller
 from palpate.perception.velocity import VelocityEstimator
 from palpate.runs.progress import progress
-from palpate.trials.controller import FeedbackController
-from palpate.trials.rope.trials import StabilizationTrial, settling_time
+from palpate.trials.controller import FeedbackController, HeldStill
+from palpate.trials.rope.stabilization import StabilizationTrial, settling_time
 from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import (
     START_POSES,
@@ -88,6 +89,11 @@ class SwingDamper(FeedbackController):
 def _shortened(vectors: np.ndarray, limit: float) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors * np.minimum(1.0, limit / np.maximum(length, 1e-12))
+
+
+def baselines(base: RopeConfiguration) -> dict[str, Controller]:
+    """What a controller that is to bring ropes like this one to rest is held against."""
+    return {"held still": HeldStill(), "swing damper": SwingDamper(base)}
 
 
 def coarse(configuration: RopeConfiguration) -> RopeConfiguration:

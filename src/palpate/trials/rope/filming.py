@@ -15,7 +15,7 @@ from palpate.perception.rope.centre_line import FEWEST, centre_lines, line_point
 from palpate.perception.rope.segmentation import Appearance, segment
 from palpate.perception.rope.tracking import REACH, RopeTracker
 from palpate.tasks.rope import RopeStabilization
-from palpate.trials.rope.trials import StabilizationTrial
+from palpate.trials.rope.stabilization import StabilizationTrial
 from palpate.worlds.camera import Sensor
 from palpate.worlds.excitation import excitation
 from palpate.worlds.rope.filmed import ROPE_COLOUR, Background, FilmedObservation, FilmedRope
@@ -63,16 +63,16 @@ def film(
     *,
     model: Rope,
     policy: CommandPolicy | None,
-    steps: int,
     background: Background,
     sensor: Sensor,
     shaken: bool,
 ) -> Filming:
     """Run the trial: controlled by `policy` through the camera, else shaken, else held still."""
     world = FilmedRope(trial.configuration, sensor, background=background)
-    kept = Filming(**{name: part[0] for name, part in Filming.empty(1, steps, model.nodes).items()})
+    empty = Filming.empty(1, trial.steps or 0, model.nodes)
+    kept = Filming(**{name: part[0] for name, part in empty.items()})
     with contextlib.suppress(DivergedError):  # what comes after stays NaN: a failure to settle
-        _run(world, trial, kept, model, policy, steps, shaken)
+        _run(world, trial, kept, model, policy, shaken)
     return kept
 
 
@@ -82,10 +82,9 @@ def _run(
     kept: Filming,
     model: Rope,
     policy: CommandPolicy | None,
-    steps: int,
     shaken: bool,
 ) -> None:
-    configuration = trial.configuration
+    configuration, steps = trial.configuration, trial.steps or 0
     tracker = RopeTracker(model, world.pinhole, Appearance(ROPE_COLOUR, configuration.radius))
     alone = RopeTracker(model, world.pinhole, Appearance(ROPE_COLOUR, configuration.radius))
     every = configuration.bodies // (model.nodes - 1)

@@ -1,4 +1,4 @@
-"""A trained policy of a rope's task, and what makes its features of the markers that are seen."""
+"""Trained policies of a rope's tasks, and what makes their features of markers that are seen."""
 
 from typing import Any
 
@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.models.rope import RopeState
+from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
+from palpate.perception.rope.marker_observer import MarkerObserver
 from palpate.perception.velocity import VelocityEstimator
 from palpate.tasks.rope import RopeStabilization, RopeTracking
 from palpate.trials.controller import FeedbackController
@@ -84,3 +85,55 @@ class LearnedController(FeedbackController):
         window, state = self.observer.update(window, observation)
         memory, action = self._act(self.policy, memory, state, goal, jnp.asarray(step))
         return (window, memory, step + 1), np.asarray(action)[:, 0]
+
+    def follow(self, carry: Any, observation: RopeObservation, command: np.ndarray) -> Any:
+        """The next carry while somebody else commands (worlds, 3) m/s for one control period."""
+        window, _, step = carry
+        window, _ = self.observer.update(window, observation)
+        memory = self.policy.initial_carry(jnp.asarray(command, jnp.float32)[:, None])
+        return window, memory, step + 1
+
+
+class ObservedController(LearnedController):
+    """A policy for ropes of any length, seen late and seldom, all of them at the same instants.
+
+    How long a rope is, is measured in the first observation. `model` is driven by velocity at node
+    0: the rope that the policy was made for. `noise`: of the markers, m.
+    """
+
+    def __init__(
+        self, policy: CommandPolicy, task: RopeStabilization, model: Rope, noise: float
+    ) -> None:
+        super().__init__(policy, task)
+        self._model, self._noise = model, noise
+
+        @eqx.filter_jit
+        def decide(policy, carry, state, size):
+            length, velocity = size[:, None, None], jnp.sqrt(size)[:, None, None]
+            alike = RopeState(state.position / length, state.velocity / velocity)
+            return policy.similar(carry, task.features(alike, None), size)
+
+        self._decide_alike = decide
+
+    def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
+        """See `FeedbackController.start`."""
+        positions = jnp.asarray(self.observer.positions(observation))
+        length = jnp.sum(jnp.linalg.norm(jnp.diff(positions, axis=1), axis=-1), axis=1)
+        size = length / jnp.sum(self._model.rest_length)
+        rest_length = self._model.rest_length * size[:, None]
+        models = eqx.tree_at(lambda rope: rope.rest_length, self._model, rest_length).constrain()
+        memory = self.policy.initial_carry(jnp.asarray(command, jnp.float32)[:, None])
+        return MarkerObserver(models, self._noise), size, None, memory
+
+    def decide(
+        self, carry: Any, observation: RopeObservation, goal: None
+    ) -> tuple[Any, np.ndarray]:
+        """See `FeedbackController.decide`."""
+        observer, size, command, memory = carry
+        positions = jnp.asarray(self.observer.positions(observation))
+        if command is None:
+            state = observer.begin(positions, observation.time)
+        else:
+            state = observer.step(command, positions, observation.time)
+        memory, command = self._decide_alike(self.policy, memory, state, size)
+        return (observer, size, command, memory), np.asarray(command)[:, 0]

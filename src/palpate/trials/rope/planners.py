@@ -249,23 +249,15 @@ def as_of_model(model: Rope, states: RopeState) -> RopeState:
     )
 
 
-def decision_times(planned: Mapping[str, PlannedController]) -> dict[str, list[float]]:
-    """Median and 99th percentile of each planner's decisions in this process, ms."""
-    return {
-        name: (1e3 * np.quantile(planner.spent, (0.5, 0.99))).tolist()
-        for name, planner in planned.items()
-        if planner.spent
-    }
-
-
 def _length(state: RopeState) -> Float[Array, "*worlds"]:
     """Of the polygon through the nodes, m."""
     return jnp.sum(jnp.linalg.norm(jnp.diff(state.position, axis=-2), axis=-1), axis=-1)
 
 
-def decision_about(planner: CurvePlanner) -> Callable[[], Any]:
-    """A function that takes one decision about a hanging rope."""
+def decision_about(planner: CurvePlanner, goal: Float[Array, "*goal"]) -> Callable[[], Any]:
+    """A function that takes one decision about a hanging rope and a goal that stays."""
     assert isinstance(planner.model, Rope)
     plan = planner.init(jnp.zeros((1, 3)), jax.random.key(0))
-    state, goals = hanging_rope(planner.model), jnp.ones(planner.horizon)
+    goals = jnp.broadcast_to(goal, (planner.horizon, *goal.shape))
+    state = hanging_rope(planner.model)
     return lambda: planner(plan, state, goals)

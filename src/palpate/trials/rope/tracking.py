@@ -1,6 +1,5 @@
 """Ropes, paths and controllers in MuJoCo: how far the tip is from where it should be."""
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,16 +9,17 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
+from palpate.networks import Controller
 from palpate.report.evidence import write_evidence
+from palpate.report.picture import canvas_of, save_picture
 from palpate.report.style import STYLES
 from palpate.runs import Figure, Run
-from palpate.runs.storage import write_bytes
 from palpate.tasks.rope import RopeTracking
 from palpate.tasks.rope.paths import CURVES, DesiredPath, named_path, read_path
 from palpate.tasks.rope.tracking import PREVIEW, grip_of_chain
-from palpate.trials.controller import Controller, HeldStill, OpenLoop
+from palpate.trials.controller import HeldStill, OpenLoop
 from palpate.trials.rope.trials import RopeTrial
-from palpate.trials.trial import Record, first_of_each_group, groups
+from palpate.trials.trial import Record, first_of_each_group
 from palpate.worlds.rope.rope import (
     GRIPPER_START,
     RopeConfiguration,
@@ -95,9 +95,16 @@ class PathTrial(RopeTrial[Followed]):
         return Followed(tips, np.full(markers, np.nan, np.float32), {})
 
     @classmethod
-    def score(cls, trials: Sequence["PathTrial"], record: Followed) -> dict[str, float]:
-        """See `Trial`."""
-        return {"mean_tip_error_cm": 100 * float(np.nanmean(record.errors(trials)))}
+    def figures(
+        cls, trials: Sequence["PathTrial"], record: Followed, suffix: str = ""
+    ) -> list[Figure]:
+        """See `Summary.figures`."""
+        return summarise(trials, record).figures(suffix)
+
+    @classmethod
+    def line(cls, name: str, trials: Sequence["PathTrial"], record: Followed) -> str:
+        """See `Summary.line`."""
+        return summarise(trials, record).line(name)
 
 
 class PathOpenLoop(OpenLoop):
@@ -192,16 +199,23 @@ class Summary:
             f"worst {self.worst:6.2f} cm; {self.trials} trials"
         )
 
+    def figures(self, suffix: str = "", bar: float | None = None) -> list[Figure]:
+        """`mean_tip_error_cm`, `rms_tip_error_cm` and `worst_tip_error_cm`, ending in `suffix`.
 
-def summarise(
-    trials: Sequence[PathTrial], followed: Followed, chosen: Sequence[int] | None = None
-) -> Summary:
-    """Of all trials, or of those `chosen`."""
-    chosen = range(len(trials)) if chosen is None else chosen
-    diverged = sum(index in followed.failures for index in chosen)
-    if diverged:  # errors of what is no longer there would be left out of a mean
-        return Summary(None, None, None, None, len(chosen), diverged)
-    error = 100 * followed.errors(trials)[list(chosen)]
+        `bar` is that of the first.
+        """
+        return [
+            Figure(f"mean_tip_error_cm{suffix}", self.mean, "cm", bar=bar, spread=self.margin),
+            Figure(f"rms_tip_error_cm{suffix}", self.rms, "cm"),
+            Figure(f"worst_tip_error_cm{suffix}", self.worst, "cm"),
+        ]
+
+
+def summarise(trials: Sequence[PathTrial], followed: Followed) -> Summary:
+    """Tip errors of these trials."""
+    if diverged := len(followed.failures):  # a mean would leave out what is no longer there
+        return Summary(None, None, None, None, len(trials), diverged)
+    error = 100 * followed.errors(trials)
     mean = np.nanmean(error, axis=1)
     margin = 1.96 * mean.std(ddof=1) / math.sqrt(len(mean)) if len(mean) > 1 else None
     return Summary(
@@ -209,43 +223,19 @@ def summarise(
         rms=float(np.sqrt(np.nanmean(error**2, axis=1)).mean()),
         worst=float(np.nanmax(error)),
         margin=None if margin is None else float(margin),
-        trials=len(chosen),
+        trials=len(trials),
         diverged=0,
     )
 
 
-def table(trials: Sequence[PathTrial], followed: Mapping[str, Followed]) -> list[str]:
-    """Lines for a person: every controller, over all trials and on each path."""
-    lines = []
-    for name, whole in followed.items():
-        lines.append(summarise(trials, whole).line(name))
-        for path, chosen in groups(trials).items():
-            lines.append(summarise(trials, whole, chosen).line(f"  {path}"))
-        lines += [f"  trial {trial}: {why}" for trial, why in sorted(whole.failures.items())]
-    return lines
-
-
-def figures(summary: Summary, suffix: str = "", bar: float | None = None) -> list[Figure]:
-    """`mean_tip_error_cm`, `rms_tip_error_cm` and `worst_tip_error_cm`, ending in `suffix`.
-
-    `bar` is that of the first.
-    """
-    spread = summary.margin
-    return [
-        Figure(f"mean_tip_error_cm{suffix}", summary.mean, "cm", bar=bar, spread=spread),
-        Figure(f"rms_tip_error_cm{suffix}", summary.rms, "cm"),
-        Figure(f"worst_tip_error_cm{suffix}", summary.worst, "cm"),
-    ]
-
-
 def write_path_evidence(
-    run: Run, trials: Sequence[PathTrial], followed: Mapping[str, Followed], shown: str
+    run: Run, trials: Sequence[PathTrial], followed: Mapping[str, Followed]
 ) -> None:
-    """Leave for the report how the rope of the follower `shown` moved on each path, and a picture.
+    """Leave for the report how the rope of the first follower moved on each path, and a picture.
 
     The picture, `tracking.png`, has the tips of all followers on it.
     """
-    period, arrays = trials[0].control_period, {}
+    period, arrays, shown = trials[0].control_period, {}, next(iter(followed))
     for place, index in enumerate(first_of_each_group(trials)):
         trial, group = trials[index], f"motion/{trials[index].name}"
         arrays[f"{group}.time"] = np.arange(trial.steps + 1) * period
@@ -260,10 +250,8 @@ def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followe
 
     Where the tip should have been and was, from above; and how far from there it was over time.
     """
-    from matplotlib.figure import Figure as Canvas
-
     drawn = first_of_each_group(trials)
-    canvas = Canvas(figsize=(4 * len(drawn), 7.5), layout="constrained")
+    canvas = canvas_of(4 * len(drawn), 7.5)
     axes = canvas.subplots(2, len(drawn), squeeze=False)
     for index, above, below in zip(drawn, *axes, strict=True):
         trial = trials[index]
@@ -279,6 +267,4 @@ def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followe
         below.set(xlabel="time (s)", ylabel="distance of the tip from the path (cm)")
     canvas.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
                   fontsize=8, frameon=False)  # fmt: skip
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=150)
-    write_bytes(file, buffer.getvalue())
+    save_picture(file, canvas)

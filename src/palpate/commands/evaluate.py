@@ -31,16 +31,13 @@ def run(options: Evaluate) -> Path:
         )
     options.check(policy)
     task = named_task(options.task)
-    configuration = folders.configuration_of(options, f"evaluate {options.task}")
-    configuration["policy"] = folders.fingerprint(file)
-    model = None
+    model, inputs = None, {"policy": file}
     if options.model is not None:
         described = folders.product_of(options.model, folders.MODEL, "identify")
         model = options.prepare(load_model(described)[0])
         check_model(policy, model, task, str(described))
-        configuration["model"] = folders.fingerprint(described)
-    name = f"evaluate-{options.task}"
-    with folders.open_run(options, name, configuration, None) as run:
+        inputs["model"] = described
+    with folders.begin(options, f"evaluate {options.task}", inputs) as run:
         if not run.finished:
             found = options.evaluate(policy, run)
             figures = [*found.figures]
@@ -48,13 +45,13 @@ def run(options: Evaluate) -> Path:
                 figures += figures_in_model(task, model, policy, options.seed)
             write_text(run.path / folders.TABLE, "\n".join(found.table) + "\n")
             settings = found.settings | {"notes": found.notes}
-            folders.finish(run, options, name, figures, settings, found.split)
+            folders.finish(run, figures, settings, found.split)
         print((run.path / folders.TABLE).read_text(encoding="utf-8"), end="")
         notes = read_result(run.path / RESULT).settings["notes"]
         for note in notes:
             print(f"note: {note}")
-        folders.hand_over(options, run, f"What a controller does: {options.task}", notes=notes)
-        return run.path
+        title = f"What a controller does: {options.task}"
+        return folders.hand_over(options, run, title, notes=notes)
 
 
 def check_model(policy: CommandPolicy, model: Model, task: Task, described: str) -> None:

@@ -30,10 +30,7 @@ def run(options: Export) -> Path:
         _check_contract(beside)
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_policy(file)
-    configuration = folders.configuration_of(options, "export") | {
-        "policy": folders.fingerprint(file)
-    }
-    with folders.open_run(options, "export", configuration) as run:
+    with folders.begin(options, "export", {"policy": file}) as run:
         made = run.path / ONNX
         write_onnx(made, policy)
         off = difference(made, policy, STEPS, options.seed)
@@ -46,7 +43,7 @@ def run(options: Export) -> Path:
         write_contract(beside, policy, manifest, target.name)
         if not run.finished:
             figure = Figure("onnx_difference", off, "of the limit", bar=AGREES)
-            folders.finish(run, options, "export", [figure])
+            folders.finish(run, [figure])
         print(f"policy: {target} (commands differ by at most {off:.1g} of their limits)")
         print(f"contract: {beside}")
         folders.hand_over(options, run, "A policy as ONNX")

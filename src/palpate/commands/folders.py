@@ -30,6 +30,34 @@ _WHERE = ("out", "fresh")  # options that do not decide the outcome
 _SUFFIXES = {Path(name).suffix for name in (RECORDING, MODEL, POLICY, REPORT)}
 
 
+def begin(
+    options: Options,
+    words: str,
+    inputs: Mapping[str, Path | Sequence[Path]] | None = None,
+    product: str | None = None,
+    **decided: Any,
+) -> Run:
+    """`open_run` of the command that `words` give ("train cart-to-origin").
+
+    What decides its outcome: the options, the content of its `inputs` (files or folders, by name),
+    and what else was `decided`.
+    """
+    files = {}
+    for name, paths in (inputs or {}).items():
+        one = isinstance(paths, Path)
+        files[name] = fingerprint(paths) if one else [fingerprint(path) for path in paths]
+    configuration = {**configuration_of(options, words), **files, **decided}
+    return open_run(options, words.replace(" ", "-"), configuration, product)
+
+
+def configuration_of(options: Options, words: str) -> dict[str, Any]:
+    """What was said on a command's line, for its configuration: all but where to write."""
+    given = {"command": words, **dataclasses.asdict(options)}
+    return {
+        name: value for name, value in given.items() if name not in _WHERE and value is not None
+    }
+
+
 def open_run(
     options: Options, name: str, configuration: Mapping[str, Any], product: str | None = None
 ) -> Run:
@@ -61,22 +89,25 @@ def open_run(
 
 def finish(
     run: Run,
-    options: Options,
-    name: str,
     figures: Sequence[Figure] = (),
     settings: Mapping[str, Any] | None = None,
     split: dict[str, Any] | None = None,
-) -> None:
-    """Finish a command's run with its `result.json`: `settings` beside the run's configuration."""
+    **more: Any,
+) -> Result:
+    """Finish a run that `begin` began with its `result.json`.
+
+    `settings` stand there beside the run's configuration; `more` are other fields of `Result`.
+    """
+    fields = {"wall_time_s": run.elapsed, "seeds": [run.configuration["seed"]], **more}
     result = Result(
-        name=name,
+        name=run.configuration["command"].replace(" ", "-"),
         figures=list(figures),
         settings={**run.configuration, **(settings or {})},
-        seeds=[options.seed],
         split=split,
-        wall_time_s=run.elapsed,
+        **fields,
     )
     run.finish(result.to_dict())
+    return result
 
 
 def deliver(options: Options, run: Run, product: str) -> Path:
@@ -90,22 +121,20 @@ def deliver(options: Options, run: Run, product: str) -> Path:
 
 def hand_over(
     options: Options, run: Run, title: str, product: str | None = None, notes: Sequence[str] = ()
-) -> None:
-    """Deliver the product of a finished run, write its report, and print where both are."""
+) -> Path:
+    """Deliver the product of a finished run, write its report, and print where both are.
+
+    Returns the path of the product, or of the run where there is none.
+    """
+    path = run.path
     report = run.path / REPORT
     if not report.exists() or report.stat().st_mtime < (run.path / RESULT).stat().st_mtime:
         build_report([run.path], report, title, notes)
     if product is not None:
-        print(f"{Path(product).stem}: {deliver(options, run, product)}")
+        path = deliver(options, run, product)
+        print(f"{Path(product).stem}: {path}")
     print(f"report: {report}")
-
-
-def configuration_of(options: Options, command: str) -> dict[str, Any]:
-    """What decides a command's outcome, for its configuration: all that was said but where to."""
-    given = {"command": command, **dataclasses.asdict(options)}
-    return {
-        name: value for name, value in given.items() if name not in _WHERE and value is not None
-    }
+    return path
 
 
 def command(options: Options, words: str) -> str:

@@ -7,7 +7,6 @@ import dataclasses
 import importlib.util
 import time
 from pathlib import Path
-from typing import Any
 
 from palpate.commands import folders, identify_report
 from palpate.commands.identify_data import Data, read
@@ -31,7 +30,7 @@ from palpate.models.files import load_model, save_model
 from palpate.models.model import Model
 from palpate.parameters import parameters_of, value_of, with_values
 from palpate.report import write_evidence
-from palpate.runs import Result, Run
+from palpate.runs import Run
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import write_bytes
@@ -57,9 +56,13 @@ def run(options: Identify) -> Path:
     if not options.fits:
         cut_pieces(data.fitted_aligned, reference)
         check_seen(cut_pieces(data.validation_aligned, reference))
-    name = f"identify-{options.family}"
     product = folders.MODEL if options.fits else DRAWS
-    with folders.open_run(options, name, _configuration(options), product) as run:
+    inputs = {"recordings": options.recordings, "validate": options.validate}
+    if options.init is not None:
+        inputs["init"] = (_model_file(options.init),)
+    words = f"identify {options.family}"
+    of_a_fit = dataclasses.asdict(_settings(options)) if options.fits else {}
+    with folders.begin(options, words, inputs, product, **of_a_fit) as run:
         if not run.finished:
             hypotheses = options.hypotheses(data.shown, data.fitted_aligned)
             models = {of: _begun(one, options) for of, one in hypotheses.models.items()}
@@ -75,10 +78,8 @@ def run(options: Identify) -> Path:
                 run=run,
             )
             hypotheses = dataclasses.replace(hypotheses, models=models)
-            if options.fits:
-                _write_fit(run, name, options, data, hypotheses, found)
-            else:
-                _write_draws(run, name, options, data, hypotheses, found)
+            write = _write_fit if options.fits else _write_draws
+            write(run, options, data, hypotheses, found)
         result = read_result(run.path / RESULT)
         identify_report.show(result)
         if options.arviz is not None:
@@ -134,19 +135,8 @@ def _settings(options: Identify) -> Settings:
     return settings
 
 
-def _configuration(options: Identify) -> dict[str, Any]:
-    files = {
-        "recordings": [folders.fingerprint(path) for path in options.recordings],
-        "validate": [folders.fingerprint(path) for path in options.validate],
-    }
-    if options.init is not None:
-        files["init"] = [folders.fingerprint(_model_file(options.init))]
-    of_a_fit = dataclasses.asdict(_settings(options)) if options.fits else {}
-    return {**folders.configuration_of(options, f"identify {options.family}"), **files, **of_a_fit}
-
-
 def _write_fit(
-    run: Run, name: str, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
+    run: Run, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
 ) -> None:
     """The model, evidence and result into the run's folder; the result last."""
     (start,) = hypotheses.models.values()
@@ -172,17 +162,8 @@ def _write_fit(
         },
     )
     write_evidence(run.path, report.evidence())
-    result = Result(
-        name=name,
-        figures=figures,
-        settings=run.configuration | report.settings(),
-        seeds=[options.seed],
-        split=identify_report.split(data),
-        wall_time_s=wall_time,
-        parameters=parameters,
-        warnings=list(found.warnings),
-    )
-    run.finish(result.to_dict())
+    rows = {"parameters": parameters, "warnings": list(found.warnings), "wall_time_s": wall_time}
+    folders.finish(run, figures, report.settings(), identify_report.split(data), **rows)
 
 
 def _corrected(model: Model, data: Data, options: Identify, run: Run) -> tuple[Corrected, float]:
@@ -202,7 +183,7 @@ def _corrected(model: Model, data: Data, options: Identify, run: Run) -> tuple[C
 
 
 def _write_draws(
-    run: Run, name: str, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
+    run: Run, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
 ) -> None:
     """Draws, evidence and result into the run's folder; the result last."""
     comparison = found.comparison
@@ -215,7 +196,7 @@ def _write_draws(
     pieces = cut_pieces(data.validation_aligned, model)
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
     write_evidence(run.path, identify_report.expected_errors(predicted, pieces, model))
-    settings = run.configuration | {
+    settings = {
         "structure": comparison.structure,
         "probability": comparison.probability,
         "by_itself": hypotheses.by_itself,
@@ -224,17 +205,8 @@ def _write_draws(
         "scored_on": "what was fitted" if data.validation is None else "what was not fitted",
         "observation_unit": identify_report.units_of(data.unit, model)[0],
     }
-    result = Result(
-        name=name,
-        figures=identify_report.drawn_figures(posterior, score, model, run.elapsed, data.unit),
-        settings=settings,
-        seeds=[options.seed],
-        split=identify_report.split(data),
-        wall_time_s=run.elapsed,
-        parameters=[
-            *identify_report.drawn_rows(posterior),
-            *options.meanings(posterior.models(), posterior.prior),
-        ],
-        warnings=list(found.warnings),
-    )
-    run.finish(result.to_dict())
+    figures = identify_report.drawn_figures(posterior, score, model, run.elapsed, data.unit)
+    meanings = options.meanings(posterior.models(), posterior.prior)
+    parameters = [*identify_report.drawn_rows(posterior), *meanings]
+    rows = {"parameters": parameters, "warnings": list(found.warnings)}
+    folders.finish(run, figures, settings, identify_report.split(data), **rows)

@@ -16,13 +16,12 @@ def run(options: Plan) -> Path:
     sentence says why.
     """
     problem = options.read()
-    name = f"plan-{options.problem}"
-    configuration = folders.configuration_of(options, f"plan {options.problem}") | problem.inputs
-    with folders.open_run(options, name, configuration, folders.PLAN) as run:
+    words = f"plan {options.problem}"
+    with folders.begin(options, words, product=folders.PLAN, **problem.inputs) as run:
         if not run.finished:
-            folders.finish(run, options, name, problem.solve(run))
+            folders.finish(run, problem.solve(run))
         print("\n".join(problem.describe(run.path / folders.PLAN)))
-        folders.hand_over(options, run, problem.title, folders.PLAN)
+        path = folders.hand_over(options, run, problem.title, folders.PLAN)
         for picture in sorted(run.path.glob("*.png")):
             print(f"picture: {picture}")
-        return folders.deliver(options, run, folders.PLAN)
+        return path

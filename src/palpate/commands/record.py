@@ -32,7 +32,7 @@ def run(options: Record) -> Path:
             recording = dataclasses.replace(recording, provenance=provenance)
             write_recording(run.path / folders.RECORDING, recording)
             names = {"trial_names": [trial.name for trial in recording.trials]}
-            folders.finish(run, options, name, settings=names)  # nothing is claimed
+            folders.finish(run, settings=names)  # nothing is claimed
         count = len(read_result(run.path / RESULT).settings["trial_names"])
         path = folders.deliver(options, run, folders.RECORDING)
     trials = "1 trial" if count == 1 else f"{count} trials"

@@ -22,7 +22,7 @@ from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.errors import PalpateError
 from palpate.family import check_name
 from palpate.networks import CommandPolicy, load_policy
-from palpate.runs import Figure, Result
+from palpate.runs import Figure
 from palpate.runs.progress import Stop, interruptible
 from palpate.runs.storage import write_json
 
@@ -43,15 +43,12 @@ def run(options: Serve) -> Path:
     deployment = deployment_of(policy, manifest, numbers(options.rows, "--rows", [], int))
     limits = limits_of(policy, options.limit, options.rate_limit)
     supervisor = supervisor_of(deployment, limits)
-    configuration = folders.configuration_of(options, "serve") | {
-        "policy": folders.fingerprint(file)
-    }
     listen, words = options.listen, None
     if options.simulate:
         listen = free_endpoint()
         seconds = SIMULATED if options.seconds is None else options.seconds
         words = deployment.simulated_robot(listen, seconds, options.seed)
-    with folders.open_run(options, "serve", configuration) as run:
+    with folders.begin(options, "serve", {"policy": file}) as run:
         if run.finished:
             raise PalpateError(
                 f"{run.path} holds the record of an earlier `palpate serve`: give another --out, "
@@ -68,18 +65,10 @@ def run(options: Serve) -> Path:
             record = _served(supervisor, link, policy.period, options.seconds, robot)
             printed = [] if robot is None else robot.communicate()[0].splitlines()
         write_json(run.path / LATENCY, record.to_dict())
-        result = Result(
-            name="serve",
-            figures=figures_of(record) + (deployment.outcome(printed[-1]) if printed else []),
-            settings=configuration | {"real_time_scheduling": prompt},
-            seeds=[options.seed],
-            split=None,
-            wall_time_s=run.elapsed,
-        )
-        run.finish(result.to_dict())
+        figures = figures_of(record) + (deployment.outcome(printed[-1]) if printed else [])
+        result = folders.finish(run, figures, {"real_time_scheduling": prompt})
         print("\n".join(result.lines()))
-        folders.hand_over(options, run, "A policy in real time")
-    return run.path
+        return folders.hand_over(options, run, "A policy in real time")
 
 
 def limits_of(policy: CommandPolicy, limit: Sequence[str], rate_limit: Sequence[str]) -> Limits:

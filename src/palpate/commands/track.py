@@ -18,21 +18,18 @@ def run(options: Track) -> Path:
     Raises `PalpateError` for pictures or a model that cannot be used.
     """
     described = folders.product_of(options.model, folders.MODEL, "identify")
-    configuration = folders.configuration_of(options, f"track {options.family}")
-    configuration["model"] = folders.fingerprint(described)
-    configuration["pictures"] = folders.fingerprint(options.pictures)
-    name = f"track-{options.family}"
-    with folders.open_run(options, name, configuration, folders.RECORDING) as run:
+    inputs, words = {"model": described, "pictures": options.pictures}, f"track {options.family}"
+    with folders.begin(options, words, inputs, folders.RECORDING) as run:
         if not run.finished:
             model, _ = load_model(described)
             tracked = options.track(model, run)
             write_recording(run.path / folders.RECORDING, tracked.recording)
             frames, share = len(tracked.lost), float(tracked.lost.mean())
             figures = [Figure("frames", float(frames), ""), Figure("lost_share", share, "")]
-            folders.finish(run, options, name, figures)
+            folders.finish(run, figures)
             print(
                 f"{frames} frames followed; the {options.family} was lost in {100 * share:.0f} % "
                 "of them"
             )
-        folders.hand_over(options, run, f"A {options.family}, seen by a camera", folders.RECORDING)
-        return folders.deliver(options, run, folders.RECORDING)
+        title = f"A {options.family}, seen by a camera"
+        return folders.hand_over(options, run, title, folders.RECORDING)

@@ -36,26 +36,15 @@ def run(options: Train) -> Path:
     model = options.prepare(load_model(file)[0])
     task = named_task(options.task)
     training = settings(options)
-    name = f"train-{options.task}"
-    configuration = {
-        **folders.configuration_of(options, f"train {options.task}"),
-        "model": folders.fingerprint(file),
-        "task": _constants(task),
-        "training": dataclasses.asdict(training),
-    }
-    with folders.open_run(options, name, configuration, folders.POLICY) as run:
+    words = f"train {options.task}"
+    decided = {"task": constants(task), "training": dataclasses.asdict(training)}
+    with folders.begin(options, words, {"model": file}, folders.POLICY, **decided) as run:
         if not run.finished:
-            policy = trained(
-                task,
-                model,
-                training,
-                options.seed,
-                run,
-                command=folders.command(options, f"train {options.task}"),
-            )
+            command = folders.command(options, words)
+            policy = trained(task, model, training, options.seed, run, command=command)
             figures = figures_in_model(task, model, policy, options.seed)
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
-            folders.finish(run, options, name, figures, split=split)
+            folders.finish(run, figures, split=split)
         for figure in read_result(run.path / RESULT).figures:
             value = "none" if figure.value is None else f"{figure.value:.4g} {figure.unit}"
             print(f"{figure.name.replace('_', ' ').replace('.', ': ')} {value}".rstrip())
@@ -65,13 +54,7 @@ def run(options: Train) -> Path:
 
 
 def trained(
-    task: Task,
-    model: Model,
-    training: Training,
-    seed: int,
-    run: Run,
-    *,
-    command: str,
+    task: Task, model: Model, training: Training, seed: int, run: Run, *, command: str
 ) -> CommandPolicy:
     """The policy that is trained in `run`, which keeps it with all that its reader has to know.
 
@@ -129,5 +112,6 @@ def figures_in_model(task: Task, model: Model, policy: Controller, seed: int) ->
     return figures
 
 
-def _constants(task: Task) -> dict[str, Any]:
+def constants(task: Task) -> dict[str, Any]:
+    """What a task was made with, for a run's configuration."""
     return {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}

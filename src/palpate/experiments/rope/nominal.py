@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.commands.folders import POLICY
+from palpate.commands.train import constants as task_constants
 from palpate.commands.train import trained
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment
@@ -134,7 +135,7 @@ def trained_policy(
         "stage": "train",
         "seed": experiment.seed,
         "model": {row["name"]: row["value"] for row in describe(model)},
-        "task": {field.name: getattr(task, field.name) for field in dataclasses.fields(task)},
+        "task": task_constants(task),
         **dataclasses.asdict(training),
     }
     with experiment.stage(folder, configuration) as stage:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.families.options import EvaluateInTrials, Identify, Record, Train
+from palpate.families.options import Evaluate, Identify, Record, Train
 from palpate.networks import Controller
 from palpate.recordings import Aligned, Channel, Recording, Role
 from palpate.recordings import Trial as RecordedTrial
@@ -200,7 +200,7 @@ class SwingTrial(trials.Trial[Swings]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluatePendulumDamping(EvaluateInTrials):
+class EvaluatePendulumDamping(Evaluate):
     """Try a controller in pendulums that it was not trained for.
 
     1. After `palpate train`:           palpate evaluate pendulum-damping --policy POLICY

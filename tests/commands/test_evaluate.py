@@ -59,8 +59,8 @@ def test_a_model_that_the_task_cannot_have(refused):
 
 def test_a_policy_of_another_rate_than_the_world(refused):
     assert refused(period=0.02, nodes=6, control_period=0.02) == (
-        "the policy decides every 0.02 s and the simulated rope takes a command every 0.01 s: "
-        "train through a model identified at 100 Hz, the rate of `palpate record rope`"
+        "a controller that decides every 0.02 s does not fit a world with a control period of "
+        "0.01 s: expected one that was trained through a model identified at 100 Hz"
     )
 
 

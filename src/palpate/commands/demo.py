@@ -24,13 +24,12 @@ def run(options: Demo) -> Path:
     print(f"demo: about {options.minutes} minutes on two cores, written to {out}", flush=True)
     if options.fresh and out.is_dir():
         folders.start_over(out, "demo")
-    recording = record.run(options.record(out / "record"))
-    identified = identify.run(options.identify(recording, out / "identify"))
-    trained = train.run(options.train(identified, out / "train"))
-    evaluated = evaluate.run(options.evaluate(trained, out / "evaluate"))
-    stages = [recording.parent, identified, trained, evaluated]
-    results = [read_result(stage / RESULT) for stage in stages]
-    found = options.summarise(identified, evaluated, out)
+    works = record.run, identify.run, train.run, evaluate.run
+    stages = options.stages(out, out / "record" / folders.RECORDING)
+    done = [work(stage) for work, stage in zip(works, stages, strict=True)]
+    paths = [done[0].parent, *done[1:]]
+    results = [read_result(path / RESULT) for path in paths]
+    found = options.summarise(paths[1], paths[3], out)
     result = Result(
         name="demo",
         figures=found.figures,
@@ -41,7 +40,7 @@ def run(options: Demo) -> Path:
     )
     write_json(out / RESULT, result.to_dict())
     notes = results[-1].settings["notes"]
-    build_report([out, *stages], out / folders.REPORT, options.title, notes)
+    build_report([out, *paths], out / folders.REPORT, options.title, notes)
     print("\n".join(["", *found.lines]))
     print(f"report: {out / folders.REPORT}")
     return out

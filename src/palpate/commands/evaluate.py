@@ -43,7 +43,7 @@ def run(options: Evaluate) -> Path:
             figures = [*found.figures]
             if model is not None:
                 figures += figures_in_model(task, model, policy, options.seed)
-            write_text(run.path / folders.TABLE, "\n".join(found.table) + "\n")
+            write_text(run.path / folders.TABLE, "\n".join(found.lines) + "\n")
             settings = found.settings | {"notes": found.notes}
             folders.finish(run, figures, settings, found.split)
         print((run.path / folders.TABLE).read_text(encoding="utf-8"), end="")

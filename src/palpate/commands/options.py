@@ -48,10 +48,10 @@ class Report(Options):
     """Write the page of one or several runs.
 
     A run's page is RUN/report.html and opens without a network. Of a folder with runs in it, such
-    as that of `palpate demo`, one page tells all of them.
+    as that of `palpate demo`, one page shows all of them.
 
-    1. Of one run, finished or not:             palpate report runs/identify-rope-001
-    2. Of several, in the order to be told:     palpate report A B --out both.html
+    1. Of one run, finished or not:             palpate report RUN
+    2. Of several, in this order:               palpate report A B --out both.html
     """
 
     runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN ...", help_behavior_hint="")]]
@@ -68,12 +68,11 @@ class Reproduce(Options):
 
     It says first how long it takes, and goes on where it was cut off when it is called again.
 
-    1. In full:                                 palpate reproduce rope-model --out DIR
-    2. The same work at a smaller size:         palpate reproduce rope-model --quick
-    3. With motion capture of a real rope:      palpate reproduce rope-model --mocap FOLDER
-    4. Without training:                        palpate reproduce rope-stabilization
-                                                    --weights shipped
-    5. On a folder of maps:                     palpate reproduce namo-scenarios --maps FOLDER
+    1. In full:                                 palpate reproduce EXPERIMENT --out DIR
+    2. The same work at a smaller size:         palpate reproduce EXPERIMENT --quick
+    3. With motion capture of real objects:     palpate reproduce EXPERIMENT --mocap FOLDER
+    4. Without training:                        palpate reproduce EXPERIMENT --weights shipped
+    5. On a folder of maps:                     palpate reproduce EXPERIMENT --maps FOLDER
     """
 
     quick: bool = False
@@ -98,8 +97,7 @@ class Export(Options):
     Needs `pip install 'palpate[deploy]'`. The file is run by ONNX Runtime before it is handed over,
     and gives the commands that the policy gives.
 
-    1. After `palpate train`:                   palpate export runs/train-rope-stabilization-001
-                                                    --onnx policy.onnx
+    1. After `palpate train`:                   palpate export POLICY --onnx policy.onnx
     """
 
     policy: Positional[Annotated[Path, arg(metavar="POLICY", help_behavior_hint="")]]

@@ -253,14 +253,14 @@ class Train(Options, ABC):
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """What an evaluation found: figures, a table for a person, and how the trials were drawn.
+class Found:
+    """What a command found out: figures, lines for a person, and what they were measured on.
 
     `notes` are sentences about what could not be done.
     """
 
     figures: list[Figure]
-    table: list[str]
+    lines: list[str]
     settings: dict[str, Any]
     split: dict[str, Any]
     notes: tuple[str, ...] = ()
@@ -268,7 +268,10 @@ class Evaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Options, ABC):
-    """A trained policy in a world; each task says in `evaluate` what is tried and counted."""
+    """A trained policy in the worlds of its family, beside others and beside doing nothing.
+
+    Each task names its trials and who decides in them; the figures of its trials are what counts.
+    """
 
     task: ClassVar[str]
 
@@ -280,22 +283,6 @@ class Evaluate(Options, ABC):
     @abstractmethod
     def prepare(self, model: Model) -> Model:
         """The model as the task drives it."""
-
-    @abstractmethod
-    def check(self, policy: CommandPolicy) -> None:
-        """Raise `PalpateError` where the world cannot be controlled by this policy."""
-
-    @abstractmethod
-    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
-        """Try the policy in the world; leaves evidence and checkpoints in the run."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateInTrials(Evaluate, ABC):
-    """A trained policy in the worlds of its family, beside others and beside doing nothing.
-
-    Each task names its trials and who decides in them; the figures of its trials are what counts.
-    """
 
     @abstractmethod
     def trials(self) -> Sequence[Trial]:
@@ -320,7 +307,7 @@ class EvaluateInTrials(Evaluate, ABC):
             for trial in self.trials():
                 check_period(controller, trial.control_period)
 
-    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Found:
         """Let each controller decide in the same trials; the figures of each."""
         from palpate.trials.trial import evaluate_trials, table
 
@@ -332,9 +319,9 @@ class EvaluateInTrials(Evaluate, ABC):
             type(trials[0]).figures(trials, record, end)
             for end, record in zip(ends, evaluated.values(), strict=True)
         ]
-        return Evaluation(
+        return Found(
             figures=[figure for own in figures for figure in own],
-            table=table(trials, evaluated),
+            lines=table(trials, evaluated),
             settings={"trials": len(trials), **self.constants()},
             split={"evaluated": f"{len(trials)} trials, seed {self.seed}"},
         )
@@ -365,42 +352,20 @@ class Plan(Options, ABC):
         """The problem that the options name; raises `PalpateError` for one that cannot be."""
 
 
-@dataclass(frozen=True)
-class Summary:
-    """What a demo found: figures, what they were measured on, and lines for a person."""
-
-    figures: list[Figure]
-    settings: dict[str, Any]
-    split: dict[str, Any]
-    lines: list[str]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Demo(Options, ABC):
-    """The whole loop once; each family gives the options of every stage.
-
-    `out` of a stage is the folder it works in, and what comes before is the stage before it.
-    """
+    """The whole loop once."""
 
     title: ClassVar[str]  # of its page
     minutes: ClassVar[int]  # on two cores
 
     @abstractmethod
-    def record(self, out: Path) -> Record:
-        """What is recorded."""
+    def stages(self, out: Path, recording: Path) -> tuple[Record, Identify, Train, Evaluate]:
+        """The options of every stage, each of which works in a folder of its own below `out`.
+
+        `recording` is the file of the first. A stage takes up the folder of the one before it.
+        """
 
     @abstractmethod
-    def identify(self, recording: Path, out: Path) -> Identify:
-        """How it is identified."""
-
-    @abstractmethod
-    def train(self, model: Path, out: Path) -> Train:
-        """What is trained."""
-
-    @abstractmethod
-    def evaluate(self, policy: Path, out: Path) -> Evaluate:
-        """Where it is tried."""
-
-    @abstractmethod
-    def summarise(self, identified: Path, evaluated: Path, out: Path) -> Summary:
+    def summarise(self, identified: Path, evaluated: Path, out: Path) -> Found:
         """What was found, from the folders of these stages; may draw a picture into `out`."""

@@ -33,10 +33,14 @@ def band(axis: Any, x: Any, low: np.ndarray, high: np.ndarray, style: Style) -> 
     axis.fill_between(x, low, high, color=style.light, alpha=0.17, linewidth=0)
 
 
-def legend_of(canvas: Any, axis: Any, place: str) -> None:
-    """One legend for all panels, with the series of one of them, outside at `place`."""
-    lines, names = axis.get_legend_handles_labels()
-    canvas.legend(lines, names, loc=f"outside {place}", ncols=len(names), frameon=False)
+def legend_of(canvas: Any, place: str, **look: Any) -> None:
+    """One legend for all panels, outside at `place`; a series that several show stands once."""
+    series: dict[str, Any] = {}
+    for axis in canvas.axes:
+        for line, name in zip(*axis.get_legend_handles_labels(), strict=True):
+            series.setdefault(name, line)
+    settings = {"loc": f"outside {place}", "ncols": len(series), "frameon": False}
+    canvas.legend(list(series.values()), list(series), **(settings | look))
 
 
 def check_suffix(path: Path) -> None:

@@ -207,5 +207,5 @@ def draw(path: Path, earned: dict[str, Rewards]) -> None:
         axis.set(title=f"{name}, {task.episode} decisions an episode", xlabel="decisions")
         axis.set_xlim(left=0)
     axes[0].set_ylabel("mean reward of an episode's decisions (m)")
-    legend_of(canvas, axes[0], "lower center")
+    legend_of(canvas, "lower center")
     save_picture(path, canvas)

@@ -26,7 +26,7 @@ from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.maps.regions import regions_of
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan
-from palpate.report.picture import check_suffix, save_animation, save_picture
+from palpate.report.picture import check_suffix, legend_of, save_animation, save_picture
 
 _INK, _QUIET, _WALL = "#1c2127", "#5b6570", "#3d4650"
 _OBJECT, _MOVED, _ROBOT, _CARRY = "#f3d9a0", "#e8a33d", "#0062a8", "#c04d00"
@@ -82,7 +82,7 @@ def plan_picture(
         goal = plan.goal if plan is not None else next(iter(world.goals), None)
         if goal is not None:
             axes.plot(*goal[:2], label="goal", **_STAR)
-        _legend(figure, axes)
+        legend_of(figure, "upper center", handlelength=2.6)
         save_picture(out, figure, "figure")
     return out
 
@@ -275,11 +275,3 @@ def _draw_ways(axes: Axes, plan: Plan) -> None:
         if segment.kind == TRANSFER:
             axes.plot(*segment.poses[0, :2], marker="o", ms=4, color=_CARRY, zorder=7)
             axes.plot(*segment.poses[-1, :2], marker="s", ms=4, color=_CARRY, zorder=7)
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    handles = {}
-    for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-        handles.setdefault(label, handle)
-    look: Any = {"loc": "outside upper center", "frameon": False, "handlelength": 2.6}
-    figure.legend(list(handles.values()), list(handles), ncols=len(handles), **look)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from palpate.families.options import Demo, Summary
+from palpate.families.options import Demo, Found
 from palpate.families.rope.options import (
     EvaluateRopeStabilization,
     IdentifyRope,
@@ -47,41 +47,32 @@ class DemoRope(Demo):
     minutes: ClassVar[int] = 4
     size: ClassVar[Size] = Size()
 
-    def record(self, out: Path) -> RecordRope:
-        """Trials of the default rope."""
-        size = self.size
-        return RecordRope(out=out, seed=self.seed, trials=size.trials, duration=size.duration)
+    def stages(
+        self, out: Path, recording: Path
+    ) -> tuple[RecordRope, IdentifyRope, TrainRopeStabilization, EvaluateRopeStabilization]:
+        """The default rope, which was weighed, and ropes of another seed.
 
-    def identify(self, recording: Path, out: Path) -> IdentifyRope:
-        """Every second marker is a node, which makes training fast; the rope was weighed."""
-        return IdentifyRope(
-            recordings=(recording,),
-            out=out,
-            seed=self.seed,
-            mass=RecordRope.mass,
-            nodes=self.size.nodes,
-            substeps=self.size.substeps,
-            iterations=self.size.identification,
-        )
+        Every second marker is a node, which makes training fast.
+        """
+        size, seed = self.size, self.seed
+        return (
+            RecordRope(
+                out=out / "record", seed=seed, trials=size.trials, duration=size.duration
+            ),
+            IdentifyRope(
+                recordings=(recording,), out=out / "identify", seed=seed, mass=RecordRope.mass,
+                nodes=size.nodes, substeps=size.substeps, iterations=size.identification,
+            ),
+            TrainRopeStabilization(
+                model=out / "identify", out=out / "train", seed=seed, iterations=size.training,
+                batch=size.batch, starts=size.starts,
+            ),
+            EvaluateRopeStabilization(
+                policy=out / "train", out=out / "evaluate", seed=seed + 1, ropes=size.ropes
+            ),
+        )  # fmt: skip
 
-    def train(self, model: Path, out: Path) -> TrainRopeStabilization:
-        """To bring it to rest."""
-        return TrainRopeStabilization(
-            model=model,
-            out=out,
-            seed=self.seed,
-            iterations=self.size.training,
-            batch=self.size.batch,
-            starts=self.size.starts,
-        )
-
-    def evaluate(self, policy: Path, out: Path) -> EvaluateRopeStabilization:
-        """In ropes of another seed."""
-        return EvaluateRopeStabilization(
-            policy=policy, out=out, seed=self.seed + 1, ropes=self.size.ropes
-        )
-
-    def summarise(self, identified: Path, evaluated: Path, out: Path) -> Summary:
+    def summarise(self, identified: Path, evaluated: Path, out: Path) -> Found:
         """The recorded motion beside its prediction, and the energy with and without control."""
         from palpate.families.rope.motion_figure import motion_figure
         from palpate.report import read_evidence
@@ -105,7 +96,7 @@ class DemoRope(Demo):
         rest = ": never; a longer training would help"
         if seconds is not None:
             rest = f" {seconds:.2f} s, {periods:.2f} periods"
-        return Summary(
+        return Found(
             figures=figures,
             settings=dataclasses.asdict(self.size),
             split={

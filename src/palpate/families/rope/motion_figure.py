@@ -12,12 +12,11 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.report.charts import quantiles
 from palpate.report.evidence import Curves, Motion
-from palpate.report.picture import check_suffix, save_picture
+from palpate.report.picture import check_suffix, legend_of, save_picture
 from palpate.report.style import STYLES, Style, numbered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _NOTHING = "the motion holds nothing but gaps: there is nothing to draw"
 _INK, _QUIET, _RULE = "#1c2127", "#5b6570", "#dfe3e7"
@@ -77,7 +76,9 @@ def motion_figure(
                 ax.set_yticklabels([])
         if energy is not None:
             _draw_energy(axes[-1], energy, looks)
-        _legend(figure)
+        if len(looks) > 1:
+            across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
+            legend_of(figure, "upper left", ncols=across, handlelength=3.5)
         save_picture(out, figure, "figure")
     return out
 
@@ -129,28 +130,10 @@ def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
         low, median, high = quantiles(np.maximum(values, 1e-9), (0.05, 0.5, 0.95))
         if len(values) > 1:
             ax.fill_between(energy.time, low, high, color=style.light, alpha=0.16, lw=0)
-        ax.plot(
-            energy.time,
-            median,
-            color=style.light,
-            lw=style.width * 0.75,
-            ls=style.linestyle,
-            label=label,
-        )
+        look = {"color": style.light, "lw": style.width * 0.75, "ls": style.linestyle}
+        ax.plot(energy.time, median, label=label, **look)
     ax.axhline(0.01, color=_INK, lw=0.8, ls=(0, (4, 3)))
     ax.set(yscale="log", ylim=(10**-4.2, None), xlabel="time (s)")
     ax.set_title("energy relative to the start", color=_INK)
     ax.set_yticks([1e-4, 1e-3, 1e-2, 1e-1, 1], ["0.01 %", "0.1 %", "1 %", "10 %", "100 %"])
     ax.minorticks_off()
-
-
-def _legend(figure: "Figure") -> None:
-    """One legend for all panels, a label that stands in several shown once."""
-    handles = {}
-    for ax in figure.axes:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
-    if len(handles) > 1:
-        across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
-        place = {"loc": "outside upper left", "ncols": across, "frameon": False}
-        figure.legend(handles.values(), handles.keys(), handlelength=3.5, **place)

@@ -10,8 +10,8 @@ from tyro.conf import arg
 
 from palpate.errors import PalpateError
 from palpate.families.options import (
-    EvaluateInTrials,
-    Evaluation,
+    Evaluate,
+    Found,
     Identify,
     Number,
     Record,
@@ -251,7 +251,7 @@ class TrainRopeTracking(TrainRope):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateRope(EvaluateInTrials):
+class EvaluateRope(Evaluate):
     """Evaluation in MuJoCo ropes, drawn around the one that is recorded by default."""
 
     ropes: int
@@ -261,7 +261,7 @@ class EvaluateRope(EvaluateInTrials):
         return _driven_by_velocity(model)
 
     def check(self, policy: CommandPolicy) -> None:
-        """See `EvaluateInTrials.check`; there has to be a rope, too."""
+        """See `Evaluate.check`; there has to be a rope, too."""
         if self.ropes < 1:
             raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
         super().check(policy)
@@ -297,7 +297,7 @@ class EvaluateRopeStabilization(EvaluateRope):
         return evaluation_trials(RopeConfiguration(), self.ropes, self.seed)
 
     def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
-        """See `EvaluateInTrials.controllers`."""
+        """See `Evaluate.controllers`."""
         from palpate.tasks.rope import RopeStabilization
         from palpate.trials.rope.baselines import baselines
         from palpate.trials.rope.learned import LearnedController
@@ -314,8 +314,8 @@ class EvaluateRopeStabilization(EvaluateRope):
 
         write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
 
-    def evaluate(self, policy: CommandPolicy, run: Run) -> Evaluation:
-        """See `EvaluateInTrials.evaluate`; one trial is rendered, too."""
+    def evaluate(self, policy: CommandPolicy, run: Run) -> Found:
+        """See `Evaluate.evaluate`; one trial is rendered, too."""
         from palpate.trials.rope.rendering import render_trial
 
         found, (first, *_) = super().evaluate(policy, run), self.trials()
@@ -360,7 +360,7 @@ class EvaluateRopeTracking(EvaluateRope):
         return path_trials(RopeConfiguration(), self.ropes, self.seed, self.paths)
 
     def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
-        """See `EvaluateInTrials.controllers`."""
+        """See `Evaluate.controllers`."""
         from palpate.tasks.rope import RopeTracking
         from palpate.trials.rope.learned import LearnedController
         from palpate.trials.rope.tracking import blind_controllers

@@ -11,7 +11,7 @@ import numpy as np
 
 from palpate.networks import Controller
 from palpate.report.evidence import write_evidence
-from palpate.report.picture import canvas_of, save_picture
+from palpate.report.picture import canvas_of, legend_of, save_picture
 from palpate.report.style import STYLES
 from palpate.runs import Figure, Run
 from palpate.tasks.rope import RopeTracking
@@ -265,6 +265,5 @@ def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followe
             below.semilogy(time, 100 * np.linalg.norm(tips - path, axis=1), **look)
         above.set(title=trial.name, xlabel="x (m)", ylabel="y (m)", aspect="equal")
         below.set(xlabel="time (s)", ylabel="distance of the tip from the path (cm)")
-    canvas.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
-                  fontsize=8, frameon=False)  # fmt: skip
+    legend_of(canvas, "lower center", fontsize=8)
     save_picture(file, canvas)

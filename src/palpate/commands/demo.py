@@ -24,12 +24,17 @@ def run(options: Demo) -> Path:
     print(f"demo: about {options.minutes} minutes on two cores, written to {out}", flush=True)
     if options.fresh and out.is_dir():
         folders.start_over(out, "demo")
-    works = record.run, identify.run, train.run, evaluate.run
-    stages = options.stages(out, out / "record" / folders.RECORDING)
-    done = [work(stage) for work, stage in zip(works, stages, strict=True)]
-    paths = [done[0].parent, *done[1:]]
-    results = [read_result(path / RESULT) for path in paths]
-    found = options.summarise(paths[1], paths[3], out)
+    recorded, identified, trained, evaluated = options.stages(
+        out, out / "record" / folders.RECORDING
+    )
+    stages = [
+        record.run(recorded).parent,
+        identify.run(identified),
+        train.run(trained),
+        evaluate.run(evaluated),
+    ]
+    results = [read_result(stage / RESULT) for stage in stages]
+    found = options.summarise(stages[1], stages[3], out)
     result = Result(
         name="demo",
         figures=found.figures,
@@ -40,7 +45,7 @@ def run(options: Demo) -> Path:
     )
     write_json(out / RESULT, result.to_dict())
     notes = results[-1].settings["notes"]
-    build_report([out, *paths], out / folders.REPORT, options.title, notes)
+    build_report([out, *stages], out / folders.REPORT, options.title, notes)
     print("\n".join(["", *found.lines]))
     print(f"report: {out / folders.REPORT}")
     return out

@@ -184,7 +184,7 @@ class Summary:
         rate, (low, high) = self.success_rate, self.interval
         spread = max(rate - low, high - rate)
         of_rate: dict[str, Any] = {"bar": bars[0], "better": "higher", "spread": spread}
-        of_periods = {"bar": bars[1], "spread": self.margin}
+        of_periods: dict[str, Any] = {"bar": bars[1], "spread": self.margin}
         return [
             Figure(f"success_rate{suffix}", rate, "", **of_rate),
             Figure(f"time_to_1pct_periods{suffix}", self.periods, "periods", **of_periods),

@@ -40,16 +40,18 @@ def sentence(box: str, program: str, words: list[str]) -> str:
     lines = [line.strip("│╭╮╰╯─ ") for line in box.splitlines()]
     _, *inside = [line for line in lines if line.strip("-")]  # a title, and rules between parts
     text = " ".join(" ".join(inside).split())
-    for pattern, told in (
+    for pattern, answer in (
         (r"Error parsing (--\S+): .* Argument helptext: \1 (.*?) [A-Z][a-z]", _wrong_value),
-        (r"Error parsing [A-Z]\w+: (.*?) For full helptext", _refused),
+        (r"Error parsing [A-Z]\w+: (.*?) For full helptext", "{0}"),
         (r"Unrecognized options: ([^ ,]+)(?:.*? Perhaps you meant.*?: (--\S+))?", _unknown),
         (r"invalid choice '(.*)' for argument '(--\S+)'. Expected one of \((.*?)\)", _no_choice),
-        (r"Missing value for argument '(--\S+)'", _no_value),
-        (r"Missing from .*?: (--\S+ \S+)", _missing),
+        (r"Missing value for argument '(--\S+)'", "{0} needs a value"),
+        (r"Missing from .*?: (--\S+ \S+)", "{0} is missing"),
     ):
         if match := re.match(pattern, text):
-            return told(match, words) + f"; `{program} --help` says what there is"
+            given = isinstance(answer, str)
+            wrong = answer.format(*match.groups()) if given else answer(match, words)
+            return f"{wrong}; `{program} --help` says what there is"
     return text  # of another release of tyro: as it stands
 
 
@@ -62,10 +64,6 @@ def _wrong_value(match: re.Match[str], words: list[str]) -> str:
     return f"{option} takes {_TAKES.get(takes, takes)}, not '{' '.join(given)}'"
 
 
-def _refused(match: re.Match[str], words: list[str]) -> str:
-    return match[1]
-
-
 def _unknown(match: re.Match[str], words: list[str]) -> str:
     what = "option" if match[1].startswith("-") else "word"
     return f"unknown {what} '{match[1]}'" + (f", did you mean '{match[2]}'?" if match[2] else "")
@@ -74,11 +72,3 @@ def _unknown(match: re.Match[str], words: list[str]) -> str:
 def _no_choice(match: re.Match[str], words: list[str]) -> str:
     choices = sorted(set(re.findall(r"'(.*?)'", match[3])) - {"None"})
     return f"{match[2]} takes {', '.join(choices[:-1])} or {choices[-1]}, not '{match[1]}'"
-
-
-def _no_value(match: re.Match[str], words: list[str]) -> str:
-    return f"{match[1]} needs a value"
-
-
-def _missing(match: re.Match[str], words: list[str]) -> str:
-    return f"{match[1]} is missing"

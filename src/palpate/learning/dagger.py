@@ -4,14 +4,14 @@ After SPiD (Long et al. 2026, arXiv 2602.03623: "monitoring loss evolution onlin
 added in the dataset; training is still done offline later; it does not require expert data") and
 DAgger (Ross, Gordon and Bagnell 2011, AISTATS). For what counts as a shift, see `loss_monitor`.
 
-The states from which the loss parts from what was predicted are collected, and training through the
+The states from which the loss exceeds what was predicted are collected, and training through the
 model goes on from a pool of starts of which they are half.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,13 +29,9 @@ from palpate.tasks.task import Start, Task
 OBSERVED = "observed.safetensors"
 
 
-@runtime_checkable
-class Trials(Protocol):
-    """Runs a policy in a world; whatever makes the trials differ is drawn by the seed."""
-
-    def __call__(self, policy: CommandPolicy, seed: int) -> Observed:
-        """What was observed, finite: a trial that ended early is left out."""
-        ...
+# Runs a policy in a world, whatever makes the trials differ drawn by the seed. What was observed is
+# finite: a trial that ended early is left out.
+Trials = Callable[[CommandPolicy, int], Observed]
 
 
 @dataclass(frozen=True)

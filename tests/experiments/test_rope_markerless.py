@@ -1,6 +1,7 @@
 """What `reproduce rope-markerless` measures and keeps, at a size of seconds."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from palpate.models.rope import Rope, RopeState
 from palpate.runs.run import RESULT
 from palpate.trials.rope import filming as rope_filming
 from palpate.trials.rope import stabilization
-from palpate.trials.rope.filming import film
+from palpate.trials.rope.filming import empty_films, film
 from palpate.trials.rope.stabilization import StabilizationTrial
 from palpate.worlds.camera import Sensor
 from palpate.worlds.rope.rope import RopeConfiguration
@@ -21,12 +22,16 @@ from palpate.worlds.rope.rope import RopeConfiguration
 MODEL = Rope.uniform(nodes=11, substeps=4, bend_stiffness=2e-3, bend_damping=5e-4)
 
 
+def filmed(trial: StabilizationTrial, sensor: Sensor) -> SimpleNamespace:
+    """One rope that swings before a plain background."""
+    row = {name: part[0] for name, part in empty_films(1, trial.steps, MODEL.nodes).items()}
+    film(trial, row, model=MODEL, policy=None, background="plain", sensor=sensor, shaken=False)
+    return SimpleNamespace(**row)
+
+
 def test_a_trial_is_kept_beside_what_it_is_compared_with():
     trial = StabilizationTrial(RopeConfiguration(), "straight", 3, 8)
-    kept = film(
-        trial, model=MODEL, policy=None, background="plain",
-        sensor=Sensor(sub_frames=2), shaken=False,
-    )  # fmt: skip
+    kept = filmed(trial, Sensor(sub_frames=2))
     tracked, centre_line, alone, hanging = np.sqrt(kept.squared_error) * 100
     assert tracked.max() < 2.0
     assert np.isfinite(centre_line).tolist() == [step in (0, 6) for step in range(9)]
@@ -46,10 +51,7 @@ def test_a_simulation_that_diverges_leaves_nan(monkeypatch):
         raise rope_filming.DivergedError("too fast")
 
     monkeypatch.setattr(rope_filming.FilmedRope, "step", diverge)
-    kept = film(
-        StabilizationTrial(RopeConfiguration(), "straight", 3, 2), model=MODEL, policy=None,
-        background="plain", sensor=Sensor(sub_frames=1), shaken=False,
-    )  # fmt: skip
+    kept = filmed(StabilizationTrial(RopeConfiguration(), "straight", 3, 2), Sensor(sub_frames=1))
     assert np.isfinite(kept.energy).tolist() == [True, False, False]
 
 

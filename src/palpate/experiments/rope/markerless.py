@@ -27,7 +27,7 @@ from palpate.runs import Figure, Result, Run
 from palpate.runs.result import two_standard_errors
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.controller import HeldStill
-from palpate.trials.rope.filming import Filming, film, frame_times
+from palpate.trials.rope.filming import empty_films, film, frame_times
 from palpate.trials.rope.learned import LearnedController
 from palpate.trials.rope.stabilization import (
     TRIAL_PERIODS,
@@ -154,8 +154,8 @@ def _filmed(
     model: Rope,
     policy: CommandPolicy,
 ) -> dict[str, np.ndarray]:
-    """What happened in the trials of a row: arrays as in `Filming`, (trials, ...)."""
-    arrays = Filming.empty(len(trials), trials[0].steps or 0, model.nodes)
+    """What happened in the trials of a row: see `empty_films`."""
+    arrays = empty_films(len(trials), trials[0].steps or 0, model.nodes)
     cores = devices.cores()
     work = [range(first, min(first + cores, len(trials))) for first in range(0, len(trials), cores)]
     one = functools.partial(
@@ -164,10 +164,8 @@ def _filmed(
     )  # fmt: skip
     with ThreadPoolExecutor(cores) as threads:
         for chosen, note in resumable(run, work, arrays, f"filming: {name}"):
-            films = threads.map(one, [trials[place] for place in chosen])
-            for place, filming in zip(chosen, films, strict=True):
-                for part in arrays:
-                    arrays[part][place] = getattr(filming, part)
+            rows = [{name: part[place] for name, part in arrays.items()} for place in chosen]
+            list(threads.map(one, [trials[place] for place in chosen], rows))
             note(rmse_cm=_finite(_rmse(_missed(arrays)[: chosen[-1] + 1])))
     return arrays
 

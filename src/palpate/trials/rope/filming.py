@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,65 +26,41 @@ COMPILED = 20  # control periods, by which everything has been called once
 TIMED = 100  # control periods of which the computing time of frames is taken
 
 
-@dataclass
-class Filming:
-    """What happened, once per control period from the start on.
+def empty_films(trials: int, steps: int, nodes: int) -> dict[str, np.ndarray]:
+    """What happens in that many trials, once per control period from the start on; all NaN.
 
-    `squared_error` (4, times) in m^2, mean over the nodes but the gripper's: of the tracker now; of
-    the picture's centre line at its own time, NaN between frames; of the model alone since the
-    first frame; and of a rope that hangs straight down. `true` and `tracked` (times, nodes, 3) in
-    m. `hidden` (times,): the share of the rope's nodes that the last frame did not show. All NaN
-    from where a simulation diverged, and what the tracker is compared with NaN under control.
+    `squared_error` (trials, 4, times) in m^2, mean over the nodes but the gripper's: of the tracker
+    now; of the picture's centre line at its own time, NaN between frames; of the model alone since
+    the first frame; and of a rope that hangs straight down. `true` and `tracked` (trials, times,
+    nodes, 3) in m; `energy` in J, `gripper_speed` in m/s, and `hidden`, the share of the rope's
+    nodes that the last frame did not show, (trials, times).
     """
-
-    squared_error: np.ndarray
-    true: np.ndarray
-    tracked: np.ndarray
-    energy: np.ndarray
-    gripper_speed: np.ndarray
-    hidden: np.ndarray
-
-    @staticmethod
-    def empty(trials: int, steps: int, nodes: int) -> dict[str, np.ndarray]:
-        """Arrays of that many trials, one for each field, all NaN."""
-        shapes = {
-            "squared_error": (4, steps + 1),
-            "true": (steps + 1, nodes, 3),
-            "tracked": (steps + 1, nodes, 3),
-            **dict.fromkeys(("energy", "gripper_speed", "hidden"), (steps + 1,)),
-        }
-        return {
-            name: np.full((trials, *shape), np.nan, np.float32) for name, shape in shapes.items()
-        }
+    shapes = {
+        "squared_error": (4, steps + 1),
+        "true": (steps + 1, nodes, 3),
+        "tracked": (steps + 1, nodes, 3),
+        **dict.fromkeys(("energy", "gripper_speed", "hidden"), (steps + 1,)),
+    }
+    return {name: np.full((trials, *shape), np.nan, np.float32) for name, shape in shapes.items()}
 
 
 def film(
     trial: StabilizationTrial,
+    kept: Mapping[str, np.ndarray],
     *,
     model: Rope,
     policy: CommandPolicy | None,
     background: Background,
     sensor: Sensor,
     shaken: bool,
-) -> Filming:
-    """Run the trial: controlled by `policy` through the camera, else shaken, else held still."""
-    world = FilmedRope(trial.configuration, sensor, background=background)
-    empty = Filming.empty(1, trial.steps or 0, model.nodes)
-    kept = Filming(**{name: part[0] for name, part in empty.items()})
-    with contextlib.suppress(DivergedError):  # what comes after stays NaN: a failure to settle
-        _run(world, trial, kept, model, policy, shaken)
-    return kept
-
-
-def _run(
-    world: FilmedRope,
-    trial: StabilizationTrial,
-    kept: Filming,
-    model: Rope,
-    policy: CommandPolicy | None,
-    shaken: bool,
 ) -> None:
+    """Run the trial: controlled by `policy` through the camera, else shaken, else held still.
+
+    What happens is written into `kept`, one row of `empty_films`; from where a simulation diverges
+    it stays NaN, and so does what the tracker is compared with under control.
+    """
     configuration, steps = trial.configuration, trial.steps or 0
+    world = FilmedRope(configuration, sensor, background=background)
     tracker = RopeTracker(model, world.pinhole, Appearance(ROPE_COLOUR, configuration.radius))
     alone = RopeTracker(model, world.pinhole, Appearance(ROPE_COLOUR, configuration.radius))
     every = configuration.bodies // (model.nodes - 1)
@@ -94,30 +70,31 @@ def _run(
             trial.seed, steps * world.control_period, world.control_period,
             configuration.speed_limit, configuration.acceleration_limit,
         )  # fmt: skip
-    observation = world.reset(trial.seed, start=trial.start)
-    state = _started(tracker, observation)
-    predicted = _started(alone, observation)
-    decide = None if policy is None else _Decisions(policy)
-    for step in range(steps + 1):
-        if step:
-            command = commands[step - 1] if decide is None else decide(state)
-            observation = world.step(command)
-            state = tracker.step(observation.gripper_position, observation.frame)
+    with contextlib.suppress(DivergedError):  # a failure to settle
+        observation = world.reset(trial.seed, start=trial.start)
+        state = _started(tracker, observation)
+        predicted = _started(alone, observation)
+        decide = None if policy is None else _Decisions(policy)
+        for step in range(steps + 1):
+            if step:
+                command = commands[step - 1] if decide is None else decide(state)
+                observation = world.step(command)
+                state = tracker.step(observation.gripper_position, observation.frame)
+                if policy is None:
+                    predicted = alone.step(observation.gripper_position)
+            truth = world.truth()
+            nodes = truth.positions[::every]
+            kept["true"][step], kept["tracked"][step] = nodes, state.position
+            kept["energy"][step] = truth.energy
+            kept["gripper_speed"][step] = np.linalg.norm(truth.gripper_velocity)
+            kept["squared_error"][0, step] = _mean_square(state.position - nodes)
             if policy is None:
-                predicted = alone.step(observation.gripper_position)
-        truth = world.truth()
-        nodes = truth.positions[::every]
-        kept.true[step], kept.tracked[step] = nodes, state.position
-        kept.energy[step] = truth.energy
-        kept.gripper_speed[step] = np.linalg.norm(truth.gripper_velocity)
-        kept.squared_error[0, step] = _mean_square(state.position - nodes)
-        if policy is None:
-            down = np.linspace(0, configuration.length, model.nodes)[:, None] * [0, 0, -1]
-            hanging = truth.gripper_position + down
-            kept.squared_error[2, step] = _mean_square(predicted.position - nodes)
-            kept.squared_error[3, step] = _mean_square(hanging - nodes)
-        if policy is None and observation.frame is not None:
-            _keep_picture(kept, step, observation, world, model, configuration.radius)
+                down = np.linspace(0, configuration.length, model.nodes)[:, None] * [0, 0, -1]
+                hanging = truth.gripper_position + down
+                kept["squared_error"][2, step] = _mean_square(predicted.position - nodes)
+                kept["squared_error"][3, step] = _mean_square(hanging - nodes)
+            if policy is None and observation.frame is not None:
+                _keep_picture(kept, step, observation, world, model, configuration.radius)
 
 
 def frame_times(model: Rope) -> np.ndarray:
@@ -150,7 +127,7 @@ def _mean_square(miss) -> float:
 
 
 def _keep_picture(
-    kept: Filming,
+    kept: Mapping[str, np.ndarray],
     step: int,
     observation: FilmedObservation,
     world: FilmedRope,
@@ -163,17 +140,17 @@ def _keep_picture(
     instant = min(frame.time / world.control_period, step)
     before = int(instant)
     after = min(before + 1, step)
-    nodes = kept.true[before] + (instant - before) * (kept.true[after] - kept.true[before])
+    nodes = kept["true"][before] + (instant - before) * (kept["true"][after] - kept["true"][before])
     rest_length = np.asarray(model.rest_length)
     gripper, length = np.asarray(nodes[0], float), float(rest_length.sum())
     seen = segment(frame, Appearance(ROPE_COLOUR, radius), world.pinhole, gripper, REACH * length)
     points = line_points(seen)
     pixels, _ = world.pinhole.project(nodes[1:])
     apart = np.linalg.norm(pixels[:, None] - points.pixels[None], axis=-1)
-    kept.hidden[step] = np.mean(apart.min(axis=1, initial=np.inf) > 3.0)
+    kept["hidden"][step] = np.mean(apart.min(axis=1, initial=np.inf) > 3.0)
     if len(points.pixels) >= FEWEST:
         line = centre_lines(seen, world.pinhole, gripper, length)[0]
-        kept.squared_error[1, step] = _mean_square(line.nodes(rest_length) - nodes)
+        kept["squared_error"][1, step] = _mean_square(line.nodes(rest_length) - nodes)
 
 
 class _Decisions:

@@ -18,7 +18,7 @@ from palpate.planning.gradient import GradientPlanner
 from palpate.planning.sampling import Cem, Mppi, SamplingPlanner
 from palpate.tasks.rope import RopeStabilization, RopeTracking
 from palpate.tasks.rope.paths import DesiredPath
-from palpate.tasks.rope.stabilization import LEAST_ENERGY, STABILISED
+from palpate.tasks.rope.stabilization import LEAST_ENERGY, STABILISED, RopeTask
 from palpate.tasks.rope.tracking import hanging_rope
 from palpate.trials.controller import FeedbackController
 from palpate.trials.rope.learned import RopeObserver
@@ -59,7 +59,7 @@ def stabilising_planner(method: str, model: Rope, size: int) -> CurvePlanner:
     shared = _shared(RopeStabilization(), model, energy_and_speed(model), TUNING)
     if method == "gradient":
         return GradientPlanner(**shared, iterations=size)
-    return _sampling_planner(method, shared, TUNING, size, None)
+    return _sampling_planner(method, shared, TUNING, size)
 
 
 def following_planner(
@@ -73,9 +73,7 @@ def following_planner(
     return _sampling_planner(method, shared, FOLLOWING, samples, iterations)
 
 
-def _shared(
-    task: RopeStabilization | RopeTracking, model: Rope, stage_loss: StageLoss, tuning: Tuning
-) -> dict[str, Any]:
+def _shared(task: RopeTask, model: Rope, stage_loss: StageLoss, tuning: Tuning) -> dict[str, Any]:
     return {
         "model": model,
         "stage_loss": stage_loss,
@@ -87,9 +85,13 @@ def _shared(
 
 
 def _sampling_planner(
-    method: str, shared: Mapping[str, Any], tuning: Tuning, samples: int, iterations: int | None
+    method: str,
+    shared: Mapping[str, Any],
+    tuning: Tuning,
+    samples: int,
+    iterations: int | None = None,
 ) -> SamplingPlanner:
-    iterations = tuning.iterations[method] if iterations is None else iterations
+    iterations = iterations or tuning.iterations[method]
     return SamplingPlanner(
         **shared,
         rule=Cem() if method == "cem" else Mppi(tuning.temperature),

@@ -31,7 +31,7 @@ from palpate.worlds.rope.rope import (
 # World constants, written down before the first evaluation.
 SIZES, DURATIONS = (0.4, 0.8), (4.0, 6.0)  # m and s; about 1 to 2 m of path, as in the seed's code
 TILTS = (0.0, math.pi / 6)  # rad, of a path's plane from the horizontal
-DRAWN = SIZES, DURATIONS, TILTS
+DRAWN = {"size": SIZES, "duration": DURATIONS, "tilt": TILTS, "azimuth": (0.0, 2 * math.pi)}
 
 
 @dataclass(frozen=True)
@@ -152,20 +152,11 @@ def path_trials(
     trials = []
     for name in names:
         for configuration in configurations:
-            size, duration, tilt = (random.uniform(*between) for between in DRAWN)
-            azimuth = random.uniform(0.0, 2 * math.pi)
+            drawn = {what: random.uniform(*between) for what, between in DRAWN.items()}
             if name.endswith(".csv"):
                 path = read_path(name, period, beyond)
             else:
-                path = named_path(
-                    name,
-                    size=size,
-                    duration=duration,
-                    period=period,
-                    azimuth=azimuth,
-                    tilt=tilt,
-                    beyond=beyond,
-                )
+                path = named_path(name, period=period, beyond=beyond, **drawn)
             hanging = np.array(GRIPPER_START) - [0, 0, configuration.length]
             steps = len(path) - 1 - round(beyond / period)
             own = int(random.integers(2**31))

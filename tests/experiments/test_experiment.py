@@ -9,12 +9,12 @@ from palpate.experiments.experiment import (
     decision_figures,
     mean_of,
     ratio,
-    resumable,
     share_of,
     suffix,
 )
 from palpate.runs.run import RESULT, read_metrics
 from palpate.runs.storage import read_json
+from palpate.trials.trial import resumable
 
 
 def squares(experiment, cut_off=None):

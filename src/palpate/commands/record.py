@@ -15,8 +15,10 @@ from palpate.runs.run import RESULT
 def run(options: Record) -> Path:
     """Record, say where the file is, and return its path.
 
-    Raises `PalpateError` rather than overwrite a file that holds another recording.
+    Raises `PalpateError` for no trials, and rather than overwrite another recording.
     """
+    if options.trials < 1:
+        raise PalpateError(f"a recording has at least one trial, not {options.trials}")
     configuration = {
         name: " ".join(value) if isinstance(value, tuple) else value  # provenance is text
         for name, value in folders.configuration_of(options, f"record {options.family}").items()

@@ -1,6 +1,7 @@
 """How long something took, counted in bins so that nothing is allocated while it is measured."""
 
 import bisect
+import itertools
 from typing import Any
 
 _BIN, _BINS = 1e-5, 5000  # s; 10 us up to 50 ms, and all above in the last one
@@ -28,23 +29,20 @@ class Histogram:
         """
         if not self.count:
             return None
-        wanted, below, sums = share * self.count, 0, []
-        for count in self._counts:
-            below += count
-            sums.append(below)
-        place = bisect.bisect_left(sums, wanted)
+        sums = list(itertools.accumulate(self._counts))
+        place = bisect.bisect_left(sums, share * self.count)
         return min((place + 1) * _BIN, self.largest) if place < _BINS else self.largest
 
     def to_dict(self) -> dict[str, Any]:
         """Quantiles in ms, and the bins that are not empty as [lower edge in ms, count]."""
-        told: dict[str, Any] = {"count": self.count}
+        content: dict[str, Any] = {"count": self.count}
         if self.count:
             for name, share in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999)):
-                told[f"{name}_ms"] = 1e3 * (self.quantile(share) or 0.0)
-            told["largest_ms"] = 1e3 * self.largest
-        told["bins_ms"] = [
+                content[f"{name}_ms"] = 1e3 * (self.quantile(share) or 0.0)
+            content["largest_ms"] = 1e3 * self.largest
+        content["bins_ms"] = [
             [round(1e3 * _BIN * place, 2), count]
             for place, count in enumerate(self._counts)
             if count
         ]
-        return told
+        return content

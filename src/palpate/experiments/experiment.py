@@ -13,18 +13,15 @@ A stage is a run in a folder of its own: cut off, it resumes there; finished, it
 
 import contextlib
 import dataclasses
-import numbers
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, SupportsFloat
 
-import jax
 import numpy as np
 
 from palpate.networks import Controller
 from palpate.runs import Figure, Result, Run
-from palpate.runs.progress import interruptible, progress
 from palpate.runs.result import two_standard_errors
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json
@@ -152,29 +149,6 @@ class Experiment:
         seeds = list(dict.fromkeys(self.seeds if seeds is None else seeds))
         settings = {"quick": self.quick, **settings}
         return Result(self.name, figures, settings, seeds, split, self.seconds)
-
-
-def resumable(
-    run: Run, items: Sequence[Any], arrays: Any, label: str
-) -> Iterator[tuple[Any, Callable[..., None]]]:
-    """Go through `items` from where the run was cut off; `arrays` are saved after each.
-
-    `arrays` is a tree of NumPy arrays to be written on; what was saved is put into them first. With
-    each item comes a function that notes numbers for it, beside the bar and in the run's metrics.
-    """
-    done, kept = run.restore(arrays) or (0, arrays)
-    jax.tree.map(np.copyto, arrays, kept)
-    bar = progress(items[done:], label, done=done)
-    with interruptible() as stop:
-        for step, item in enumerate(bar, done + 1):
-            noted: dict[str, Any] = {}
-            yield item, noted.update
-            bar.show(**{n: v for n, v in noted.items() if isinstance(v, numbers.Real)})
-            if noted:
-                run.log(step, **noted)
-            run.save(step, arrays)
-            if stop:
-                break
 
 
 # --- figures ----------------------------------------------------------------------------------

@@ -8,11 +8,13 @@ the truth.
 import dataclasses
 import functools
 import math
+import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, Generic, TypeVar
 
+import jax
 import numpy as np
 
 from palpate.errors import PalpateError
@@ -251,30 +253,49 @@ def evaluate_trials(
     longest = _longest(trials, steps)
     done = {name: kind.record(trials, longest, len(drawn)) for name in controllers}
     work = list(_chunks(controllers, len(trials), kind.side_by_side))
-    step = _restore(run, done)
-    bar = progress(work[step:], "trials", done=step)
+    arrays = {name: record.arrays() for name, record in done.items()}
+    for (name, chosen), note in resumable(run, work, arrays, "trials"):
+        some = [trials[index] for index in chosen]
+        places = [place for place, index in enumerate(chosen) if index in drawn]
+        part = run_trials(some, controllers[name], steps, places)
+        rows = [drawn.index(chosen[place]) for place in places]
+        for field, values in part.arrays().items():
+            whole = arrays[name][field]
+            whole[rows if field == part.observed else chosen, : values.shape[1]] = values
+        failures = {chosen[place]: why for place, why in part.failures.items()}
+        done[name].failures.update(failures)
+        reasons = {str(trial): why for trial, why in failures.items()}
+        first, *_ = kind.figures(some, part)
+        note(controller=name, failures=reasons, **{first.name: first.value})
+    for line in run.metrics() if run is not None else ():  # those of earlier processes, too
+        failures = {int(trial): why for trial, why in line["failures"].items()}
+        done[line["controller"]].failures.update(failures)
+    return done
+
+
+def resumable(
+    run: Run | None, items: Sequence[Any], arrays: Any, label: str
+) -> Iterator[tuple[Any, Callable[..., None]]]:
+    """Go through `items` from where the run was cut off; `arrays` are saved after each.
+
+    `arrays` is a tree of NumPy arrays to be written on; what was saved is put into them first. With
+    each item comes a function that notes values for it in the run's metrics, numbers beside the bar
+    too. Without a run nothing is saved.
+    """
+    done, kept = (run and run.restore(arrays)) or (0, arrays)
+    jax.tree.map(np.copyto, arrays, kept)
+    bar = progress(items[done:], label, done=done)
     with interruptible() as stop:
-        for name, chosen in bar:
-            some = [trials[index] for index in chosen]
-            places = [place for place, index in enumerate(chosen) if index in drawn]
-            part = run_trials(some, controllers[name], steps, places)
-            rows = [drawn.index(chosen[place]) for place in places]
-            for field, values in part.arrays().items():
-                whole = getattr(done[name], field)
-                whole[rows if field == part.observed else chosen, : values.shape[1]] = values
-            failures = {chosen[place]: why for place, why in part.failures.items()}
-            done[name].failures.update(failures)
-            step += 1
-            first, *_ = kind.figures(some, part)
-            if first.value is not None:
-                bar.show(**{first.name: first.value})
+        for step, item in enumerate(bar, done + 1):
+            noted: dict[str, Any] = {}
+            yield item, noted.update
+            bar.show(**{n: v for n, v in noted.items() if isinstance(v, numbers.Real)})
             if run is not None:
-                reasons = {str(trial): why for trial, why in failures.items()}
-                run.log(step, controller=name, failures=reasons, **{first.name: first.value})
-                run.save(step, _arrays(done))
+                if noted:
+                    run.log(step, **noted)
+                run.save(step, arrays)
             if stop:
                 break
-    return done
 
 
 def by_group(
@@ -302,25 +323,6 @@ def _chunks(names: Mapping[str, Any], count: int, size: int) -> Iterator[tuple[s
     for name in names:
         for first in range(0, count, size):
             yield name, list(range(first, min(first + size, count)))
-
-
-def _restore(run: Run | None, done: Mapping[str, Record]) -> int:
-    """Fill in what an earlier process did; the number of chunks of trials that it was."""
-    restored = None if run is None else run.restore(_arrays(done))
-    if run is None or restored is None:
-        return 0
-    step, arrays = restored
-    for name, parts in arrays.items():
-        for part, array in parts.items():
-            getattr(done[name], part)[:] = array
-    for line in run.metrics():
-        failures = {int(trial): why for trial, why in line["failures"].items()}
-        done[line["controller"]].failures.update(failures)
-    return step
-
-
-def _arrays(done: Mapping[str, Record]) -> dict[str, dict[str, np.ndarray]]:
-    return {name: record.arrays() for name, record in done.items()}
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.experiments.experiment import Experiment, resumable
+from palpate.experiments.experiment import Experiment
 from palpate.experiments.furniture.calibration_figure import rank_figure
 from palpate.identification.posterior.calibration import (
     Problem,
@@ -30,6 +30,7 @@ from palpate.models.planar import Planar, furniture
 from palpate.models.planar.shapes import rectangle
 from palpate.parameters import LogNormal, Normal, declare
 from palpate.runs import Figure, Result, Run
+from palpate.trials.trial import resumable
 
 NAME = "calibration"
 BAR = 0.0035  # the smallest of 14 p-values lies below it in 5 % of calibrated runs

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.experiments.experiment import Experiment, mean_of, resumable, suffix
+from palpate.experiments.experiment import Experiment, mean_of, suffix
 from palpate.report.picture import band, canvas_of, curve, legend_of, save_picture
 from palpate.report.style import STYLES
 from palpate.runs import Figure, Result
@@ -35,6 +35,7 @@ from palpate.trials.furniture.cart_trials import (
     Trial,
     best_scene,
 )
+from palpate.trials.trial import resumable
 
 NAME = "cart-online"
 BAR = 0.05

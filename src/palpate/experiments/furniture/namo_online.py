@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.experiments.experiment import Experiment, resumable, share_of
+from palpate.experiments.experiment import Experiment, share_of
 from palpate.families.furniture.plan_picture import plan_picture, scene_animation
 from palpate.planning.movable_obstacles.motion.primitives import FREE, Constraint
 from palpate.runs import Figure, Result
@@ -39,6 +39,7 @@ from palpate.trials.furniture.namo_episode import (
 )
 from palpate.trials.furniture.namo_execution import FORCE
 from palpate.trials.furniture.rooms import Room, generated_room, scenes
+from palpate.trials.trial import resumable
 
 NAME = "namo-online"
 SOLVED_BAR, ALL_MOVABLE_BAR = 0.95, 0.60

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.experiments.experiment import Experiment, ratio, resumable
+from palpate.experiments.experiment import Experiment, ratio
 from palpate.experiments.rope import nominal
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
@@ -30,7 +30,7 @@ from palpate.tasks.task import Start
 from palpate.trials.controller import Noted, OpenLoop
 from palpate.trials.rope.learned import LearnedController
 from palpate.trials.rope.stabilization import StabilizationTrial, lasting, settling_time
-from palpate.trials.trial import run_trials
+from palpate.trials.trial import resumable, run_trials
 from palpate.worlds.rope.rope import START_POSES, RopeWorld
 
 NAME = "rope-bound"

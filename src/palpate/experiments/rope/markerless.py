@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.experiments.experiment import Experiment, resumable, share_of, suffix
+from palpate.experiments.experiment import Experiment, share_of, suffix
 from palpate.experiments.rope import nominal
 from palpate.experiments.rope.nominal import BASE
 from palpate.families.rope.recording import constants
@@ -36,7 +36,7 @@ from palpate.trials.rope.stabilization import (
     evaluation_trials,
     summarise,
 )
-from palpate.trials.trial import run_trials
+from palpate.trials.trial import resumable, run_trials
 from palpate.worlds.camera import Sensor
 from palpate.worlds.rope.filmed import TRIPOD, Background
 from palpate.worlds.rope.rope import START_POSES

@@ -73,8 +73,6 @@ class RecordRope(Record):
         from palpate.families.rope.recording import record_rope
         from palpate.worlds.rope.configuration import RopeConfiguration
 
-        if self.trials < 1:
-            raise PalpateError(f"a recording has at least one trial, not {self.trials}")
         constants = {field.name for field in dataclasses.fields(RopeConfiguration)}
         told = {name: value for name, value in vars(self).items() if name in constants}
         seeds = np.random.SeedSequence(self.seed).generate_state(self.trials)

@@ -51,9 +51,9 @@ def check_suffix(path: Path) -> None:
 
 
 def save_picture(path: Path, canvas: Any, dpi: int | str = 150) -> None:
-    """Write a Matplotlib figure as the kind of file that `path` ends in, .png or .svg."""
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format=path.suffix[1:], dpi=dpi, metadata=_STAMPS[path.suffix])
+    """Write a Matplotlib figure, as SVG where `path` ends so, else as PNG."""
+    kind, buffer = ".svg" if path.suffix == ".svg" else ".png", io.BytesIO()
+    canvas.savefig(buffer, format=kind[1:], dpi=dpi, metadata=_STAMPS[kind])
     write_bytes(path, buffer.getvalue())
 
 

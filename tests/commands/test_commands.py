@@ -198,7 +198,7 @@ def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap(tmp_path):
     data = identify_data.read(IdentifyToy(recordings=(file,)))
     metres, newtons = (
         FitReport(
-            START["cart"], error, error, error, dataclasses.replace(data, unit=unit), None
+            START["cart"], error, error, error, error, dataclasses.replace(data, unit=unit), None
         ).evidence()
         for unit in ("m", "N")
     )

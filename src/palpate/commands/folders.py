@@ -151,7 +151,7 @@ def command(options: Options, words: str) -> str:
 
 
 def start_over(folder: Path, words: str) -> None:
-    """Empty every run in `folder` and below, and remove what was told of them together.
+    """Empty every run in `folder` and below, and remove what was written about them together.
 
     What commands do not write is not touched. Raises `PalpateError`, and removes nothing, when a
     run below was begun by another command than `words` ("reproduce rope-model").
@@ -168,7 +168,7 @@ def start_over(folder: Path, words: str) -> None:
         with Run.open(configuration.parent, read_json(configuration), fresh=True) as run:
             _remove(run.path, (RECORDING, MODEL, POLICY, *_FOR_A_PERSON))
             configuration.unlink()
-        _remove(folder, (RESULT, REPORT, EVIDENCE))  # what was told of all of them
+        _remove(folder, (RESULT, REPORT, EVIDENCE))  # about all of them
 
 
 def product_of(path: Path, product: str, command: str) -> Path:

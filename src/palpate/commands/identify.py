@@ -10,13 +10,13 @@ from pathlib import Path
 
 from palpate.commands import folders, identify_report
 from palpate.commands.identify_data import Data, read
-from palpate.commands.identify_report import CORRECTION, Corrected, FitReport
+from palpate.commands.identify_report import CORRECTION, FitReport
 from palpate.errors import PalpateError
 from palpate.families.options import Hypotheses, Identify
-from palpate.identification.data.prediction import prediction_error
 from palpate.identification.declarations import with_values_of
 from palpate.identification.gradient.descent import Settings, check_shapes
 from palpate.identification.gradient.residual import (
+    Correction,
     ResidualSettings,
     check_correctable,
     fit_residual,
@@ -143,11 +143,11 @@ def _write_fit(
     # Into the model as it was declared: what did not show in these recordings is still there.
     values = {path: value_of(found.model, path) for path in parameters_of(found.model)}
     found = dataclasses.replace(found, model=with_values(start, values))
-    corrected, earlier = (
-        _corrected(found.model, data, options, run) if options.residual else (None, 0.0)
+    correction, earlier = (
+        _correction(found.model, data, options, run) if options.residual else (None, 0.0)
     )
     wall_time = run.elapsed + earlier
-    report = FitReport.of(start, found, data, corrected)
+    report = FitReport.of(start, found.model, data, correction)
     figures, parameters = report.figures(wall_time), identify_report.fitted_rows(found)
     save_model(
         run.path / folders.MODEL,
@@ -166,7 +166,7 @@ def _write_fit(
     folders.finish(run, figures, report.settings(), identify_report.split(data), **rows)
 
 
-def _corrected(model: Model, data: Data, options: Identify, run: Run) -> tuple[Corrected, float]:
+def _correction(model: Model, data: Data, options: Identify, run: Run) -> tuple[Correction, float]:
     """A network on top of the physics where that helps; the recording to score on is not seen.
 
     And the seconds that earlier processes spent on it: it is a run of its own, below this one's.
@@ -179,7 +179,7 @@ def _corrected(model: Model, data: Data, options: Identify, run: Run) -> tuple[C
         earlier = max(0.0, own.elapsed - (time.monotonic() - began))
         if not own.finished:
             own.finish({"kept": correction.kept, "reason": correction.reason})
-    return Corrected(correction, prediction_error(model, data.validation_aligned)), earlier
+    return correction, earlier
 
 
 def _write_draws(

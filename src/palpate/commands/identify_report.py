@@ -47,39 +47,31 @@ def split(data: Data) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Corrected:
-    """What became of a correction, and the error of the physics without it."""
-
-    correction: Correction
-    physics: PredictionError
-
-
-@dataclasses.dataclass(frozen=True)
 class FitReport:
     """A fitted model and its errors beside those of the model it started from.
 
-    Where a correction was kept, `fitted` and `scored` are with it.
+    Where a correction was kept, `fitted` and `scored` are with it; `physics` is without any.
     """
 
     delivered: Model
     fitted: PredictionError
     scored: PredictionError
     start: PredictionError
+    physics: PredictionError
     data: Data
-    corrected: Corrected | None
+    correction: Correction | None
 
     @classmethod
     def of(
-        cls, start: Model, found: Identified, data: Data, corrected: Corrected | None
+        cls, start: Model, physics: Model, data: Data, correction: Correction | None
     ) -> "FitReport":
         """Score what was found on the trials held out, or on the fitted ones if none were."""
-        kept = corrected is not None and corrected.correction.kept
-        model = corrected.correction.model if corrected and kept else found.model
-        fitted = prediction_error(model, data.fitted_aligned)
+        model = correction.model if correction is not None and correction.kept else physics
+        scored, before = (prediction_error(of, data.validation_aligned) for of in (model, start))
         held_out = data.validation is not None
-        scored = prediction_error(model, data.validation_aligned) if held_out else fitted
-        before = prediction_error(start, data.validation_aligned)
-        return cls(model, fitted, scored, before, data, corrected)
+        fitted = prediction_error(model, data.fitted_aligned) if held_out else scored
+        alone = scored if model is physics else prediction_error(physics, data.validation_aligned)
+        return cls(model, fitted, scored, before, alone, data, correction)
 
     def figures(self, wall_time: float) -> list[Figure]:
         """Errors of each unit that is observed, and the seconds it took."""
@@ -99,11 +91,11 @@ class FitReport:
                 Figure(f"l1_fitted_trials_{shown}", _known(fitted_l1), shown),
             ]
         figures.append(Figure("wall_time_s", wall_time, "s"))
-        if self.corrected is not None:
+        if self.correction is not None:
             scale, shown = UNITS.get(self.data.unit, (1.0, self.data.unit))
-            alone = self.corrected.physics.mean_absolute
+            alone = self.physics.mean_absolute
             ratio = _known(self.scored.mean_absolute / alone)
-            size = _known(self.corrected.correction.size)
+            size = _known(self.correction.size)
             figures += [
                 Figure(f"l1_physics_{shown}", _known(alone * scale), shown),
                 Figure("l1_ratio_to_physics", ratio, ""),
@@ -123,9 +115,9 @@ class FitReport:
             "scored_duration_s": float(np.median(scored.length) - 1) * scored.period,
             "end_s": float(self.scored.horizon[self.scored.last_seen]),
         }
-        if self.corrected is None:
+        if self.correction is None:
             return known
-        correction, trials = self.corrected.correction, self.data.fitted.trials
+        correction, trials = self.correction, self.data.fitted.trials
         scale, _ = UNITS.get(self.data.unit, (1.0, self.data.unit))
         compared = correction.physics, correction.corrected
         about = {
@@ -145,8 +137,8 @@ class FitReport:
             "horizon.identified": error.rmse,
             "horizon.start model": self.start.rmse,
         }
-        if self.corrected is not None and self.corrected.correction.kept:
-            arrays["horizon.physics alone"] = self.corrected.physics.rmse
+        if self.correction is not None and self.correction.kept:
+            arrays["horizon.physics alone"] = self.physics.rmse
         if self._is_chain():
             low, high = quantiles(_root_mean_square(_distances(error)), (0.1, 0.9))
             arrays |= {"horizon.identified.low": low, "horizon.identified.high": high}

@@ -15,7 +15,7 @@ from palpate.perception.velocity import VelocityEstimator
 from palpate.runs.storage import read_json, write_json
 
 _FORMAT = "palpate.contract"
-_VERSION = 2  # the first had one action, and its limits apart from it
+_VERSION = 2  # the first had one action, its limits beside it
 _TRAINED = ("command", "seed", "training", "model", "machine", "wall_time_s")
 
 

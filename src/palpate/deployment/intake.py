@@ -14,7 +14,7 @@ from palpate.networks import Channel
 PATIENCE = 1.4  # periods after one state at which the next one is missing
 LATE = 1.0  # periods that a state may have been under way longer than the fastest
 JITTER = 0.5  # periods by which two of the sender's stamps may differ from one period
-DRIFT = 2e-4  # s/s by which two clocks may run apart
+DRIFT = 2e-4  # s/s by which two clocks may drift
 
 
 class BadStateError(PalpateError):

@@ -68,14 +68,14 @@ def run_loop(
     link: Link,
     period: float,
     goes_on: Callable[[float], bool],
-    told: Callable[[Mode, str], None] = lambda mode, reason: None,
+    report: Callable[[Mode, str], None] = lambda mode, reason: None,
 ) -> Record:
     """One order every `period` s while `goes_on(seconds since the start)`; then a brake to rest.
 
     Deadlines lie `LEAD` after the arrival of a state, as far as following the sender's clock by
     `FOLLOW` in a period allows, or when a state becomes missing, if that is sooner. One that has
     passed is skipped, not made up for. A first call may be slow: warm up what decides before.
-    Garbage is collected before and after, not in between. `told` hears of every change of mode.
+    Garbage is collected before and after, not in between. `report` hears of every change of mode.
     """
     record, clock = Record(), link.clock
     session, sequence = secrets.randbits(64), 0
@@ -111,7 +111,7 @@ def run_loop(
                 deadline += min(max(newest + LEAD - now, -FOLLOW), FOLLOW)
             if (order.mode, order.reason) != (mode, reason):
                 mode, reason = order.mode, order.reason
-                told(mode, reason)
+                report(mode, reason)
                 if len(record.events) < EVENTS:
                     record.events.append((now - began, mode, reason))
             if not going and not order.action.any():

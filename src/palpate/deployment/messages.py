@@ -7,7 +7,7 @@
              state u64 (sequence of the newest state it rests on), the declared action channels
              one after the other f32, CRC-32 u32
 
-A session is a number that a sender draws when it starts, so that its successor is told apart.
+A session is a number that a sender draws when it starts, so that its successor has another.
 Nothing is unpickled: a message is numbers of declared size, or it is refused.
 """
 

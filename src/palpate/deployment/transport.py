@@ -1,4 +1,4 @@
-"""Messages over Zenoh, between processes of one machine unless told otherwise.
+"""Messages over Zenoh, between processes of one machine unless asked otherwise.
 
 Nothing is searched for on the network and no port is open to it: the loop listens on 127.0.0.1 and
 the robot's program connects there.

@@ -94,7 +94,7 @@ class Track(Options, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Reading(Options):
-    """What a command has to be told about recordings that others have made."""
+    """What recordings that others have made do not say themselves."""
 
     rate: Number = None
     """Hz, for files that carry no time."""

@@ -187,8 +187,8 @@ def _earlier_description(manifest: Mapping[str, Any]) -> dict[str, Any] | None:
 
     Its channels stood as sentences: features "(10, 3) m" by name, the action as "velocity, m/s".
     """
-    told = manifest.get("policy")
-    if not isinstance(told, dict) or told.get("kind") != "command policy":
+    earlier = manifest.get("policy")
+    if not isinstance(earlier, dict) or earlier.get("kind") != "command policy":
         return None
     seen = []
     for name, sentence in dict(manifest.get("features") or {}).items():
@@ -201,18 +201,12 @@ def _earlier_description(manifest: Mapping[str, Any]) -> dict[str, Any] | None:
         sizes = [int(size) for size in match[1].replace(",", " ").split()]
         seen.append({"name": name, "shape": sizes, "unit": match[2]})
     name, _, unit = str(manifest.get("action", "action, ")).rpartition(", ")
+    action = {"name": name, "shape": earlier.get("action_shape"), "unit": unit}
+    limits = {limit: earlier.get(limit) for limit in ("limit", "rate_limit")}
     return {
         "kind": _NETWORK,
-        "observations": seen or [{"name": "features", "shape": [told.get("features")]}],
-        "actions": [
-            {
-                "name": name,
-                "shape": told.get("action_shape"),
-                "unit": unit,
-                "limit": told.get("limit"),
-                "rate_limit": told.get("rate_limit"),
-            }
-        ],
-        "period": told.get("period"),
-        "settings": {"width": told.get("width"), "depth": told.get("depth")},
+        "observations": seen or [{"name": "features", "shape": [earlier.get("features")]}],
+        "actions": [action | limits],
+        "period": earlier.get("period"),
+        "settings": {"width": earlier.get("width"), "depth": earlier.get("depth")},
     }

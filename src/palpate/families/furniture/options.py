@@ -1,4 +1,4 @@
-"""What the commands can be told about furniture, and what they then do."""
+"""Options of the commands that furniture takes part in, and what they do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands can be told about navigation among movable obstacles."""
+"""Options of planning among movable obstacles."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A map among movable obstacles, and the plan on it: as a picture, or moving.
 
 Walls are solid, objects numbered by the order in which they are moved; where an object began is
-dashed, where it is left is filled. Ways are told apart by line as well as by colour.
+dashed, where it is left is filled. Ways differ in line as well as in colour.
 """
 
 import math

@@ -26,7 +26,7 @@ FRAMES = 256  # looked at together
 CONTACT_RANGE = 0.3  # m between outlines, beyond which nothing touches before it is seen again
 SPACING = 2.5  # m between pieces that are handled, so that they do not meet
 UNITS = {POSE: "m, m, rad", WRENCH: "N, N, N m"}
-MAX_PERIOD = 0.25  # s between frames: of less nothing can be told from a push
+MAX_PERIOD = 0.25  # s between frames: a push shows nothing in fewer frames
 MAX_LENGTH = 50.0  # m of an outline
 MAX_DIFFERENCE = 1e-3  # m between corners of the same outline
 
@@ -80,10 +80,10 @@ def _check_convention(trial: str, channel: Channel, unit: str, frame: str) -> No
             f"the poses are in '{frame}': expected both in the same"
         )
     if channel.role is Role.OBSERVATION and not channel.nominal_period <= MAX_PERIOD:
-        count, apart = len(channel.time), f", {channel.nominal_period:.3g} s apart as a rule"
+        count, spaced = len(channel.time), f", {channel.nominal_period:.3g} s apart as a rule"
         raise PalpateError(
             f"channel '{channel.name}' of trial '{trial}' has "
-            f"{f'{count} frames{apart}' if count > 1 else 'one frame'}: expected many, at most "
+            f"{f'{count} frames{spaced}' if count > 1 else 'one frame'}: expected many, at most "
             f"{MAX_PERIOD:g} s apart, with stamps in seconds"
         )
 
@@ -206,8 +206,8 @@ def record_pieces(
 ) -> Recording:
     """Furniture of the MuJoCo world, handled or pushed: `trials` for each piece in turn.
 
-    The pieces stand in a row, far enough apart not to touch. Raises `PalpateError` for a kind that
-    does not exist.
+    The pieces stand in a row, too far from each other to touch. Raises `PalpateError` for a kind
+    that does not exist.
     """
     reach = [Piece(kind).made_as.radius for kind in kinds]
     across = np.concatenate([[0.0], np.cumsum(np.add(reach[1:], reach[:-1]) + SPACING)])

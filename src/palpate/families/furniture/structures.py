@@ -219,9 +219,9 @@ def _with_bolts(model: Planar, recording: Recording) -> Planar:
     standing = []
     for body in range(model.bodies):
         seen = _seen(recording, [body])[:, 0]
-        apart = seen - seen[0]
-        apart[:, 2] = wrapped(jnp.asarray(apart[:, 2]))
-        standing.append(seen[0] + apart.mean(axis=0))
+        off = seen - seen[0]
+        off[:, 2] = wrapped(jnp.asarray(off[:, 2]))
+        standing.append(seen[0] + off.mean(axis=0))
     return dataclasses.replace(model, bolted_pose=np.array(standing))
 
 

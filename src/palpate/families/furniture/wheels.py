@@ -16,7 +16,7 @@ def wheel_rows(models: Planar, prior: Planar, viscous: bool) -> list[dict[str, A
     """Rows for `result.json`: of wheels (draws, bodies, wheels) direction and forces.
 
     Only wheels that there are; none where all is fixed. `prior` are draws too: a force whose
-    logarithm the data have not narrowed down from there was not told.
+    logarithm the data have not narrowed down from there is undecided.
     """
     if np.ndim(models.wheel_along) < 3 or not np.any(models.wheel):
         return []

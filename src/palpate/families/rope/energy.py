@@ -26,7 +26,7 @@ def show(curves: Curves, looks: Mapping[str, int]) -> tuple[str, charts.Chart]:
         else:
             ends.append(f"{label} does not come to stay below 1 %")
     episodes = max(len(values) for values in curves.values.values())
-    caption = "Energy left in the object, its start being 100 %"
+    caption = "Energy left in the object, in percent of its start"
     if episodes > 1:
         caption += f": the median of {episodes} episodes and the band that holds 90 % of them"
     return f"{caption}; {', '.join(ends)}.", chart(curves, looks)

@@ -1,4 +1,4 @@
-"""What the commands can be told about ropes, and what they then do."""
+"""Options of the commands that ropes take part in, and what they do."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ class RecordRope(Record):
         from palpate.worlds.rope.configuration import RopeConfiguration
 
         constants = {field.name for field in dataclasses.fields(RopeConfiguration)}
-        told = {name: value for name, value in vars(self).items() if name in constants}
+        given = {name: value for name, value in vars(self).items() if name in constants}
         seeds = np.random.SeedSequence(self.seed).generate_state(self.trials)
-        return record_rope(RopeConfiguration(**told), seeds.tolist(), self.duration)
+        return record_rope(RopeConfiguration(**given), seeds.tolist(), self.duration)
 
 
 @dataclass(frozen=True, kw_only=True)

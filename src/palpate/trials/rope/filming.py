@@ -146,8 +146,8 @@ def _keep_picture(
     seen = segment(frame, Appearance(ROPE_COLOUR, radius), world.pinhole, gripper, REACH * length)
     points = line_points(seen)
     pixels, _ = world.pinhole.project(nodes[1:])
-    apart = np.linalg.norm(pixels[:, None] - points.pixels[None], axis=-1)
-    kept["hidden"][step] = np.mean(apart.min(axis=1, initial=np.inf) > 3.0)
+    distance = np.linalg.norm(pixels[:, None] - points.pixels[None], axis=-1)
+    kept["hidden"][step] = np.mean(distance.min(axis=1, initial=np.inf) > 3.0)
     if len(points.pixels) >= FEWEST:
         line = centre_lines(seen, world.pinhole, gripper, length)[0]
         kept["squared_error"][1, step] = _mean_square(line.nodes(rest_length) - nodes)

@@ -99,7 +99,8 @@ def lasting(trials: Sequence[StabilizationTrial]) -> list[StabilizationTrial]:
         found = {getattr(trial.configuration, name) for trial in trials}
         if len(found) > 1:
             raise PalpateError(
-                f"trials run side by side with one {name}, not {sorted(found)}: evaluate apart"
+                f"trials run side by side with one {name}, not {sorted(found)}: evaluate them one "
+                "after the other"
             )
     longest = max(trial.period for trial in trials)
     steps = math.ceil(TRIAL_PERIODS * longest / trials[0].control_period)
@@ -115,7 +116,7 @@ def settling_time(
     end of which the gripper is at rest (slower than 0.02 m/s). Both arrays are (trials, times).
 
     A gripper that trembles about 0.02 m/s finds such an instant soon, and one that is at rest needs
-    none: `first` only looks at the first second of low energy, and tells the two apart.
+    none: `first` only looks at the first second of low energy, and distinguishes the two.
     """
     stay = round(STAY / control_period)
     above = ~(energy < STABILISED * energy[:, :1])  # NaN is above

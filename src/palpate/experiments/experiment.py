@@ -2,7 +2,7 @@
 
     experiment = Experiment("rope-bound", out, quick, seed)
     experiment.announce({"search": 4})
-    with experiment.stage("search", {"stage": "search", "seed": seed}) as stage:
+    with experiment.stage("search", {"rollouts": rollouts}) as stage:
         for trial, note in resumable(stage.run, trials, arrays, "searching"):
             arrays["time"][trial] = ...
             note(time=...)
@@ -83,9 +83,11 @@ class Experiment:
     def stage(self, folder: str, configuration: Mapping[str, Any]) -> Iterator[Stage]:
         """Open a stage, finish it at the end of the block, and count the seconds that it took.
 
-        Raises `PalpateError` when the folder holds a stage of another configuration.
+        Its name and the seed join the configuration. Raises `PalpateError` when the folder holds a
+        stage of another one.
         """
-        with Run.open(self.out / folder, configuration) as run:
+        whole = {"stage": folder, "seed": self.seed, **configuration}
+        with Run.open(self.out / folder, whole) as run:
             stage = Stage(run)
             yield stage
             if not run.finished:
@@ -116,9 +118,8 @@ class Experiment:
         evidence. The times are median and 99th percentile, ms, of controllers that note what they
         have `spent`, s.
         """
-        sizes = {"stage": folder, "seed": self.seed, "trials": len(trials)}
-        configuration = {**sizes, "controllers": list(controllers), **about}
-        with self.stage(folder, configuration) as stage:
+        used = {"trials": len(trials), "controllers": list(controllers)}
+        with self.stage(folder, used | dict(about)) as stage:
             found = evaluate_trials(controllers, trials, stage.run)
             if not stage.finished:
                 if show is not None:

@@ -85,8 +85,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     first = experiment.uses(SEEDS)
     trials = lasting([StabilizationTrial(nominal.BASE, start, first) for start in START_POSES])
     rollouts = ROLLOUTS // 20 if quick else ROLLOUTS
-    configuration = {"stage": "search", "seed": seed, "policy": about, "rollouts": rollouts}
-    with experiment.stage("search", configuration) as stage:
+    with experiment.stage("search", {"policy": about, "rollouts": rollouts}) as stage:
         done = bounded(model, policy, trials, rollouts, seed, stage.run)
         if not stage.finished:
             write_evidence(stage.path, _evidence(done))

@@ -90,11 +90,9 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     for name, row in ROWS.items():
         trials = _trials(row, counts, first)
         configuration = {
-            "stage": name,
             "row": dataclasses.asdict(row),
             "sensor": dataclasses.asdict(Sensor(has_depth=row.depth)),
             "trials": len(trials),
-            "seed": seed,
             "policy": about,
             "world": constants(BASE),
         }

@@ -69,30 +69,25 @@ QUICK = Size(
 
 def identified_rope(experiment: Experiment, size: Size) -> Rope:
     """The nominal rope as a model driven by velocity, from "record" and "identify"."""
-    aligned = _recorded(experiment, size.recorded_trials)
-    settings = Settings(iterations=size.identification, seed=experiment.seed)
-    configuration = {
-        "stage": "identify",
-        "recorded_trials": size.recorded_trials,
-        "nodes": NODES,
-        "substeps": SUBSTEPS,
-        **dataclasses.asdict(settings),
-    }
+    trials = size.recorded_trials
+    first = experiment.uses(0, trials)
+    with experiment.stage("record", {"trials": trials, "world": constants(BASE)}) as stage:
+        if not stage.finished:
+            recording = record_rope(BASE, range(first, first + trials), RECORDED_DURATION)
+            write_recording(stage.path / "recording.npz", recording)
+    aligned = recorded_markers(experiment.out)
     start = starting_rope(aligned, mass=BASE.mass)
     start = dataclasses.replace(start, substeps=SUBSTEPS).constrain()
-    return fitted_rope(experiment, "identify", configuration, start, aligned, settings)
+    return fitted_rope(experiment, "identify", size, start, aligned)
 
 
 def fitted_rope(
-    experiment: Experiment,
-    folder: str,
-    configuration: dict[str, Any],
-    start: Rope,
-    aligned: Aligned,
-    settings: Settings,
+    experiment: Experiment, folder: str, size: Size, start: Rope, aligned: Aligned
 ) -> Rope:
     """The rope fitted in a stage from `start` on, driven by velocity."""
-    with experiment.stage(folder, configuration) as stage:
+    settings = Settings(iterations=size.identification, seed=experiment.seed)
+    about = {"recorded_trials": size.recorded_trials, "nodes": NODES, "substeps": SUBSTEPS}
+    with experiment.stage(folder, about | dataclasses.asdict(settings)) as stage:
         path = stage.path / "model.json"
         if not stage.finished:
             model = identify(start, aligned, settings, stage.run)
@@ -112,28 +107,11 @@ def recorded_markers(path: Path) -> Aligned:
     return dataclasses.replace(aligned, observation=aligned.observation[:, :, ::every])
 
 
-def _recorded(experiment: Experiment, trials: int) -> Aligned:
-    first = experiment.uses(0, trials)
-    configuration = {
-        "stage": "record",
-        "trials": trials,
-        "seed": experiment.seed,
-        "world": constants(BASE),
-    }
-    with experiment.stage("record", configuration) as stage:
-        if not stage.finished:
-            recording = record_rope(BASE, range(first, first + trials), RECORDED_DURATION)
-            write_recording(stage.path / "recording.npz", recording)
-    return recorded_markers(experiment.out)
-
-
 def trained_policy(
     experiment: Experiment, folder: str, task: Task, model: Rope, training: Training
 ) -> tuple[CommandPolicy, dict[str, Any]]:
     """The policy trained in a stage, and its manifest. Its actions are the gripper's velocity."""
     configuration = {
-        "stage": "train",
-        "seed": experiment.seed,
         "model": {row["name"]: row["value"] for row in describe(model)},
         "task": task_constants(task),
         **dataclasses.asdict(training),
@@ -156,7 +134,6 @@ def sizes_within(
     From a stage; 0 where not even the least fits. `decision(method, size)` gives a function that
     takes one, and each of the `methods` finds the size, as `samples_within` does.
     """
-    configuration = {"stage": "planners", "seed": experiment.seed, "budget_s": budget}
 
     def found() -> dict[str, Any]:
         sizes = {}
@@ -168,7 +145,7 @@ def sizes_within(
                 sizes[method] = 0
         return {"sizes": sizes}
 
-    return experiment.found("planners", configuration, found)["sizes"]
+    return experiment.found("planners", {"budget_s": budget}, found)["sizes"]
 
 
 def shipped_policy() -> tuple[CommandPolicy, dict[str, Any]]:

@@ -23,7 +23,6 @@ from palpate.experiments.rope import nominal
 from palpate.experiments.rope.model import undamped
 from palpate.experiments.rope.nominal import Size
 from palpate.families.rope.recording import constants
-from palpate.identification.gradient.descent import Settings
 from palpate.learning import Training
 from palpate.models.rope import Rope
 from palpate.planning.gradient import iterations_within
@@ -84,7 +83,14 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         print(f"{SAC}: {NOT_RUN}", flush=True)
     policy, about = nominal.shipped_policy()
     model, task = nominal.identified_rope(experiment, size), RopeStabilization()
-    lively = _identified_undamped(experiment, model, size)
+    # The rope without damping that suits the same recording best, from what was found with it.
+    lively = nominal.fitted_rope(
+        experiment,
+        "identify-undamped",
+        size,
+        dataclasses.replace(undamped(model), drive="position").constrain(),
+        nominal.recorded_markers(out),
+    )
     rival, rival_about = nominal.trained_policy(
         experiment, "train-undamped", task, lively, size.training
     )
@@ -154,20 +160,6 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 def sac_installed() -> bool:
     """Whether the library of SAC is there."""
     return importlib.util.find_spec("stable_baselines3") is not None
-
-
-def _identified_undamped(experiment: Experiment, model: Rope, size: Size) -> Rope:
-    """The rope without damping that suits the same recording best.
-
-    It starts from what was identified with damping.
-    """
-    settings = Settings(iterations=size.identification, seed=experiment.seed)
-    configuration = {"stage": "identify undamped", **dataclasses.asdict(settings)}
-    start = dataclasses.replace(undamped(model), drive="position").constrain()
-    seen = nominal.recorded_markers(experiment.out)
-    return nominal.fitted_rope(
-        experiment, "identify-undamped", configuration, start, seen, settings
-    )
 
 
 def _model_free(

@@ -11,7 +11,6 @@ import functools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -33,6 +32,7 @@ from palpate.trials.rope.stabilization import (
     TRIAL_PERIODS,
     Episodes,
     StabilizationTrial,
+    Summary,
     evaluation_trials,
     summarise,
 )
@@ -87,6 +87,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     experiment.announce({"identification": 1 if quick else 4} | filming)
     model, first = nominal.identified_rope(experiment, size), experiment.uses(SEEDS)
     filmed: dict[str, dict[str, np.ndarray]] = {}
+    rates: dict[str, Summary] = {}
     for name, row in ROWS.items():
         trials = _trials(row, counts, first)
         configuration = {
@@ -98,18 +99,21 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         }
         folder = name.replace(", ", "-").replace(" ", "-")
         with experiment.stage(folder, configuration) as stage:
-            filmed[name] = _filmed(stage.run, name, row, trials, model, policy)
+            filmed[name] = kept = _filmed(stage.run, name, row, trials, model, policy)
             if not stage.finished:
-                write_evidence(stage.path, _evidence(filmed[name]))
+                time = np.arange(kept["true"].shape[1]) * BASE.control_period
+                motions = {f"motion.{who}": kept[who][0] for who in ("true", "tracked")}
+                write_evidence(stage.path, {"motion.time": time, **motions})
+        if row.controlled:
+            episodes = Episodes(kept["energy"], kept["gripper_speed"], np.empty((0,)), {})
+            rates[name] = summarise(trials, episodes)
     controlled = _trials(ROWS["stabilised"], counts, first)
     marked = LearnedController(policy, RopeStabilization())
     with experiment.counted():
-        rivals = {
-            "markers": run_trials(controlled, marked),
-            "held still": run_trials(controlled, HeldStill()),
-        }
+        for name, controller in {"markers": marked, "held still": HeldStill()}.items():
+            rates[name] = summarise(controlled, run_trials(controlled, controller))
     return experiment.result(
-        _figures(filmed, rivals, counts, first, frame_times(model)),
+        _figures(filmed, rates, frame_times(model)),
         {
             "weights": "shipped",
             "policy": about,
@@ -164,7 +168,7 @@ def _filmed(
         for chosen, note in resumable(run, work, arrays, f"filming: {name}"):
             rows = [{name: part[place] for name, part in arrays.items()} for place in chosen]
             list(threads.map(one, [trials[place] for place in chosen], rows))
-            note(rmse_cm=_finite(_rmse(_missed(arrays)[: chosen[-1] + 1])))
+            note(rmse_cm=_rmse(_missed(arrays)[: chosen[-1] + 1]))
     return arrays
 
 
@@ -178,36 +182,25 @@ def _missed(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.where(there & ~known, np.inf, arrays["squared_error"][:, 0])
 
 
-def _rmse(squared: np.ndarray) -> float:
-    """In cm, of mean squared errors in m^2 where there are any."""
-    return 100.0 * math.sqrt(np.nanmean(squared)) if np.isfinite(squared).any() else math.inf
+def _rmse(squared: np.ndarray) -> float | None:
+    """In cm, of mean squared errors in m^2; None where one is infinite, or none is known."""
+    mean = np.nanmean(squared) if np.isfinite(squared).any() else np.inf
+    return 100.0 * math.sqrt(mean) if np.isfinite(mean) else None
 
 
 def _figures(
-    filmed: dict[str, dict[str, np.ndarray]],
-    rivals: dict[str, Episodes],
-    counts: dict[str, int],
-    seed: int,
-    took: np.ndarray,
+    filmed: dict[str, dict[str, np.ndarray]], rates: dict[str, Summary], took: np.ndarray
 ) -> list[Figure]:
+    """Errors over the rows, how often ropes come to rest, and the computing `took` (frames,) s."""
     swinging = np.concatenate([filmed[name]["squared_error"] for name in ("released", "shaken")])
     missed = np.concatenate([_missed(filmed[name]) for name in ("released", "shaken")])
     by_trial = np.sqrt(np.nanmean(missed, axis=-1)) * 100.0
-    spread = None
-    if np.isfinite(by_trial).all():
-        spread = two_standard_errors(by_trial)
-    rates = {
-        name: summarise(_trials(row, counts, seed), _episodes(filmed[name]))
-        for name, row in ROWS.items()
-        if row.controlled
-    }
-    controlled = _trials(ROWS["stabilised"], counts, seed)
-    rates |= {name: summarise(controlled, episodes) for name, episodes in rivals.items()}
+    spread = two_standard_errors(by_trial) if np.isfinite(by_trial).all() else None
     own = rates["stabilised"]
     rows = [
         Figure(
-            "node_rmse_cm", _finite(_rmse(missed)), "cm", bar=RMSE_BAR,
-            rival=_finite(_rmse(swinging[:, 1])), spread=spread,
+            "node_rmse_cm", _rmse(missed), "cm", bar=RMSE_BAR, rival=_rmse(swinging[:, 1]),
+            spread=spread,
         ),
         share_of(
             "success_rate", own.successes, own.trials, bar=SUCCESS_BAR, seed_document="succeeds",
@@ -215,11 +208,9 @@ def _figures(
         ),
     ]  # fmt: skip
     for place, kind in enumerate(KINDS[1:], 1):
-        value = _finite(_rmse(swinging[:, place]))
-        rows.append(Figure(f"node_rmse_cm.{suffix(kind)}", value, "cm"))
+        rows.append(Figure(f"node_rmse_cm.{suffix(kind)}", _rmse(swinging[:, place]), "cm"))
     for name, arrays in filmed.items():
-        value = _finite(_rmse(_missed(arrays)))
-        rows.append(Figure(f"node_rmse_cm.{suffix(name)}", value, "cm"))
+        rows.append(Figure(f"node_rmse_cm.{suffix(name)}", _rmse(_missed(arrays)), "cm"))
         if not ROWS[name].controlled:
             hidden = float(np.nanmean(arrays["hidden"]))
             rows.append(Figure(f"hidden_share.{suffix(name)}", hidden, ""))
@@ -233,21 +224,3 @@ def _figures(
         value = 1e3 * float(np.percentile(took, percent))
         rows.append(Figure(f"frame_cpu_ms.p{percent}", value, "ms"))
     return rows
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _episodes(arrays: dict[str, np.ndarray]) -> Episodes:
-    return Episodes(arrays["energy"], arrays["gripper_speed"], np.empty((0,)), {})
-
-
-def _evidence(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The first trial as it was and as it was followed."""
-    time_axis = np.arange(arrays["true"].shape[1]) * BASE.control_period
-    return {
-        "motion.time": time_axis,
-        "motion.true": arrays["true"][0],
-        "motion.tracked": arrays["tracked"][0],
-    }

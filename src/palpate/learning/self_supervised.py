@@ -118,7 +118,8 @@ def train(
     if run is not None:
         done, state = run.restore(state) or (0, state)
     state, starts, for_updates = everywhere((state, starts, for_updates))
-    stages = _stages(task, model, training)
+    shares = task.stages if training.horizon_curriculum else task.stages[-1:]
+    stages = [max(1, round(share * task.duration / model.control_period)) for share in shares]
     bar = progress(range(done + 1, training.iterations + 1), "training", done=done)
     updates = {}
     with interruptible() as stop:
@@ -149,12 +150,6 @@ def train(
 def _finite(value: Array) -> float | None:
     number = float(value)
     return number if math.isfinite(number) else None
-
-
-def _stages(task: Task, model: Model, training: Training) -> list[int]:
-    """Episode lengths in control steps, one per stage."""
-    shares = task.stages if training.horizon_curriculum else task.stages[-1:]
-    return [max(1, round(share * task.duration / model.control_period)) for share in shares]
 
 
 def _schedule(training: Training) -> optax.Schedule:

@@ -252,7 +252,11 @@ def evaluate_trials(
             check_period(controller, period)
     longest = _longest(trials, steps)
     done = {name: kind.record(trials, longest, len(drawn)) for name in controllers}
-    work = list(_chunks(controllers, len(trials), kind.side_by_side))
+    work = [
+        (name, list(range(first, min(first + kind.side_by_side, len(trials)))))
+        for name in controllers
+        for first in range(0, len(trials), kind.side_by_side)
+    ]
     arrays = {name: record.arrays() for name, record in done.items()}
     for (name, chosen), note in resumable(run, work, arrays, "trials"):
         some = [trials[index] for index in chosen]
@@ -317,12 +321,6 @@ def table(trials: Sequence[Trial[RecordType]], evaluated: Mapping[str, RecordTyp
             lines += [line(f"  {group}", *part) for group, part in parts.items()]
         lines += [f"  trial {trial}: {why}" for trial, why in sorted(record.failures.items())]
     return lines
-
-
-def _chunks(names: Mapping[str, Any], count: int, size: int) -> Iterator[tuple[str, list[int]]]:
-    for name in names:
-        for first in range(0, count, size):
-            yield name, list(range(first, min(first + size, count)))
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:

@@ -113,7 +113,8 @@ def hypotheses(
         by_itself[name] = probability
     likely = joints(recording)
     models = {}
-    for chosen in _sets(likely):
+    sets = (itertools.combinations(likely, count) for count in range(len(likely) + 1))
+    for chosen in itertools.chain.from_iterable(sets):
         joined = {body for pair in chosen for body in pair}
         together = {b: "wheels" if b in joined else kind for b, kind in kinds.items()}
         where = {pair: likely[pair] for pair in chosen}
@@ -157,12 +158,6 @@ def _common_point(
     anchors, *_ = np.linalg.lstsq(design, between, rcond=1e-3)
     off = (design @ anchors - between).reshape(-1, 2)
     return (anchors[:2], anchors[2:]), float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-
-
-def _sets(likely: Iterable[Pair]) -> list[tuple[Pair, ...]]:
-    """All sets of candidate joints, the empty one first."""
-    pairs = list(likely)
-    return [chosen for n in range(len(pairs) + 1) for chosen in itertools.combinations(pairs, n)]
 
 
 def _together(

@@ -1,12 +1,12 @@
 """`palpate reproduce cart-online`: furniture brought to its places by who learns how it rolls.
 
-The Shopping-Cart and Apartment tasks (`tasks.furniture.cart`) in MuJoCo, learnt online from the first
-decision on. PBRL climbs the posterior of a planar model of each piece as data arrive and plans
-through its mode; OO-LWR and LWR plan through regressions of the same decisions in the pieces' own
-axes, with and without the deck's oriented contact predicates; random takes any action. TRUE is told
-the planar model that explains best how the same pieces moved when they were wiggled apart, pushed
-anyhow, and then brought to their places from other starts, searched for from the hidden constants
-on: MuJoCo itself as the planner's model would take hours.
+The Shopping-Cart and Apartment tasks (`palpate.tasks.furniture.cart`) in MuJoCo, learnt online from
+the first decision on. PBRL climbs the posterior of a planar model of each piece as data arrive and
+plans through its mode; OO-LWR and LWR plan through regressions of the same decisions in the pieces'
+own axes, with and without the deck's oriented contact predicates; random takes any action. TRUE is
+told the planar model that explains best how the same pieces moved when they were wiggled apart,
+pushed anyhow, and then brought to their places from other starts, searched for from the hidden
+constants on: MuJoCo itself as the planner's model would take hours.
 All plan by the same MPPI with the same samples, on the same seeds: the same hidden parameters and
 starts.
 

@@ -30,7 +30,6 @@ from palpate.trials.furniture.namo_episode import (
     SEARCH,
     THRESHOLD,
     Episode,
-    Fixed,
     Flag,
     Learner,
     Opinion,
@@ -56,8 +55,8 @@ def planners(room: Room) -> dict[str, Callable[[], Opinion]]:
     world = room.world()
     return {
         OURS: lambda: Learner(world.outlines, room.seed),
-        TOLD: lambda: Fixed(truth_of(room)),
-        ALL: lambda: Fixed(dict.fromkeys(world.names, Constraint(FREE))),
+        TOLD: lambda: Opinion(truth_of(room)),
+        ALL: lambda: Opinion(dict.fromkeys(world.names, Constraint(FREE))),
         FLAG: lambda: Flag(world.names),
     }
 

@@ -160,7 +160,7 @@ def show(folder: Path, room: Room, outcome: Episode) -> None:
         world,
         room.goal,
         np.array([frame.robot for frame in frames]),
-        [dict(zip(world.movables, frame.poses, strict=True)) for frame in frames],
+        np.array([frame.poses for frame in frames]),
         [frame.held for frame in frames],
         movability=believed,
     )

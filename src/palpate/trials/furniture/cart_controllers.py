@@ -333,7 +333,6 @@ class PhysicsController(CartController):
         return self.scene
 
     def learn(self) -> None:
-        """See `CartController.learn`."""
         episode = self.episodes[-1]
         held = episode.decisions[-1].held
         self._learnt[held] += 1
@@ -367,7 +366,6 @@ class RegressionController(CartController):
         self._capacity = decisions
 
     def learn(self) -> None:
-        """See `CartController.learn`."""
         one = self.episodes[-1].decisions[-1]
         inputs, change, condition = map(
             np.asarray, _datum(self._features, one.before, jnp.asarray(one.wrench), one.after)
@@ -379,7 +377,6 @@ class RegressionController(CartController):
                 self._parts[body] = locally_weighted(*columns, capacity=self._capacity)
 
     def believed(self, held: int) -> Model | None:
-        """See `CartController.believed`."""
         if self._parts[held] is None:
             return None
         # What was never held is believed to behave as this one: something has to be believed.

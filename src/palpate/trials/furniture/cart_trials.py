@@ -60,7 +60,6 @@ class CartTrial(Trial[Rewards]):
 
     @property
     def control_period(self) -> float:
-        """See `Trial`."""
         return CONTROL_PERIOD
 
     @property
@@ -70,7 +69,6 @@ class CartTrial(Trial[Rewards]):
 
     @property
     def reset_options(self) -> Mapping[str, Any]:
-        """See `Trial`."""
         return {"episode": self.episode, "poses": self.start}
 
     @property
@@ -79,25 +77,21 @@ class CartTrial(Trial[Rewards]):
         return np.zeros((len(self.task.kinds), 3))
 
     def world(self) -> FurnitureWorld:
-        """See `Trial`."""
         return self.task.world()
 
     def measure(
         self, observation: FurnitureObservation, truth: FurnitureTruth
     ) -> Mapping[str, Any]:
-        """See `Trial`."""
         return {"reward": self.task.reward(truth.poses)}
 
     @classmethod
     def record(cls, trials: Sequence["CartTrial"], steps: int, drawn: int) -> Rewards:
-        """See `Trial`."""
         shape = steps + 1, len(trials[0].task.kinds), 3
         reward = np.full((len(trials), steps + 1), np.nan)
         return Rewards(reward, np.full((drawn, *shape), np.nan), {})
 
     @classmethod
     def score(cls, trials: Sequence["CartTrial"], record: Rewards) -> dict[str, float]:
-        """See `Trial`."""
         return {"reward": float(np.nanmean(record.reward))}
 
 

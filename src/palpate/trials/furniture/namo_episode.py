@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.maps.map import Map
-from palpate.planning.movable_obstacles.motion.belief import SceneBelief
+from palpate.planning.movable_obstacles.motion.belief import ObjectBelief, cut
 from palpate.planning.movable_obstacles.motion.physics_manipulation import (
     ConstrainedManipulation,
     Drawn,
@@ -86,11 +86,9 @@ class Flag(Opinion):
         self._probability = dict.fromkeys(names, MOVABLE)
 
     def movability(self) -> dict[str, float]:
-        """See `Opinion`."""
         return dict(self._probability)
 
     def tried(self, name: str, share: float) -> None:
-        """See `Opinion`."""
         prior = self._probability[name]
         told = 1 - ERRS if share >= DONE else ERRS  # of a movable object
         self._probability[name] = prior * told / (prior * told + (1 - prior) * (1 - told))
@@ -103,28 +101,31 @@ class Learner(Opinion):
 
     def __init__(self, outlines: Mapping[str, np.ndarray], seed: int) -> None:
         super().__init__({})
-        self.belief = SceneBelief(outlines, seed)
+        self.objects = {
+            name: ObjectBelief(np.asarray(outline, float), seed + 1000 * number)
+            for number, (name, outline) in enumerate(outlines.items())
+        }
 
     def model(self) -> ConstrainedManipulation:
-        """See `Opinion`."""
-        return ConstrainedManipulation(self.belief.drawn(DRAWS), FORCE)
+        drawn = {name: one.drawn(DRAWS) for name, one in self.objects.items()}
+        return ConstrainedManipulation(drawn, FORCE)
 
     def movability(self) -> dict[str, float]:
-        """See `Opinion`."""
-        return self.belief.movability(FORCE)
+        return {name: one.movability(FORCE) for name, one in self.objects.items()}
 
     def immovable(self) -> set[str]:
         """See `Opinion`: anything may give way."""
         return set()
 
     def felt(self, contact: Contact) -> None:
-        """See `Opinion`."""
         seen = contact.poses, contact.wrenches, contact.alone
-        self.belief.learn(contact.name, *map(np.array, seen))
+        self.objects[contact.name].learn(cut(*map(np.array, seen)))
 
     def relent(self) -> None:
-        """See `Opinion`."""
-        self.belief.relax()
+        """See `Opinion`: of all that was touched."""
+        for one in self.objects.values():
+            if one.version:
+                one.relax()
 
 
 @dataclass

@@ -114,7 +114,6 @@ class RigidCarry(ManipulationModel):
         lengths: np.ndarray,
         draw: int,
     ) -> Motion:
-        """See `ManipulationModel.motion`."""
         robot = base_poses(robot_pose, primitive, lengths)
         return Motion(carried(object_pose, robot_pose, robot), robot, np.zeros(len(lengths)))
 

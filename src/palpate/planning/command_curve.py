@@ -11,24 +11,16 @@ on by one control period, is where the next decision starts.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from palpate.models.model import Model
+
 StageLoss = Callable[[Any, Array, Any], Float[Array, " plans"]]
-
-
-@runtime_checkable
-class Steps(Protocol):
-    """What is planned through: a `Model`, or anything else with its `step`."""
-
-    @property
-    def control_period(self) -> float: ...
-
-    def step(self, state: Any, action: Array) -> Any: ...
 
 
 class Plan(eqx.Module):
@@ -46,7 +38,7 @@ class CurvePlanner(eqx.Module):
     period with these commands; `goal` is what is asked for then. Limits are as in `tasks.Task`.
     """
 
-    model: Steps
+    model: Model
     stage_loss: StageLoss = eqx.field(static=True)
     limit: float = eqx.field(static=True)
     rate_limit: float | None = eqx.field(static=True)

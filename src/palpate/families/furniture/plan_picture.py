@@ -138,7 +138,8 @@ def scene_animation(
                 drawn += _draw_object(axes, corners, left=name == held[index])
                 if movability is not None and name in movability[index]:
                     text = f"{movability[index][name]:.0%}"
-                    drawn.append(axes.text(*pose[:2], text, ha="center", va="center", zorder=8))
+                    x, y = pose[:2]
+                    drawn.append(axes.text(x, y, text, ha="center", va="center", zorder=8))
             drawn += _draw_robot(axes, world, robot)
             canvas.restore_region(background)
             for artist in sorted(drawn, key=lambda one: one.get_zorder()):

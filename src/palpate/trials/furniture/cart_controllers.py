@@ -20,10 +20,10 @@ from jaxtyping import Array, Float, Int
 
 from palpate.identification.regression.locally_weighted import LocallyWeighted, locally_weighted
 from palpate.identification.regression.model import Features, RegressedModel
-from palpate.models.model import Model
+from palpate.models.model import Model, Wrapper
 from palpate.models.planar import Planar, PlanarState, furniture
 from palpate.numerics.polygons import placed
-from palpate.parameters import as_floating, declare, parameters_of, value_of, with_values
+from palpate.parameters import Parameter, as_floating, declare, parameters_of, value_of, with_values
 from palpate.planning.sampling import Mppi, SamplingPlanner
 from palpate.recordings import Aligned
 from palpate.tasks.furniture.cart import DECISION, HEADING_WEIGHT, CartTask, Turns
@@ -66,7 +66,7 @@ def stage_loss(
     return jnp.mean(distance + HEADING_WEIGHT * heading, axis=-1) + effort
 
 
-class Handled(eqx.Module):
+class Handled(Wrapper):
     """A scene in which one piece is held: an action is a share (along, across, turn) of its wrench.
 
     Forces act at the piece's handle, in its axes as it stands when the decision is taken, and keep
@@ -78,6 +78,12 @@ class Handled(eqx.Module):
     strength: Float[Array, "bodies 3"]
     handle: Float[Array, "bodies 2"]
     control_period: float = eqx.field(static=True, default=DECISION)
+    overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
+
+    @property
+    def action_shape(self) -> tuple[int]:
+        """(3,): along, across, turn."""
+        return (3,)
 
     def wrench(self, pose: Array, action: Array) -> Float[Array, "*batch bodies 3"]:
         """What acts on each body, in the room's axes about the bodies' origins."""
@@ -92,7 +98,6 @@ class Handled(eqx.Module):
         return one[..., None, :] * jax.nn.one_hot(self.held, pose.shape[-2])[:, None]
 
     def step(self, state: PlanarState, action: Array) -> PlanarState:
-        """The state a decision later."""
         return self.inner.step(state, self.wrench(state.pose, action))
 
 
@@ -255,7 +260,7 @@ class CartController(FeedbackController):
 
     def _handled(self, model: Model, held: int) -> Handled:
         strength, handles = as_floating(self._task.strength), as_floating(self._task.handles)
-        return Handled(model, jnp.asarray(held), strength, handles)
+        return Handled(inner=model, held=jnp.asarray(held), strength=strength, handle=handles)
 
     def _touching(self, poses: np.ndarray) -> np.ndarray:
         """Which pieces (bodies,) are near another or a wall."""
@@ -383,7 +388,7 @@ class RegressionController(CartController):
         parts = [part if part is not None else self._parts[held] for part in self._parts]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
         return RegressedModel(
-            prototype=self._prototype,
+            inner=self._prototype,
             regression=stacked,
             features=self._features,
             control_period=DECISION,

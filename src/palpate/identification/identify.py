@@ -97,11 +97,7 @@ def fitted(start: Model, aligned: Aligned, settings: Settings, run: Run | None) 
     model = descent.identify(start, aligned, settings, run)
     coordinates = FreeParameters(model)
     found = intervals(coordinates, coordinates.initial, aligned)
-    lower, upper = (
-        {path: np.asarray(edge) for path, edge in edges.items()}
-        for edges in (found.lower, found.upper)
-    )
-    return Identified(model, lower, upper, found.verdict, found.warnings)
+    return Identified(model, **vars(found))
 
 
 def drawn(comparison: Comparison) -> Identified:

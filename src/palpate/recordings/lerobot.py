@@ -13,7 +13,7 @@ import math
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,6 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 class Feature:
     """A column of the dataset: `values` (frames, size) of all episodes one after another."""
 
-    dtype: str
     names: tuple[str, ...]
     values: np.ndarray
 
@@ -104,29 +103,27 @@ def _features(recording: Recording, aligned: Aligned, fps: int) -> dict[str, Fea
         _filled(observed[trial == number], each.name, names)
         for number, each in enumerate(recording.trials)
     ])  # fmt: skip
-    features = {STATE: Feature("float32", names, state)}
+    features = {STATE: Feature(names, state.astype(np.float32))}
     if aligned.actions:
         # The last frame has no action of its own: nobody knows what came after it.
         before_end = np.minimum(frame, aligned.length[trial] - 2)
-        features[ACTION] = Feature("float32", *_columns(aligned.actions, trial, before_end))
+        acting, acted = _columns(aligned.actions, trial, before_end)
+        features[ACTION] = Feature(acting, acted.astype(np.float32))
     if not np.isfinite(observed).all():
         points = [name.partition(".")[0] for name in names]
         first = np.unique(points, return_index=True)[1]
         first.sort()
         unseen = np.logical_or.reduceat(np.isnan(observed), first, axis=1)
-        features[SEEN] = Feature("bool", tuple(points[index] for index in first), ~unseen)
-    for name, dtype, values in (
-        ("timestamp", "float32", frame / fps),
-        ("frame_index", "int64", frame),
-        ("episode_index", "int64", trial),
-        ("index", "int64", np.arange(len(frame))),
-        ("task_index", "int64", np.zeros(len(frame))),
+        features[SEEN] = Feature(tuple(points[index] for index in first), ~unseen)
+    for name, values in (
+        ("timestamp", (frame / fps).astype(np.float32)),
+        ("frame_index", frame),
+        ("episode_index", trial),
+        ("index", np.arange(len(frame))),
+        ("task_index", np.zeros_like(frame)),
     ):
-        features[name] = Feature(dtype, (), values[:, None])
-    return {
-        name: replace(feature, values=feature.values.astype(feature.dtype))
-        for name, feature in features.items()
-    }
+        features[name] = Feature((), values[:, None])
+    return features
 
 
 def _columns(
@@ -196,7 +193,7 @@ def _write(
             "video_path": None,
             "features": {
                 name: {
-                    "dtype": feature.dtype,
+                    "dtype": feature.values.dtype.name,
                     "shape": [feature.values.shape[1]],
                     "names": list(feature.names) or None,
                 }

@@ -197,8 +197,8 @@ class Intervals:
     `warnings` about combinations of parameters.
     """
 
-    lower: dict[str, Array]
-    upper: dict[str, Array]
+    lower: dict[str, np.ndarray]
+    upper: dict[str, np.ndarray]
     verdict: dict[str, str | None]
     warnings: tuple[str, ...]
 
@@ -247,17 +247,11 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     lower, upper, verdicts = {}, {}, {}
     for path, declaration in coordinates.declarations.items():
         reference = value_of(coordinates.reference, path)
-        low, high = (
-            jnp.broadcast_to(
-                declaration.prior.to_value(free[path] + sign * deviation[path], reference),
-                reference.shape,
-            )
-            for sign in (-QUANTILE, QUANTILE)
-        )
-        lower[path], upper[path] = low, high
-        verdicts[path] = verdict(
-            undecided(*(np.asarray(of[path]).ravel() for of in (deviation, free)))
-        )
+        for edge, sign in ((lower, -QUANTILE), (upper, QUANTILE)):
+            value = declaration.prior.to_value(free[path] + sign * deviation[path], reference)
+            edge[path] = np.broadcast_to(np.asarray(value), reference.shape)
+        share, shift = (np.asarray(of[path]).ravel() for of in (deviation, free))
+        verdicts[path] = verdict(undecided(share, shift))
     return Intervals(lower, upper, verdicts, _undecided(information, unravel))
 
 

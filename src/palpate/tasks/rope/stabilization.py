@@ -29,11 +29,79 @@ STATES_PER_MOTION = 16
 _HANGING = np.array([0.0, 0.0, -1.0], np.float32)
 
 
-class RopeStabilization(Task):
+class HangingRopeTask(Task):
+    """A task for a rope that hangs from a gripper: what is seen of it, and its symmetries.
+
+    The model is driven by `velocity` at its first node.
+    """
+
+    goal_features: ClassVar[int] = 0  # of `features`: what is seen of the goal
+    action_name: ClassVar[str] = "gripper velocity"
+    action_unit: ClassVar[str] = "m/s"
+    action_limit: float = eqx.field(static=True, default=1.5)  # m/s
+    action_rate_limit: float = eqx.field(static=True, default=10.0)  # m/s^2
+
+    def check_driven(self, model: Rope) -> None:
+        """Raise `PalpateError` when the rope is not driven by velocity at its first node."""
+        if model.driven != (0,) or model.drive != "velocity":
+            raise PalpateError(
+                f"{self.name} needs a rope driven by velocity at node 0, "
+                f"got one driven by {model.drive} at {model.driven}"
+            )
+
+    def augment(self, start: Start, key: PRNGKeyArray) -> Start:
+        """Turned about the vertical through any angle, and mirrored or not in a vertical plane.
+
+        With translations these are all symmetries that gravity leaves. Translations need not be
+        drawn: the features do not say where the gripper is, so all of them look the same.
+        """
+        count = start.command.shape[0]
+        for_angle, for_mirror = jax.random.split(key)
+        angle = jax.random.uniform(for_angle, (count,), maxval=2 * jnp.pi)
+        mirror = jax.random.rademacher(for_mirror, (count,), angle.dtype)
+        move = vertical_symmetry(angle, mirror)
+
+        def moved(vectors: Array) -> Array:
+            return jnp.einsum("bij,bnj->bni", move, vectors)
+
+        return jax.tree.map(moved, start)
+
+    def adapt(self, start: Start, models: Rope) -> Start:
+        """The same directions and turning rates with each rope's own segment lengths."""
+        position, velocity = start.state.position, start.state.velocity
+        edge = jnp.diff(position, axis=-2)
+        length = jnp.linalg.norm(edge, axis=-1)
+        ratio = (models.rest_length / length)[..., None]
+        own = RopeState(
+            _along(edge, ratio[..., 0]) + position[..., :1, :],
+            _along(jnp.diff(velocity, axis=-2), ratio[..., 0]) + velocity[..., :1, :],
+        )
+        return eqx.tree_at(lambda s: s.state, start, own)
+
+    def features(self, state: RopeState, goal: Any = None) -> Float[Array, "*batch features"]:
+        """Positions relative to the gripper (m) and velocities (m/s) of all nodes but the gripper.
+
+        Exactly the same wherever the rope is. The gripper's velocity is the command, which a
+        policy carries.
+        """
+        relative = state.position[..., 1:, :] - state.position[..., :1, :]
+        seen = jnp.concatenate([relative, state.velocity[..., 1:, :]], axis=-2)
+        return seen.reshape(*seen.shape[:-2], -1)
+
+    def feature_channels(self, model: Rope) -> tuple[Channel, ...]:
+        """See `Task.feature_channels`."""
+        shape = (model.nodes - 1, 3)
+        return (
+            Channel("node position relative to the gripper", shape, "m"),
+            Channel("node velocity", shape, "m/s"),
+        )
+
+
+class RopeStabilization(HangingRopeTask):
     """A hanging rope of one driven end comes to rest, wherever the gripper then is.
 
-    The model is driven by `velocity` at its first node. The loss of an episode, with the energy
-    e(t) = E_rope(X^t) / E_rope(X^0) above hanging rest and the gripper's speed v, is
+    The loss of an episode, with the energy e(t) = E_rope(X^t) / E_rope(X^0) above hanging rest and
+    the gripper's speed v, is
 
         final_weight e(T) + settling_weight mean_t log(1 + e(t) / 0.01) + rest_weight v(T)
 
@@ -43,17 +111,12 @@ class RopeStabilization(Task):
     """
 
     name: ClassVar[str] = "rope-stabilization"
-    goal_features: ClassVar[int] = 0  # of `features`: what is seen of the goal
-    action_name: ClassVar[str] = "gripper velocity"
-    action_unit: ClassVar[str] = "m/s"
     outcome_units: ClassVar[Mapping[str, str]] = {
         "settling_time": "s",
         "settling_periods": "periods",
         "final_speed": "m/s",
     }
     duration: float = eqx.field(static=True, default=2.0)
-    action_limit: float = eqx.field(static=True, default=1.5)  # m/s
-    action_rate_limit: float = eqx.field(static=True, default=10.0)  # m/s^2
     final_weight: float = eqx.field(static=True, default=1.0)
     settling_weight: float = eqx.field(static=True, default=1.0)
     rest_weight: float = eqx.field(static=True, default=1.0)
@@ -66,11 +129,7 @@ class RopeStabilization(Task):
         Curves are straight, circular or helical, their mean direction 10 to 120 degrees from
         hanging. Raises `PalpateError` when the rope is not driven by velocity at its first node.
         """
-        if model.driven != (0,) or model.drive != "velocity":
-            raise PalpateError(
-                f"{self.name} needs a rope driven by velocity at node 0, "
-                f"got one driven by {model.drive} at {model.driven}"
-            )
+        self.check_driven(model)
         for_motion, for_curve = jax.random.split(key)
         moving = self._from_motions(model, for_motion, count // 2)
         still = self._curves(model, for_curve, count - count // 2)
@@ -149,53 +208,6 @@ class RopeStabilization(Task):
         )
         position = _along(jnp.where(kind == 2, helix, arc), model.rest_length)
         return Start(RopeState(position, jnp.zeros_like(position)), jnp.zeros((count, 1, 3)))
-
-    def augment(self, start: Start, key: PRNGKeyArray) -> Start:
-        """Turned about the vertical through any angle, and mirrored or not in a vertical plane.
-
-        With translations these are all symmetries that gravity leaves. Translations need not be
-        drawn: the features do not say where the gripper is, so all of them look the same.
-        """
-        count = start.command.shape[0]
-        for_angle, for_mirror = jax.random.split(key)
-        angle = jax.random.uniform(for_angle, (count,), maxval=2 * jnp.pi)
-        mirror = jax.random.rademacher(for_mirror, (count,), angle.dtype)
-        move = vertical_symmetry(angle, mirror)
-
-        def moved(vectors: Array) -> Array:
-            return jnp.einsum("bij,bnj->bni", move, vectors)
-
-        return jax.tree.map(moved, start)
-
-    def adapt(self, start: Start, models: Rope) -> Start:
-        """The same directions and turning rates with each rope's own segment lengths."""
-        position, velocity = start.state.position, start.state.velocity
-        edge = jnp.diff(position, axis=-2)
-        length = jnp.linalg.norm(edge, axis=-1)
-        ratio = (models.rest_length / length)[..., None]
-        own = RopeState(
-            _along(edge, ratio[..., 0]) + position[..., :1, :],
-            _along(jnp.diff(velocity, axis=-2), ratio[..., 0]) + velocity[..., :1, :],
-        )
-        return eqx.tree_at(lambda s: s.state, start, own)
-
-    def features(self, state: RopeState, goal: None = None) -> Float[Array, "*batch features"]:
-        """Positions relative to the gripper (m) and velocities (m/s) of all nodes but the gripper.
-
-        Exactly the same wherever the rope is. The gripper's velocity is the command, which a
-        policy carries.
-        """
-        relative = state.position[..., 1:, :] - state.position[..., :1, :]
-        seen = jnp.concatenate([relative, state.velocity[..., 1:, :]], axis=-2)
-        return seen.reshape(*seen.shape[:-2], -1)
-
-    def feature_channels(self, model: Rope) -> tuple[Channel, ...]:
-        """See `Task.feature_channels`."""
-        shape = (model.nodes - 1, 3)
-        return (
-            Channel("node position relative to the gripper", shape, "m"),
-            Channel("node velocity", shape, "m/s"),
-        )
 
     @staticmethod
     def measure(observation: Any, truth: Any) -> dict[str, float]:

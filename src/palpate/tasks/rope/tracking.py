@@ -12,13 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from palpate.errors import PalpateError
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import Channel
 from palpate.tasks.rope.paths import DesiredPath, random_paths
-from palpate.tasks.rope.stabilization import RopeStabilization
-from palpate.tasks.task import Start, Task
+from palpate.tasks.rope.stabilization import HangingRopeTask
+from palpate.tasks.task import Start
 
 # What is seen of the path, s ahead. A hanging chain's grip has to know where its tip should be
 # 2 sqrt(L / g) later, 0.64 s for 1 m: see `grip_of_chain`. The rest is for longer ropes.
@@ -30,14 +29,12 @@ STATES_PER_MOTION = 16
 AT_THE_BEGINNING = 0.2  # of the starts: at rest, where the path starts softly
 MOST_MIXED = 0.5  # share of the path itself in how the gripper moves before the others
 
-_ROPE = RopeStabilization()  # its symmetries, and what is seen of a rope, are this task's too
 
-
-class RopeTracking(Task):
+class RopeTracking(HangingRopeTask):
     """The tip of a hanging rope follows a path that is seen some way ahead.
 
-    The model is driven by `velocity` at its first node, and the goal is a `DesiredPath` in the
-    world frame. With the tip at p_N and the path at g, the loss is the seed document's,
+    The goal is a `DesiredPath` in the world frame. With the tip at p_N and the path at g, the loss
+    is the seed document's,
 
         sum_t discount^(T - t) |p_N(t) - g(t)|^2
 
@@ -46,8 +43,6 @@ class RopeTracking(Task):
 
     name: ClassVar[str] = "rope-tracking"
     goal_features: ClassVar[int] = 3 * len(PREVIEW)
-    action_name: ClassVar[str] = "gripper velocity"
-    action_unit: ClassVar[str] = "m/s"
     outcome_units: ClassVar[Mapping[str, str]] = {
         "mean_tip_error": "cm",
         "rms_tip_error": "cm",
@@ -58,8 +53,6 @@ class RopeTracking(Task):
     # that was trained without one shook long ropes apart within seconds, of 0.4 cm otherwise.
     action_lag: ClassVar[float] = 0.03
     duration: float = eqx.field(static=True, default=6.0)
-    action_limit: float = eqx.field(static=True, default=1.5)  # m/s
-    action_rate_limit: float = eqx.field(static=True, default=10.0)  # m/s^2
     discount: float = eqx.field(static=True, default=0.99)  # per control period
 
     def starts(self, model: Rope, key: PRNGKeyArray, count: int) -> Start:
@@ -71,11 +64,7 @@ class RopeTracking(Task):
 
         Raises `PalpateError` when the rope is not driven by velocity at its first node.
         """
-        if model.driven != (0,) or model.drive != "velocity":
-            raise PalpateError(
-                f"{self.name} needs a rope driven by velocity at node 0, "
-                f"got one driven by {model.drive} at {model.driven}"
-            )
+        self.check_driven(model)
         period = model.control_period
         motions = max(1, -(-count // STATES_PER_MOTION))
         for_path, for_mix, for_time = jax.random.split(key, 3)
@@ -110,16 +99,9 @@ class RopeTracking(Task):
         )
         return Start(states, commands[:, None, :], DesiredPath(position, period))
 
-    def augment(self, start: Start, key: PRNGKeyArray) -> Start:
-        """Rope and path turned about the vertical together, and mirrored or not.
-
-        See `RopeStabilization.augment`, also for why no translations are drawn.
-        """
-        return _ROPE.augment(start, key)
-
     def adapt(self, start: Start, models: Rope) -> Start:
         """The same shapes with each rope's own segment lengths; paths move along with the tips."""
-        adapted = _ROPE.adapt(start, models)
+        adapted = super().adapt(start, models)
         moved = adapted.state.position[:, -1:] - start.state.position[:, -1:]
         return eqx.tree_at(lambda s: s.goal.position, adapted, start.goal.position + moved)
 
@@ -135,14 +117,14 @@ class RopeTracking(Task):
         """
         steps = np.round(np.array(PREVIEW) / goal.period).astype(int)
         path = goal.ahead(jnp.asarray(steps)) - state.position[..., :1, :]
-        seen = _ROPE.features(state, None)
+        seen = super().features(state)
         return jnp.concatenate([seen, path.reshape(*path.shape[:-2], -1)], axis=-1)
 
     def feature_channels(self, model: Rope) -> tuple[Channel, ...]:
         """See `Task.feature_channels`."""
         instants = ", ".join(f"{instant:g}" for instant in PREVIEW)
         ahead = f"desired tip position relative to the gripper, {instants} s ahead"
-        return (*_ROPE.feature_channels(model), Channel(ahead, (len(PREVIEW), 3), "m"))
+        return (*super().feature_channels(model), Channel(ahead, (len(PREVIEW), 3), "m"))
 
     @staticmethod
     def measure(observation: Any, truth: Any) -> dict[str, np.ndarray]:

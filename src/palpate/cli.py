@@ -18,87 +18,50 @@ BAD_INPUT = 2
 
 @dataclass(frozen=True)
 class Command:
-    """One command: its work, and its options, as "module:name".
+    """One command, whose work is `run` of its module below `palpate.commands`.
 
     Where it works on one of several things, `subject` says what they are, and the families' tables
-    give the options of each; `options` then serve those that come without (experiments). With
-    `optional` the subject may be left out: the first that there is stands for it.
+    give the options of each; `options`, of `palpate.commands.options`, then serve those that come
+    without (experiments). With `optional` the subject may be left out: the first that there is
+    stands for it.
     """
 
     about: str
-    run: str
     options: str = ""
     subject: str = ""
     optional: bool = False
 
     def kinds(self, name: str) -> dict[str, str]:
-        """Where the options of each thing that the command `name` works on are."""
+        """Where the options of each thing that the command `name` works on are: "module:name"."""
+        own = f"palpate.commands.options:{self.options}"
         if not self.subject:
-            return {"": self.options}
-        return (
-            dict.fromkeys(places("experiments"), self.options) if self.options else options_of(name)
-        )
+            return {"": own}
+        return dict.fromkeys(places("experiments"), own) if self.options else options_of(name)
 
-
-_OPTIONS = "palpate.commands.options"
 
 COMMANDS = {
     "demo": Command(
         "record an object, identify it, train a controller, try it, write a report",
-        "palpate.commands.demo:run",
         subject="family",
         optional=True,
     ),
-    "record": Command("record a simulated object", "palpate.commands.record:run", subject="family"),
-    "convert": Command(
-        "turn a robot's log or any recording into another format",
-        "palpate.commands.convert:run",
-        f"{_OPTIONS}:Convert",
-    ),
-    "track": Command(
-        "follow an object through a camera's pictures",
-        "palpate.commands.track:run",
-        subject="family",
-    ),
+    "record": Command("record a simulated object", subject="family"),
+    "convert": Command("turn a robot's log or any recording into another format", "Convert"),
+    "track": Command("follow an object through a camera's pictures", subject="family"),
     "identify": Command(
-        "find an object's physical parameters from recordings of it",
-        "palpate.commands.identify:run",
-        subject="family",
+        "find an object's physical parameters from recordings of it", subject="family"
     ),
-    "plan": Command(
-        "plan a robot's way, moving what stands in it",
-        "palpate.commands.plan:run",
-        subject="problem",
-    ),
-    "train": Command(
-        "train a controller through an identified model",
-        "palpate.commands.train:run",
-        subject="task",
-    ),
-    "evaluate": Command(
-        "try a controller in a world the model cannot see into",
-        "palpate.commands.evaluate:run",
-        subject="task",
-    ),
+    "plan": Command("plan a robot's way, moving what stands in it", subject="problem"),
+    "train": Command("train a controller through an identified model", subject="task"),
+    "evaluate": Command("try a controller in a world the model cannot see into", subject="task"),
     "export": Command(
-        "write a policy as ONNX, with a contract that says how to connect it",
-        "palpate.commands.export:run",
-        f"{_OPTIONS}:Export",
+        "write a policy as ONNX, with a contract that says how to connect it", "Export"
     ),
-    "serve": Command(
-        "run a policy in real time, and brake when its eyes fail",
-        "palpate.commands.serve:run",
-        f"{_OPTIONS}:Serve",
-    ),
-    "report": Command(
-        "write the page of one or several runs",
-        "palpate.commands.report:run",
-        f"{_OPTIONS}:Report",
-    ),
+    "serve": Command("run a policy in real time, and brake when its eyes fail", "Serve"),
+    "report": Command("write the page of one or several runs", "Report"),
     "reproduce": Command(
         "repeat a headline experiment and hold its figures against their bars",
-        "palpate.commands.reproduce:run",
-        f"{_OPTIONS}:Reproduce",
+        "Reproduce",
         subject="experiment",
     ),
 }
@@ -151,11 +114,10 @@ def _run(words: list[str]) -> int:
         kind, *rest = rest
         check_name(command.subject, kind, kinds)
         program = f"{program} {kind}"
-    kind_of_options = resolve(kinds[kind])
-    options = parse(kind_of_options, program, rest)
-    if options is None:
-        return 0
-    resolve(command.run)(options, *([kind] if name == "reproduce" else []))
+    options = parse(resolve(kinds[kind]), program, rest)
+    if options is not None:
+        run = resolve(f"palpate.commands.{name}:run")
+        run(options, *([kind] if name == "reproduce" else []))
     return 0
 
 

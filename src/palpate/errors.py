@@ -6,8 +6,7 @@ from collections.abc import Iterable
 class PalpateError(ValueError):
     """Bad input: one sentence that says what was expected, what came and what would work.
 
-    The command line prints the sentence and exits with status 2; a library user sees an
-    ordinary `ValueError`.
+    The command line prints it and exits with status 2; a library user sees a `ValueError`.
     """
 
 

@@ -38,8 +38,7 @@ class Identified:
 
     `model` is the fitted one, or the most probable of the draws. `lower` and `upper` are the ends
     of 90 % intervals by parameter, in its unit and shape; `verdict` a sentence where the data left
-    it as the prior has it, else None. `comparison` holds draws, and how probable each hypothesis
-    is; it is None of a fit.
+    it as the prior has it. `comparison`, None of a fit, has draws and hypotheses' probabilities.
     """
 
     model: Model

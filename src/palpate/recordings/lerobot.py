@@ -54,8 +54,7 @@ def write_lerobot(
     episode's end); both float32 in the channels' own units, which `meta/palpate.json` tells. Frames
     are evenly spaced, `fps` to the second, by default those of the first sensor. The format has no
     value for what was not seen: it is interpolated from the frames around it, and a column `seen`
-    says which points really were. Events are left out. With `fresh`, a folder that is there goes
-    when the new one is whole.
+    says which points really were. Events are left out. `fresh` replaces a folder that is there.
 
     Raises `PalpateError` when the folder exists, when pyarrow is missing, when there is no
     observation, when something is never seen in an episode, or when `fps` is less than 1.

@@ -2,8 +2,7 @@
 
 What is fitted are the parameters and, for each segment, the state that it starts in: a smoothed
 start is off, and a model held to it would bend its parameters to make up for that (errors in
-variables). A start's errors are whitened by its vague deviation (`Segments.moved`), and eliminated
-segment by segment.
+variables). A start's errors are whitened by their deviation (`Segments.moved`) and eliminated.
 
 With few unknowns and many residuals the Jacobian is taken column by column in forward mode and only
 products of its columns are kept: memory does not grow with the recording.
@@ -210,9 +209,8 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     A = J^T W J / s^2 + 1 (the prior's precision is one in whitened coordinates) and the scores
     g_b = J^T W r / s^2 over a tenth of a trial each, the covariance is
     A^-1 (sum g_b g_b^T + 1) A^-1 (Huber 1967; White 1982): residuals next to each other in time are
-    not counted as independent evidence. Never below the covariance A^-1 of independent noise. What
-    a descent that ended early has left to go, a Gauss-Newton step, widens them as an error of that
-    size.
+    not counted as independent evidence. Never below the covariance A^-1 of independent noise. The
+    Gauss-Newton step that a descent has left to go widens them as an error of its size.
     """
     segments = SegmentSource.of(aligned, coordinates.reference).whole()
     offset = jnp.zeros((segments.count, 2, *segments.pose.shape[1:]))

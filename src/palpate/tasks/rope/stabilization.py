@@ -81,8 +81,7 @@ class HangingRopeTask(Task):
     def features(self, state: RopeState, goal: Any = None) -> Float[Array, "*batch features"]:
         """Positions relative to the gripper (m) and velocities (m/s) of all nodes but the gripper.
 
-        Exactly the same wherever the rope is. The gripper's velocity is the command, which a
-        policy carries.
+        The same wherever the rope is. The gripper's velocity is the command, which policies carry.
         """
         relative = state.position[..., 1:, :] - state.position[..., :1, :]
         seen = jnp.concatenate([relative, state.velocity[..., 1:, :]], axis=-2)

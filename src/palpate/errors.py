@@ -1,6 +1,8 @@
-"""What palpate raises when the fault is in what it was given."""
+"""What palpate raises when the fault is in what it was given, or in what is installed."""
 
+import importlib
 from collections.abc import Iterable
+from typing import Any
 
 
 class PalpateError(ValueError):
@@ -15,3 +17,14 @@ def listed(names: Iterable[str], most: int = 6) -> str:
     every = list(names)
     more = f" and {len(every) - most} more" if len(every) > most else ""
     return ", ".join(every[:most]) + more
+
+
+def extra_module(name: str, extra: str, package: str = "") -> Any:
+    """The module `name`; raises `PalpateError` that names the extra, if its package is missing."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise PalpateError(
+            f"this needs {package or name}, which is not installed: "
+            f"`pip install 'palpate[{extra}]'` brings it"
+        ) from error

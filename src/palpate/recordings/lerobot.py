@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, extra_module
 from palpate.recordings.alignment import Aligned
 from palpate.recordings.channel import Role
 from palpate.recordings.facts import fact_to_json
@@ -59,13 +59,7 @@ def write_lerobot(
     Raises `PalpateError` when the folder exists, when pyarrow is missing, when there is no
     observation, when something is never seen in an episode, or when `fps` is less than 1.
     """
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError as error:
-        raise PalpateError(
-            "LeRobot datasets are written by the package pyarrow, which is not installed: "
-            "pip install 'palpate[io]'"
-        ) from error
+    extra_module("pyarrow.parquet", "io", "pyarrow")
     folder = Path(folder)
     if folder.exists() and not fresh:
         raise PalpateError(f"{folder} exists: expected the name of a new folder")

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.stats import binom
 
-from palpate.experiments.picture import canvas_of, legend_of, save_picture
+from palpate.report.picture import canvas_of, legend_of, save_picture
 from palpate.report.style import STYLES
 
 ACROSS = 4  # panels in a row
@@ -43,5 +43,5 @@ def rank_figure(
             axis.set_ylabel("simulations")
         if index >= len(names) - ACROSS:
             axis.set_xlabel("rank of the truth / draws", fontsize=9)
-    legend_of(canvas, axes[0], "upper center")
+    legend_of(canvas, "upper center")
     save_picture(out, canvas)

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.experiments.experiment import Experiment, mean_of, resumable, suffix
-from palpate.experiments.picture import band, canvas_of, curve, legend_of, save_picture
+from palpate.report.picture import band, canvas_of, curve, legend_of, save_picture
 from palpate.report.style import STYLES
 from palpate.runs import Figure, Result
 from palpate.runs.progress import progress
@@ -211,5 +211,5 @@ def draw(path: Path, earned: dict[str, Rewards]) -> None:
         axis.set(title=f"{name}, {task.episode} decisions an episode", xlabel="decisions")
         axis.set_xlim(left=0)
     axes[0].set_ylabel("mean reward of an episode's decisions (m)")
-    legend_of(canvas, axes[0], "lower center")
+    legend_of(canvas, "lower center")
     save_picture(path, canvas)

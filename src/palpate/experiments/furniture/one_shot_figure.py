@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.experiments.furniture.one_shot_regression import OURS, RIVALS
-from palpate.experiments.picture import canvas_of, curve, legend_of, save_picture
+from palpate.report.picture import canvas_of, curve, legend_of, save_picture
 from palpate.report.style import STYLES
 
 ACROSS = 3  # panels in a row
@@ -34,5 +34,5 @@ def shares_figure(out: Path, compared: Mapping[str, Mapping[str, Any]]) -> None:
             axis.set_ylabel("error² / displacement²")
         if index >= len(compared) - ACROSS:
             axis.set_xlabel("samples of 0.1 s since it moved")
-    legend_of(canvas, axes[0], "upper center")
+    legend_of(canvas, "upper center")
     save_picture(out, canvas)

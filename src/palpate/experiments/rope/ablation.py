@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from palpate.experiments.experiment import Experiment, suffix
-from palpate.experiments.picture import band, canvas_of, save_picture
 from palpate.experiments.rope.nominal import (
     BASE,
     FULL,
@@ -21,6 +20,7 @@ from palpate.experiments.rope.nominal import (
     trained_policy,
 )
 from palpate.experiments.rope.stabilization import EVALUATION_SEEDS
+from palpate.report.picture import band, canvas_of, save_picture
 from palpate.report.style import STYLES
 from palpate.runs import Result
 from palpate.tasks.rope import RopeStabilization

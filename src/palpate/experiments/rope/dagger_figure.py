@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.experiments.picture import canvas_of, curve, save_picture
 from palpate.learning.dagger import Outcome, Round
 from palpate.models.model import Model
+from palpate.report.picture import canvas_of, curve, save_picture
 from palpate.report.style import STYLES
 from palpate.tasks.task import Start, Task
 

@@ -4,7 +4,6 @@ Walls are solid, objects numbered by the order in which they are moved; where an
 dashed, where it is left is filled. Ways are told apart by line as well as by colour.
 """
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.maps.regions import regions_of
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan
-from palpate.runs.storage import write_bytes
+from palpate.report.picture import legend_of, save_animation, save_picture
 
 _INK, _QUIET, _WALL = "#1c2127", "#5b6570", "#3d4650"
 _OBJECT, _MOVED, _ROBOT, _CARRY = "#f3d9a0", "#e8a33d", "#0062a8", "#c04d00"
@@ -85,8 +84,8 @@ def plan_picture(
         goal = plan.goal if plan is not None else next(iter(world.goals), None)
         if goal is not None:
             axes.plot(*goal[:2], label="goal", **_STAR)
-        _legend(figure, axes)
-        _write(figure, out)
+        legend_of(figure, "upper center", handlelength=2.6)
+        save_picture(out, figure)
     return out
 
 
@@ -148,12 +147,8 @@ def scene_animation(
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
             colours = 64, Image.Quantize.FASTOCTREE
             pictures.append(picture.quantize(*colours, dither=Image.Dither.NONE))
-    buffer = io.BytesIO()
     milliseconds = [round(1000 * period)] * (len(pictures) - 1) + [1500]
-    pictures[0].save(
-        buffer, "GIF", save_all=True, append_images=pictures[1:], duration=milliseconds, loop=0
-    )
-    write_bytes(out, buffer.getvalue())
+    save_animation(out, pictures, milliseconds)
     return out
 
 
@@ -265,18 +260,3 @@ def _draw_ways(axes: Axes, plan: Plan) -> None:
         if segment.kind == TRANSFER:
             axes.plot(*segment.poses[0, :2], marker="o", ms=4, color=_CARRY, zorder=7)
             axes.plot(*segment.poses[-1, :2], marker="s", ms=4, color=_CARRY, zorder=7)
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    handles = {}
-    for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-        handles.setdefault(label, handle)
-    look: Any = {"loc": "outside upper center", "frameon": False, "handlelength": 2.6}
-    figure.legend(list(handles.values()), list(handles), ncols=len(handles), **look)
-
-
-def _write(figure: Figure, out: Path) -> None:
-    buffer = io.BytesIO()
-    stamp = {"Date": None} if out.suffix == ".svg" else {"Software": None}
-    figure.savefig(buffer, format=out.suffix[1:], metadata=stamp)
-    write_bytes(out, buffer.getvalue())

@@ -3,7 +3,6 @@
 What they show is what the page shows, in the same looks (`palpate.report.style`), on white.
 """
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +12,11 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.report.charts import quantiles
 from palpate.report.evidence import Curves, Motion
+from palpate.report.picture import canvas_of, legend_of, save_picture
 from palpate.report.style import STYLES, Style, numbered
-from palpate.runs.storage import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _NOTHING = "the motion holds nothing but gaps: there is nothing to draw"
 _INK, _QUIET, _RULE = "#1c2127", "#5b6570", "#dfe3e7"
@@ -51,7 +49,6 @@ def motion_figure(
     Raises `PalpateError` for another suffix, no instants, or a file that cannot be written.
     """
     import matplotlib
-    from matplotlib.figure import Figure
 
     out = Path(out)
     if out.suffix not in _SUFFIXES:
@@ -67,7 +64,7 @@ def motion_figure(
     panel = 1.4 * np.clip(np.ptp(limits[0]) / np.ptp(limits[1]), 0.5, 2.0)
     widths = [panel] * len(instants) + [2.8] * (energy is not None)
     with matplotlib.rc_context(_SETTINGS):
-        figure = Figure(figsize=(sum(widths) + 0.8, 2.4), dpi=200, layout="constrained")
+        figure = canvas_of(sum(widths) + 0.8, 2.4, dpi=200)
         axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
         for ax, frame in zip(axes, frames, strict=False):
             for label, chain in seen.items():
@@ -81,8 +78,10 @@ def motion_figure(
                 ax.set_yticklabels([])
         if energy is not None:
             _draw_energy(axes[-1], energy, looks)
-        _legend(figure)
-        _save(figure, out)
+        if len(looks) > 1:
+            across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
+            legend_of(figure, "upper left", ncols=across, handlelength=3.5)
+        save_picture(out, figure)
     return out
 
 
@@ -146,22 +145,3 @@ def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
     ax.set_title("energy relative to the start", color=_INK)
     ax.set_yticks([1e-4, 1e-3, 1e-2, 1e-1, 1], ["0.01 %", "0.1 %", "1 %", "10 %", "100 %"])
     ax.minorticks_off()
-
-
-def _legend(figure: "Figure") -> None:
-    """One legend for all panels, a label that stands in several shown once."""
-    handles = {}
-    for ax in figure.axes:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
-    if len(handles) > 1:
-        across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
-        place = {"loc": "outside upper left", "ncols": across, "frameon": False}
-        figure.legend(handles.values(), handles.keys(), handlelength=3.5, **place)
-
-
-def _save(figure: "Figure", out: Path) -> None:
-    buffer = io.BytesIO()
-    stamp = {"Date": None} if out.suffix == ".svg" else {"Software": None}
-    figure.savefig(buffer, format=out.suffix[1:], metadata=stamp)
-    write_bytes(out, buffer.getvalue())

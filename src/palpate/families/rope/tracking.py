@@ -1,6 +1,5 @@
 """A rope followed through the pictures of a calibrated camera."""
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,9 @@ from palpate.perception.image_folder import read_image_folder
 from palpate.perception.rope.segmentation import Appearance
 from palpate.perception.rope.tracking import RopeTracker
 from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.report.picture import save_animation
 from palpate.runs import Run
 from palpate.runs.progress import progress
-from palpate.runs.storage import write_bytes
 
 OVERLAY = "rendering.webp"  # the pictures with the nodes on them, which the report shows
 MAX_PICTURES = 300  # of the overlay
@@ -93,10 +92,5 @@ def _draw(
         for u, v in 2 * pixels + 1:  # no line between them, which would hide the rope
             drawing.ellipse((u - 3, v - 3, u + 3, v + 3), outline=(0, 114, 178), width=2)
         pictures.append(picture)
-    buffer = io.BytesIO()
     shown = round(1000 * every * float(np.median(np.diff(times)))) if len(times) > 1 else 1000
-    pictures[0].save(
-        buffer, "WEBP", save_all=True, append_images=pictures[1:], duration=shown, loop=0,
-        quality=70,
-    )  # fmt: skip
-    write_bytes(path, buffer.getvalue())
+    save_animation(path, pictures, shown, quality=70)

@@ -1,10 +1,9 @@
 """A moving picture of a controlled rope, as MuJoCo renders it."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from palpate.runs.storage import write_bytes
+from palpate.report.picture import save_animation
 from palpate.trials.controller import Controller
 from palpate.trials.rope.trials import StabilizationTrial
 from palpate.trials.trial import run_trials
@@ -30,14 +29,5 @@ def render_trial(
             pictures.append(Image.fromarray(worlds[0].render(*SIZE)))
 
     run_trials([trial], controller, round(duration / trial.control_period), watch=watch)
-    buffer = io.BytesIO()
-    pictures[0].save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=pictures[1:],
-        duration=round(1000 * EVERY * trial.control_period),
-        loop=0,
-        quality=60,
-    )
-    write_bytes(path, buffer.getvalue())
+    shown = round(1000 * EVERY * trial.control_period)
+    save_animation(path, pictures, shown, quality=60)

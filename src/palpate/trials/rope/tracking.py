@@ -1,6 +1,5 @@
 """Ropes, paths and controllers in MuJoCo: how far the tip is from where it should be."""
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.report.evidence import write_evidence
+from palpate.report.picture import canvas_of, legend_of, save_picture
 from palpate.report.style import STYLES
 from palpate.runs import Figure, Run
-from palpate.runs.storage import write_bytes
 from palpate.tasks.rope import RopeTracking
 from palpate.tasks.rope.paths import CURVES, DesiredPath, named_path, read_path
 from palpate.tasks.rope.tracking import PREVIEW, grip_of_chain
@@ -260,10 +259,8 @@ def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followe
 
     Where the tip should have been and was, from above; and how far from there it was over time.
     """
-    from matplotlib.figure import Figure as Canvas
-
     drawn = first_of_each_group(trials)
-    canvas = Canvas(figsize=(4 * len(drawn), 7.5), layout="constrained")
+    canvas = canvas_of(4 * len(drawn), 7.5)
     axes = canvas.subplots(2, len(drawn), squeeze=False)
     for index, above, below in zip(drawn, *axes, strict=True):
         trial = trials[index]
@@ -277,8 +274,5 @@ def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followe
             below.semilogy(time, 100 * np.linalg.norm(tips - path, axis=1), **look)
         above.set(title=trial.name, xlabel="x (m)", ylabel="y (m)", aspect="equal")
         below.set(xlabel="time (s)", ylabel="distance of the tip from the path (cm)")
-    canvas.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
-                  fontsize=8, frameon=False)  # fmt: skip
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=150)
-    write_bytes(file, buffer.getvalue())
+    legend_of(canvas, "lower center", ncols=7, fontsize=8)
+    save_picture(file, canvas)

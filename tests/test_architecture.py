@@ -49,7 +49,7 @@ ENGINE, ENGINE_FREE = "mujoco", {"models", "safety", "planning", "learning", "id
 TRUTH_FILES = {
     "trials/trial.py",
     "trials/rope/filming.py",  # what a tracker says beside what is
-    "trials/furniture/cart_trials.py",  # rewards, and the agent that is told
+    "trials/furniture/cart_trials.py",  # the controller that is told
     "trials/furniture/namo_episode.py",  # the planner that is told
     *("experiments/rope/bound.py", "experiments/rope/swing.py"),
     "experiments/furniture/one_shot.py",

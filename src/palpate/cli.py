@@ -18,12 +18,12 @@ BAD_INPUT = 2
 
 @dataclass(frozen=True)
 class Command:
-    """One command, whose work is `run` in its file of `palpate.commands`.
+    """One command, whose work is `run` of its module below `palpate.commands`.
 
-    `options` names its options in `palpate.commands.options`. Where it works on one of several
-    things, `subject` says what they are, and the families' tables give the options of each; named
-    `options` then serve those that come without (experiments). With `optional` the subject may be
-    left out: the first that there is stands for it.
+    Where it works on one of several things, `subject` says what they are, and the families' tables
+    give the options of each; `options`, of `palpate.commands.options`, then serve those that come
+    without (experiments). With `optional` the subject may be left out: the first that there is
+    stands for it.
     """
 
     about: str
@@ -32,11 +32,11 @@ class Command:
     optional: bool = False
 
     def kinds(self, name: str) -> dict[str, str]:
-        """Where the options of each thing that the command `name` works on are."""
-        if self.subject and not self.options:
-            return options_of(name)
-        things = places("experiments") if self.subject else ("",)
-        return dict.fromkeys(things, f"palpate.commands.options:{self.options}")
+        """Where the options of each thing that the command `name` works on are: "module:name"."""
+        own = f"palpate.commands.options:{self.options}"
+        if not self.subject:
+            return {"": own}
+        return dict.fromkeys(places("experiments"), own) if self.options else options_of(name)
 
 
 COMMANDS = {
@@ -114,12 +114,10 @@ def _run(words: list[str]) -> int:
         kind, *rest = rest
         check_name(command.subject, kind, kinds)
         program = f"{program} {kind}"
-    kind_of_options = resolve(kinds[kind])
-    options = parse(kind_of_options, program, rest)
-    if options is None:
-        return 0
-    run = resolve(f"palpate.commands.{name}:run")
-    run(options, *([kind] if name == "reproduce" else []))
+    options = parse(resolve(kinds[kind]), program, rest)
+    if options is not None:
+        run = resolve(f"palpate.commands.{name}:run")
+        run(options, *([kind] if name == "reproduce" else []))
     return 0
 
 

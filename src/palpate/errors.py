@@ -1,13 +1,14 @@
-"""What palpate raises when the fault is in what it was given."""
+"""What palpate raises when the fault is in what it was given, or in what is installed."""
 
+import importlib
 from collections.abc import Iterable
+from typing import Any
 
 
 class PalpateError(ValueError):
     """Bad input: one sentence that says what was expected, what came and what would work.
 
-    The command line prints the sentence and exits with status 2; a library user sees an
-    ordinary `ValueError`.
+    The command line prints it and exits with status 2; a library user sees a `ValueError`.
     """
 
 
@@ -16,3 +17,14 @@ def listed(names: Iterable[str], most: int = 6) -> str:
     every = list(names)
     more = f" and {len(every) - most} more" if len(every) > most else ""
     return ", ".join(every[:most]) + more
+
+
+def extra_module(name: str, extra: str, package: str = "") -> Any:
+    """The module `name`; raises `PalpateError` that names the extra, if its package is missing."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise PalpateError(
+            f"this needs {package or name}, which is not installed: "
+            f"`pip install 'palpate[{extra}]'` brings it"
+        ) from error

@@ -10,6 +10,7 @@ import difflib
 import functools
 import importlib
 import pkgutil
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
@@ -95,6 +96,18 @@ def find(what: str, name: str) -> Any:
     """What is called `name` among all families' `what`; raises `PalpateError` if nothing is."""
     known = places(what)
     return resolve(known[check_name(what.removesuffix("s"), name, known)])
+
+
+def name_of(kind: type, known: Places) -> str | None:
+    """What a class is called in a table of places; None where it is not in it.
+
+    A place that is not loaded yet cannot be that of a class which is here.
+    """
+    for name, place in known.items():
+        module, _, attribute = place.partition(":")
+        if getattr(sys.modules.get(module), attribute, None) is kind:
+            return name
+    return None
 
 
 def resolve(place: str) -> Any:

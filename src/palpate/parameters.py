@@ -138,8 +138,7 @@ class Parameter:
 def as_floating(value: Any) -> Array:
     """Convert to a floating array: kept when it is one, else JAX's default float.
 
-    One dtype whatever is given, and never a weak one: an int here and a float there would trace
-    anew each time.
+    Never a weak dtype: an int here and a float there would be traced anew each time.
     """
     kept = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
     return jnp.asarray(value, dtype=value.dtype if kept else jnp.asarray(0.0).dtype)

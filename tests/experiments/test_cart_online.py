@@ -23,22 +23,23 @@ from palpate.tasks.furniture.cart import (
     clearance,
     shopping_cart,
 )
-from palpate.trials.furniture import cart_agents, cart_posterior, cart_trials
-from palpate.trials.furniture.cart_agents import (
+from palpate.trials.furniture import cart_controllers, cart_posterior, cart_trials
+from palpate.trials.furniture.cart_controllers import (
     FRAMES,
+    CartController,
     Decision,
     Episode,
     Handled,
-    Knowing,
-    PhysicsAgent,
-    RegressionAgent,
+    PhysicsController,
+    Planning,
+    RegressionController,
     around,
     due,
     piece_model,
     scene_model,
 )
 from palpate.trials.furniture.cart_posterior import PiecePosterior
-from palpate.trials.furniture.cart_trials import Planning, Trial, best_scene
+from palpate.trials.furniture.cart_trials import best_scene, rewards_by_episode
 from palpate.worlds.furniture.furniture import KINDS
 from palpate.worlds.furniture.pieces import draw_parameters
 
@@ -78,10 +79,9 @@ def test_the_reward_is_distance_and_heading_the_short_way_round():
 def test_pieces_are_held_one_after_another():
     task = apartment()
     turns, away = Turns(task), np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-    turns.begin()
     held = [turns.held(task.goals + away) for _ in range(3 * TURN)]
     assert held == [0] * TURN + [1] * TURN + [2] * TURN
-    turns.begin()
+    turns = Turns(task)
     assert turns.held(task.goals + away * [[0], [1], [1]]) == 1  # the first is where it should be
     assert turns.held(task.goals + away * 0.9 * DONE) == 1  # all are: nothing changes
     assert turns.held(task.goals + away * [[1], [0], [0]]) == 0
@@ -176,35 +176,34 @@ def test_the_pieces_in_which_most_happened_are_compared(monkeypatch):
     assert np.asarray(picked.seen).all(axis=(1, 2, 3)).tolist() == [True] * 4 + [False] * 2
 
 
-def run(task, agent, seed, count, idle=False):
-    trial = Trial(task, agent, SMALL, seed, idle)
-    return np.array([trial.decide() for _ in range(count)]), trial
+def run(task, controller, seed, count):
+    return np.concatenate(list(rewards_by_episode(task, controller, seed, count)))
 
 
 def test_a_trial_is_its_seed_and_begins_anew_after_an_episode():
     task = dataclasses.replace(shopping_cart(), episode=4)
-    first, trial = run(task, Knowing(None), 3, 6)
-    again, _ = run(task, Knowing(None), 3, 6)
-    other, _ = run(task, Knowing(None), 4, 6)
+    controller = CartController(task, SMALL, 3)
+    first = run(task, controller, 3, 6)
+    again = run(task, CartController(task, SMALL, 3), 3, 6)
+    other = run(task, CartController(task, SMALL, 4), 4, 6)
     np.testing.assert_array_equal(first, again)
     assert (first != other).all()
-    assert [len(episode.decisions) for episode in trial.episodes] == [4, 2]
-    still, trial = run(task, Knowing(None), 3, 6, idle=True)
-    np.testing.assert_allclose(still[:4], task.reward(trial.episodes[0].first), atol=0.02)
+    assert [len(episode.decisions) for episode in controller.episodes] == [4, 2]
+    idle = CartController(task, SMALL, 3, idle=True)
+    still = run(task, idle, 3, 6)
+    np.testing.assert_allclose(still[:4], task.reward(idle.episodes[0].first), atol=0.02)
     np.testing.assert_allclose(np.diff(still[:4]), 0, atol=1e-4)
 
 
 def test_a_regression_is_asked_once_its_piece_was_held():
-    task = apartment()
-    agent = RegressionAgent(task, "oo-lwr", 16)
+    task = dataclasses.replace(apartment(), episode=4)
+    agent = RegressionController(task, SMALL, 3, "oo-lwr", 16)
     assert agent.believed(0) is None
-    trial = Trial(task, agent, SMALL, 3)
-    for _ in range(4):
-        trial.decide()
+    run(task, agent, 3, 4)
     assert agent.believed(1) is None
     model = agent.believed(0)
     assert model is not None
-    last = trial.episodes[-1].decisions[-1]
+    last = agent.episodes[-1].decisions[-1]
     predicted = model.step(last.before, jnp.asarray(last.wrench))
     assert np.abs(predicted.pose - last.after.pose).max() < 0.2
 
@@ -232,11 +231,11 @@ def test_of_two_regressions_only_the_one_of_contact_conditions_knows_what_a_wall
     stopped = [pushed_chair(task, at_wall, 0.0, force) for force in forces]
 
     def ways(kind: str, seen: list[Decision]) -> list[float]:
-        agent = RegressionAgent(task, kind, 16)
-        episode = Episode(task.goals)
+        agent = RegressionController(task, SMALL, 0, kind, 16)
+        agent.episodes.append(Episode(task.goals))
         for one in seen:
-            episode.decisions.append(one)
-            agent.learn([episode])
+            agent.episodes[-1].decisions.append(one)
+            agent.learn()
         model = agent.believed(2)
         assert model is not None
         asked = pushed_chair(task, 0.5, 0.0, 15.0), pushed_chair(task, at_wall, 0.0, 15.0)
@@ -259,13 +258,14 @@ def test_a_planner_is_asked_for_what_is_believed(monkeypatch):
         return plan, jnp.array([0.5, 0.0, 0.0])
 
     monkeypatch.setattr(SamplingPlanner, "__call__", call)
-    task = shopping_cart()
+    task = dataclasses.replace(shopping_cart(), episode=2)
     scene = scene_model(task, [piece_model(task, 0)])
-    _, trial = run(task, Knowing(scene), 3, 2)
+    controller = CartController(task, SMALL, 3, scene=scene)
+    run(task, controller, 3, 2)
     assert [held for _, held, _ in asked] == [0, 0]
     assert asked[0][2] == (2, 1, 3)
     assert isinstance(asked[0][0], Planar)
-    wrench = trial.episodes[0].decisions[0].wrench[0]
+    wrench = controller.episodes[0].decisions[0].wrench[0]
     assert np.hypot(*wrench[:2]) == pytest.approx(0.5 * KINDS["cart"].hand_force, rel=1e-4)
 
 
@@ -273,7 +273,7 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
     updates, kept, searched = [], [], []
 
     class Posterior:
-        def __init__(self, model, seed, told):
+        def __init__(self, model, seed, first):
             self.model, self.mass = model, 10.0
 
         def keep(self, stretches):
@@ -287,12 +287,12 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
         def search(self):
             searched.append(len(kept))
 
-    monkeypatch.setattr(cart_agents, "PiecePosterior", Posterior)
+    monkeypatch.setattr(cart_controllers, "PiecePosterior", Posterior)
     monkeypatch.setattr(
         SamplingPlanner, "__call__", lambda self, plan, *_: (plan, jnp.array([0.2, 0.0, 0.0]))
     )
     task = dataclasses.replace(shopping_cart(), episode=3)
-    agent = PhysicsAgent(task, 0)
+    agent = PhysicsController(task, SMALL, 0)
     run(task, agent, 3, 4)
     assert updates == [FRAMES, 2 * FRAMES, 3 * FRAMES, FRAMES]
     assert kept == [1]
@@ -304,17 +304,16 @@ def test_physics_learns_after_each_decision_and_keeps_what_is_over(monkeypatch):
     searched.clear()
     kept.clear()
     task = dataclasses.replace(task, episode=1)
-    run(task, PhysicsAgent(task, 0), 3, 9)
+    run(task, PhysicsController(task, SMALL, 0), 3, 9)
     assert searched == [1, 2, 4, 8]  # after so many episodes
 
 
 def four_decisions():
     """A cart's posterior that nothing was told yet, and handling to tell it."""
-    task = shopping_cart()
-    trial = Trial(task, Knowing(None), SMALL, 3)
-    for _ in range(4):
-        trial.decide()
-    return PiecePosterior(piece_model(task, 0), 0), trial.episodes[0].handling(0)
+    task = dataclasses.replace(shopping_cart(), episode=4)
+    controller = CartController(task, SMALL, 3)
+    run(task, controller, 3, 4)
+    return PiecePosterior(piece_model(task, 0), 0), controller.episodes[0].handling(0)
 
 
 def test_climbs_begin_at_the_last_modes_and_beside_the_best(monkeypatch):
@@ -364,17 +363,18 @@ def test_a_search_compares_what_it_found_with_what_was_known(monkeypatch):
 
 def test_who_is_told_a_model_climbs_from_it_first(monkeypatch):
     """From the hidden constants themselves, as a planar model has them."""
-    begun, task = [], apartment()
+    begun, task = [], dataclasses.replace(apartment(), episode=1)
 
     def climb(target, start, steps):
         begun.append(target.model(start[0]))
         return SimpleNamespace(position=start)
 
     monkeypatch.setattr(cart_posterior, "climb", climb)
-    trial = Trial(task, Knowing(None), SMALL, 3)
-    trial.decide()
-    told, truth = cart_trials._told(task, 3), trial._world.truth()
-    PiecePosterior(piece_model(task, 0), 0, told[0]).update(trial.episodes[0].handling(0))
+    controller, world = CartController(task, SMALL, 3), task.world()
+    run(task, controller, 3, 1)
+    world.reset(3)
+    told, truth = cart_trials._hidden(task, 3), world.truth()
+    PiecePosterior(piece_model(task, 0), 0, told[0]).update(controller.episodes[0].handling(0))
     hidden = truth.parameters[0]
     locked = next(i for i, angle in enumerate(hidden.locked) if angle is not None)
     place = begun[0].wheel_position[0, 0] * begun[0].half_extent[0]
@@ -388,29 +388,28 @@ def test_the_best_scene_is_learnt_from_handling_and_from_other_starts(monkeypatc
     seen, task = [], dataclasses.replace(shopping_cart(), episode=2)
     scene = scene_model(task, [piece_model(task, 0)])
 
-    class Learner:
-        def __init__(self, task, seed, handled, told):
-            assert len(told) == len(handled)
+    class Learner(CartController):
+        def __init__(self, task, planning, seed, first_episode, handled, begun):
+            super().__init__(task, planning, seed, first_episode)
+            assert len(begun) == len(handled)
             seen.append([len(stretches) for stretches in handled])
 
         def search(self):
             seen.append("searched")
             return scene
 
-        def learn(self, episodes):
-            seen.append(episodes[-1].first)
+        def learn(self):
+            seen.append(self.episodes[-1].first)
 
-        def believed(self, held):
-            return None
-
-    monkeypatch.setattr(cart_trials, "PhysicsAgent", Learner)
+    monkeypatch.setattr(cart_trials, "PhysicsController", Learner)
     monkeypatch.setattr(cart_trials, "HANDLED", 0.2)
     monkeypatch.setattr(cart_trials, "PRACTISED", 1)
     assert best_scene(task, SMALL, 3) is scene
     assert seen[:2] == [[3 + cart_trials.TOSSED], "searched"]  # wiggled, and pushed anyhow
     assert seen[4:] == ["searched"]
-    _, trial = run(task, Knowing(None), 3, 1)
-    assert np.abs(trial.episodes[0].first - seen[2]).max() > 0.1
+    controller = CartController(task, SMALL, 3)
+    run(task, controller, 3, 1)
+    assert np.abs(controller.episodes[0].first - seen[2]).max() > 0.1
 
 
 def earned(worlds: int, decisions: int) -> cart_online.Rewards:
@@ -444,25 +443,21 @@ def test_regret_is_a_share_of_what_there_is_to_learn():
 def test_what_was_earned_is_kept_and_only_what_was_cut_off_begins_anew(tmp_path, monkeypatch):
     worked = []
 
-    class Stub:
-        def __init__(self, task, agent, planning, seed, idle):
-            worked.append((task.name, seed, idle))
-            self.count = 0
-
-        def decide(self):
-            self.count += 1
-            if len(worked) == 3 and self.count == 5:
+    def rewards(task, controller, seed, decisions):
+        worked.append((task.name, seed, controller))
+        for done in range(0, decisions, task.episode):
+            if len(worked) == 3:
                 raise KeyboardInterrupt
-            return -1.0 / self.count - 0.1 * len(worked)
+            yield -1.0 / np.arange(done + 1, done + task.episode + 1) - 0.1 * len(worked)
 
-    monkeypatch.setattr(cart_online, "Trial", Stub)
-    monkeypatch.setattr(cart_online, "_agent", lambda *_: None)
+    monkeypatch.setattr(cart_online, "rewards_by_episode", rewards)
+    monkeypatch.setattr(cart_online, "_controller", lambda task, who, *_: who)
     with pytest.raises(KeyboardInterrupt):
         cart_online.reproduce(tmp_path, quick=True)
     assert len(worked) == 3
     result = cart_online.reproduce(tmp_path, quick=True)
     assert len(worked) == 3 + 2 * len(cart_online.AGENTS) - 2
-    assert sum(idle for *_, idle in worked) == 2
+    assert sum(who == cart_online.NOTHING for *_, who in worked) == 2
     assert {seed for _, seed, _ in worked} == {cart_online.EVALUATION_SEEDS}
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
     names = [figure.name for figure in result.figures]

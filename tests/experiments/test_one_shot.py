@@ -47,15 +47,15 @@ def test_only_what_was_pushed_is_judged(pushes):
     model = starting_furniture(pushes, PERIOD)
     asked = pushes_of(pushes, model)
     found = judged(model, predicted_with(asked, 0.1, 0.05), asked)
-    np.testing.assert_allclose(found.error, 0.1, rtol=1e-5)
-    assert found.error.shape == found.displacement.shape == (2,)
+    np.testing.assert_allclose(found.error_m, 0.1, rtol=1e-5)
+    assert found.error_m.shape == found.displacement_m.shape == (2,)
     moved = np.asarray(asked.target[:, -1] - asked.pose)[[0, 1], [0, 1], :2]
-    np.testing.assert_allclose(found.displacement, np.linalg.norm(moved, axis=1), rtol=1e-5)
-    assert found.displacement.min() > 0.1
+    np.testing.assert_allclose(found.displacement_m, np.linalg.norm(moved, axis=1), rtol=1e-5)
+    assert found.displacement_m.min() > 0.1
     # two standard deviations off in x of three channels: there the interval misses
     assert found.inside == pytest.approx(2 / 3, abs=0.01)
     assert judged(model, predicted_with(asked, 0.0, 0.05), asked).inside == 1.0
-    assert found.drift == pytest.approx(np.linalg.norm(moved, axis=1).max(), abs=0.12)
+    assert found.drift_m == pytest.approx(np.linalg.norm(moved, axis=1).max(), abs=0.12)
 
 
 def test_shares_are_pooled_over_pushes_and_not_averaged():

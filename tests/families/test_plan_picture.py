@@ -52,9 +52,11 @@ def test_an_animation_moves_the_robot_and_then_the_object(planned, tmp_path):
 def test_poses_of_an_execution_are_shown_with_the_belief_of_each_moment(planned, tmp_path):
     world, _ = planned
     robots = np.array([[1.0, 1.5, 0.0], [1.5, 1.5, 0.3]])
+    still = [movable.pose for movable in world.movables.values()]
+    objects = np.array([still, [(4.2, 1.5, 0.1), still[1]]])
     path = scene_animation(
-        tmp_path / "run.gif", world, (7.0, 1.5, 0.0), robots,
-        [{}, {"a": np.array([4.2, 1.5, 0.1])}], [None, "a"], movability=[{"a": 0.5}, {"a": 0.9}],
+        tmp_path / "run.gif", world, (7.0, 1.5, 0.0), robots, objects, [None, "a"],
+        movability=[{"a": 0.5}, {"a": 0.9}],
     )  # fmt: skip
     assert Image.open(io.BytesIO(path.read_bytes())).n_frames == 2
 

@@ -15,7 +15,6 @@ from palpate.planning.movable_obstacles.motion.belief import (
     LEAST_PROBABILITY,
     PIECES,
     ObjectBelief,
-    SceneBelief,
     cut,
 )
 from palpate.planning.movable_obstacles.motion.primitives import AXIS, FREE, PIVOT, STATIC
@@ -118,12 +117,12 @@ def test_a_belief_does_not_die_of_nonsense():
 
 
 def test_short_and_crowded_contacts_change_nothing():
-    belief = SceneBelief({"piece": OUTLINE})
+    belief = ObjectBelief(OUTLINE, 0)
     poses, wrenches, alone = handled(STATIC)
-    belief.learn("piece", poses[:12], wrenches[:12], alone[:12])
-    belief.learn("piece", poses, wrenches, np.zeros_like(alone))
-    belief.learn("piece", np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
-    assert belief.objects["piece"].version == 0
+    belief.learn(cut(poses[:12], wrenches[:12], alone[:12]))
+    belief.learn(cut(poses, wrenches, np.zeros_like(alone)))
+    belief.learn(cut(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)))
+    assert belief.version == 0
     assert not cut(poses[:12], wrenches[:12], alone[:12]).use.any()
 
 
@@ -138,17 +137,16 @@ def test_pieces_do_not_overlap_and_start_as_the_object_moved():
 
 
 def test_draws_stay_until_something_is_learnt_and_relaxing_goes_towards_the_prior():
-    belief = SceneBelief({"piece": OUTLINE, "other": rectangle(0.6, 0.6)})
+    belief = ObjectBelief(OUTLINE, 0)
     first = belief.drawn(8)
-    assert belief.drawn(8) == first
-    belief.learn("piece", *handled(STATIC))
+    assert belief.drawn(8) is first
+    belief.learn(cut(*handled(STATIC)))
     second = belief.drawn(8)
-    assert second["other"] is first["other"]
-    assert second["piece"].version == 1
-    firm = share(belief.objects["piece"], STATIC)
+    assert second is not first
+    assert second.version == 1
+    firm = share(belief, STATIC)
     belief.relax()
-    assert 0.2 < share(belief.objects["piece"], STATIC) < firm
-    assert belief.objects["other"].version == 0
+    assert 0.2 < share(belief, STATIC) < firm
 
 
 def test_another_outline_compiles_nothing_anew():

@@ -133,5 +133,7 @@ def test_sequences_that_cannot_be_are_refused(counts):
 
 def test_without_the_package_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cma", None)
-    with pytest.raises(PalpateError, match=r"needs the package cma: pip install 'palpate\[rivals"):
+    with pytest.raises(
+        PalpateError, match=r"needs cma, which is not installed: `pip install 'palpate\[rivals"
+    ):
         cma_package()

@@ -1,7 +1,7 @@
 """Recordings as LeRobot datasets: the layout, the columns, and what has no place in them."""
 
-import builtins
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -234,15 +234,10 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(tmp_path):
 
 
 def test_without_pyarrow_a_sentence_says_what_to_install(tmp_path, monkeypatch):
-    importing = builtins.__import__
-
-    def without(name, *rest):
-        if name.startswith("pyarrow"):
-            raise ImportError(name)
-        return importing(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(PalpateError, match=r"pyarrow, which is not .* pip install 'palpate\[io\]'"):
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    with pytest.raises(
+        PalpateError, match=r"pyarrow, which is not .* `pip install 'palpate\[io\]'"
+    ):
         write_lerobot(tmp_path / "set", recording(trial("a", markers())))
 
 

@@ -18,7 +18,7 @@ from palpate.planning.movable_obstacles.search.plan import TRANSIT, Plan, Segmen
 from palpate.planning.movable_obstacles.search.planner import Planner
 from palpate.trials.furniture import namo_episode, namo_execution
 from palpate.trials.furniture import rooms as namo_rooms
-from palpate.trials.furniture.namo_episode import Fixed, Flag, episode
+from palpate.trials.furniture.namo_episode import Flag, Opinion, episode
 from palpate.trials.furniture.namo_execution import Contact, Execution, OutOfTimeError
 from palpate.trials.furniture.rooms import scenes
 
@@ -89,7 +89,7 @@ def test_time_runs_out():
 
 def test_told_the_truth_a_locked_piece_is_turned_about_its_caster():
     room = scenes()["learning by contact"]
-    outcome = episode(room, Fixed(namo_episode.truth_of(room)))
+    outcome = episode(room, Opinion(namo_episode.truth_of(room)))
     assert outcome.reached, outcome.reason
     assert [name for name, _ in outcome.tried] == ["cabinet"]
     assert namo_episode.truth_of(room)["cabinet"].kind == PIVOT
@@ -103,7 +103,7 @@ def test_told_the_truth_a_locked_piece_is_turned_about_its_caster():
 def test_told_the_truth_the_one_piece_that_gives_way_is_got_past(seed, kind):
     room = namo_rooms.generated_room(seed)
     truth = namo_episode.truth_of(room)
-    outcome = episode(room, Fixed(truth))
+    outcome = episode(room, Opinion(truth))
     assert outcome.reached, outcome.reason
     assert outcome.failures == 0
     assert {truth[name].kind for name, _ in outcome.tried} == {kind}
@@ -125,7 +125,7 @@ def test_the_flag_weighs_failures_against_what_came_along():
 
 def test_what_never_learns_tries_the_same_piece_until_its_attempts_are_over(monkeypatch):
     monkeypatch.setattr(namo_episode, "ATTEMPTS", 2)
-    outcome = episode(ROOM, Fixed(dict.fromkeys(("cabinet", "cabinet 2"), Constraint(FREE))))
+    outcome = episode(ROOM, Opinion(dict.fromkeys(("cabinet", "cabinet 2"), Constraint(FREE))))
     assert not outcome.reached
     assert outcome.reason == "attempts"
     assert [name for name, _ in outcome.tried] == ["cabinet", "cabinet"]

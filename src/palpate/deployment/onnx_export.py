@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from palpate.deployment.extras import extra_module
+from palpate.errors import extra_module
 from palpate.networks import Channel, CommandPolicy
 from palpate.runs.storage import write_bytes
 

@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from palpate.deployment.extras import extra_module
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, extra_module
 
 LISTEN = "tcp/127.0.0.1:7447"
 STATE, COMMAND = "palpate/state", "palpate/command"

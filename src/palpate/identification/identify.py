@@ -38,8 +38,7 @@ class Identified:
 
     `model` is the fitted one, or the most probable of the draws. `lower` and `upper` are the ends
     of 90 % intervals by parameter, in its unit and shape; `verdict` a sentence where the data left
-    it as the prior has it, else None. `comparison` holds draws, and how probable each hypothesis
-    is; it is None of a fit.
+    it as the prior has it. `comparison`, None of a fit, has draws and hypotheses' probabilities.
     """
 
     model: Model
@@ -97,11 +96,7 @@ def fitted(start: Model, aligned: Aligned, settings: Settings, run: Run | None) 
     model = descent.identify(start, aligned, settings, run)
     coordinates = FreeParameters(model)
     found = intervals(coordinates, coordinates.initial, aligned)
-    lower, upper = (
-        {path: np.asarray(edge) for path, edge in edges.items()}
-        for edges in (found.lower, found.upper)
-    )
-    return Identified(model, lower, upper, found.verdict, found.warnings)
+    return Identified(model, **vars(found))
 
 
 def drawn(comparison: Comparison) -> Identified:

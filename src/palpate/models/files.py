@@ -1,7 +1,6 @@
 """Models on disk: JSON that a person can read, with the unit and meaning of every parameter."""
 
 import dataclasses
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.family import places, resolve
+from palpate.family import name_of, places, resolve
 from palpate.models.model import Model
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.parameters import LogNormal, axes_of, describe, parameters_of
@@ -101,12 +100,7 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
 
 def registered(model: Model) -> str | None:
     """The name of the model's kind in files, None for one that has none."""
-    own = f"{type(model).__module__}:{type(model).__qualname__}"
-    for name, place in places("models").items():
-        module, _, attribute = place.partition(":")  # loaded already, if a model of it is here
-        if own == place or getattr(sys.modules.get(module), attribute, None) is type(model):
-            return name
-    return None
+    return name_of(type(model), places("models"))
 
 
 def kind_of(path: str | Path, name: Any) -> type[Model]:

@@ -71,8 +71,7 @@ class SiteNetwork(eqx.Module):
         x <- tanh(W <x> + b),    correction = bound tanh(W <x> + b)
 
     where `bound` holds one number for each site, in the correction's unit. The last layer is zero
-    at first. A group without members counts as zeros. Raises `PalpateError` for other shapes than
-    those beside the fields.
+    at first. A group without members counts as zeros. Raises `PalpateError` for other shapes.
     """
 
     mean: Float[Array, "..."]  # (sites, features)

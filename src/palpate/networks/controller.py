@@ -6,7 +6,6 @@ table names as `controllers`: networks, planners, hand-written laws.
 
 import dataclasses
 import re
-import sys
 from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +16,7 @@ import jax
 from jaxtyping import Array, Key
 
 from palpate.errors import PalpateError
-from palpate.family import check_name, places, resolve
+from palpate.family import check_name, name_of, places, resolve
 from palpate.networks.channels import Channel, channels_of
 from palpate.runs.storage import load_arrays, read_json, read_manifest, save_arrays, write_json
 
@@ -47,8 +46,7 @@ class Controller(Protocol):
     def initial_carry(self, command: Any) -> Any:
         """What to carry into the first call.
 
-        `command`, (*batch, *action_shape), is the action in force when the controller takes over:
-        zero for a robot at rest.
+        `command`, (*batch, *action_shape), is the action in force until then: zero at rest.
         """
         ...
 
@@ -107,12 +105,17 @@ def save_controller(
     What it is (kind, channels with units and limits, period, settings) joins the manifest as
     "controller"; `manifest` says what else a user must know: the task, what it was trained on.
 
-    Raises `PalpateError` for a kind that the table of families does not name, and for JSON where
-    there are arrays.
+    Raises `PalpateError` for a kind that no family's table names, and for JSON with arrays.
     """
-    path = Path(path)
+    path, known = Path(path), _OWN_KINDS | places("controllers")
+    kind = name_of(type(controller), known)
+    if kind is None:
+        raise PalpateError(
+            f"a controller of type {type(controller).__name__} cannot be saved; kinds: "
+            + ", ".join(known)
+        )
     described = {
-        "kind": _kind(type(controller)),
+        "kind": kind,
         "observations": controller.observations,
         "actions": controller.actions,
         "period": controller.period,
@@ -161,17 +164,6 @@ def load_controller(path: str | Path) -> tuple[DeclaredController, dict[str, Any
     return (controller, manifest) if in_json else load_arrays(path, controller)
 
 
-def _kind(of: type[DeclaredController]) -> str:
-    known = _OWN_KINDS | places("controllers")
-    for name, place in known.items():
-        module, _, attribute = place.partition(":")  # loaded already, if one of it is here
-        if getattr(sys.modules.get(module), attribute, None) is of:
-            return name
-    raise PalpateError(
-        f"a controller of type {of.__name__} cannot be saved; kinds: {', '.join(known)}"
-    )
-
-
 def _manifest(path: Path, content: Any) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise PalpateError(f"{path} holds no controller: expected what `save_controller` wrote")
@@ -187,8 +179,8 @@ def _earlier_description(manifest: Mapping[str, Any]) -> dict[str, Any] | None:
 
     Its channels stood as sentences: features "(10, 3) m" by name, the action as "velocity, m/s".
     """
-    earlier = manifest.get("policy")
-    if not isinstance(earlier, dict) or earlier.get("kind") != "command policy":
+    policy = manifest.get("policy")
+    if not isinstance(policy, dict) or policy.get("kind") != "command policy":
         return None
     seen = []
     for name, sentence in dict(manifest.get("features") or {}).items():
@@ -201,12 +193,13 @@ def _earlier_description(manifest: Mapping[str, Any]) -> dict[str, Any] | None:
         sizes = [int(size) for size in match[1].replace(",", " ").split()]
         seen.append({"name": name, "shape": sizes, "unit": match[2]})
     name, _, unit = str(manifest.get("action", "action, ")).rpartition(", ")
-    action = {"name": name, "shape": earlier.get("action_shape"), "unit": unit}
-    limits = {limit: earlier.get(limit) for limit in ("limit", "rate_limit")}
     return {
         "kind": _NETWORK,
-        "observations": seen or [{"name": "features", "shape": [earlier.get("features")]}],
-        "actions": [action | limits],
-        "period": earlier.get("period"),
-        "settings": {"width": earlier.get("width"), "depth": earlier.get("depth")},
+        "observations": seen or [{"name": "features", "shape": [policy.get("features")]}],
+        "actions": [
+            {"name": name, "shape": policy.get("action_shape"), "unit": unit}
+            | {key: policy.get(key) for key in ("limit", "rate_limit")}
+        ],
+        "period": policy.get("period"),
+        "settings": {key: policy.get(key) for key in ("width", "depth")},
     }

@@ -62,8 +62,7 @@ def cores() -> int:
 def compiled_sooner(function: Callable[..., Any]) -> Callable[..., Any]:
     """`eqx.filter_jit` for what is compiled anew for every recording and runs for a minute.
 
-    A posterior compiles in two thirds of the time and runs as fast; a single rope may run at half
-    the speed.
+    A posterior compiles in two thirds of the time and runs as fast, a single rope half as fast.
     """
     return _compiled(function, {"xla_cpu_use_fusion_emitters": False})
 

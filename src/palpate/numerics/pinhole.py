@@ -5,8 +5,7 @@ principal point c in pixels, a point (x, y, z) of that frame appears at
 
     u = c_u + f_u x / z,    v = c_v + f_v y / z
 
-where the centre of the upper left pixel is (0, 0). Pictures with lens distortion are rectified
-before they come here.
+where the centre of the upper left pixel is (0, 0). Pictures have to be without lens distortion.
 """
 
 from __future__ import annotations
@@ -111,9 +110,8 @@ class Pinhole:
 class Frame:
     """One picture; raises `PalpateError` when colour and depth do not fit together.
 
-    `time` (s) is the middle of the exposure. `colour` (height, width, 3) is uint8; `depth`
-    (height, width) in m along the optical axis, NaN where the sensor saw none, or None for a camera
-    without depth.
+    `time` (s) is the middle of the exposure, `colour` (height, width, 3) uint8, `depth` (height,
+    width) in m along the optical axis, NaN where there was none; None from a colour camera.
     """
 
     time: float

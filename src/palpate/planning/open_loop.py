@@ -7,14 +7,14 @@ needs no gradient: time, in whole control periods, has none.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, extra_module
 
 POPULATION = 40  # candidates of a generation
 LEAD = 5  # control periods by which a deadline lies before the best time so far
@@ -117,15 +117,9 @@ def search(
     return [search.found() for search in searches]
 
 
-def cma_package() -> ModuleType:
+def cma_package() -> Any:
     """The package cma; raises `PalpateError` that says how to install it."""
-    try:
-        import cma
-    except ImportError as error:
-        raise PalpateError(
-            "searching by CMA-ES needs the package cma: pip install 'palpate[rivals]'"
-        ) from error
-    return cma
+    return extra_module("cma", "rivals")
 
 
 class _Search:

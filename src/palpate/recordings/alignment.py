@@ -33,8 +33,7 @@ class Aligned:
 
     Of several channels the numbers of a frame stand side by side, (trials, frames, numbers), while
     `observations` and `actions` have each by its name and in its own shape. `events` (trials,
-    frames) by name is the index of the newest event at each frame: -1 before the first one and past
-    a trial's end.
+    frames) by name: the newest event's index, -1 before the first one and past a trial's end.
     """
 
     period: float

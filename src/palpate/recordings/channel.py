@@ -86,8 +86,7 @@ class Events:
 
     `values` are arrays (size, *shape), one for each of `time` (events,) in s. They have one dtype
     and one `shape`, and each a size of its own: clouds (points, 3) in m, where NaN is a point that
-    was not seen, or images (rows, columns, 3). Order, equal stamps and copies as in `Channel`;
-    dtypes are kept.
+    was not seen, or images (rows, columns, 3). All else as in `Channel`, but dtypes are kept.
 
     Raises `PalpateError` if a stamp is not finite, a value is infinite, there are no events, or
     shapes or dtypes do not fit.

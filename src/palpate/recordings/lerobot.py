@@ -13,13 +13,13 @@ import math
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, extra_module
 from palpate.recordings.alignment import Aligned
 from palpate.recordings.channel import Role
 from palpate.recordings.facts import fact_to_json
@@ -40,7 +40,6 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 class Feature:
     """A column of the dataset: `values` (frames, size) of all episodes one after another."""
 
-    dtype: str
     names: tuple[str, ...]
     values: np.ndarray
 
@@ -55,19 +54,12 @@ def write_lerobot(
     episode's end); both float32 in the channels' own units, which `meta/palpate.json` tells. Frames
     are evenly spaced, `fps` to the second, by default those of the first sensor. The format has no
     value for what was not seen: it is interpolated from the frames around it, and a column `seen`
-    says which points really were. Events are left out. With `fresh`, a folder that is there goes
-    when the new one is whole.
+    says which points really were. Events are left out. `fresh` replaces a folder that is there.
 
     Raises `PalpateError` when the folder exists, when pyarrow is missing, when there is no
     observation, when something is never seen in an episode, or when `fps` is less than 1.
     """
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError as error:
-        raise PalpateError(
-            "LeRobot datasets are written by the package pyarrow, which is not installed: "
-            "pip install 'palpate[io]'"
-        ) from error
+    extra_module("pyarrow.parquet", "io", "pyarrow")
     folder = Path(folder)
     if folder.exists() and not fresh:
         raise PalpateError(f"{folder} exists: expected the name of a new folder")
@@ -104,29 +96,27 @@ def _features(recording: Recording, aligned: Aligned, fps: int) -> dict[str, Fea
         _filled(observed[trial == number], each.name, names)
         for number, each in enumerate(recording.trials)
     ])  # fmt: skip
-    features = {STATE: Feature("float32", names, state)}
+    features = {STATE: Feature(names, state.astype(np.float32))}
     if aligned.actions:
         # The last frame has no action of its own: nobody knows what came after it.
         before_end = np.minimum(frame, aligned.length[trial] - 2)
-        features[ACTION] = Feature("float32", *_columns(aligned.actions, trial, before_end))
+        acting, acted = _columns(aligned.actions, trial, before_end)
+        features[ACTION] = Feature(acting, acted.astype(np.float32))
     if not np.isfinite(observed).all():
         points = [name.partition(".")[0] for name in names]
         first = np.unique(points, return_index=True)[1]
         first.sort()
         unseen = np.logical_or.reduceat(np.isnan(observed), first, axis=1)
-        features[SEEN] = Feature("bool", tuple(points[index] for index in first), ~unseen)
-    for name, dtype, values in (
-        ("timestamp", "float32", frame / fps),
-        ("frame_index", "int64", frame),
-        ("episode_index", "int64", trial),
-        ("index", "int64", np.arange(len(frame))),
-        ("task_index", "int64", np.zeros(len(frame))),
+        features[SEEN] = Feature(tuple(points[index] for index in first), ~unseen)
+    for name, values in (
+        ("timestamp", (frame / fps).astype(np.float32)),
+        ("frame_index", frame),
+        ("episode_index", trial),
+        ("index", np.arange(len(frame))),
+        ("task_index", np.zeros_like(frame)),
     ):
-        features[name] = Feature(dtype, (), values[:, None])
-    return {
-        name: replace(feature, values=feature.values.astype(feature.dtype))
-        for name, feature in features.items()
-    }
+        features[name] = Feature((), values[:, None])
+    return features
 
 
 def _columns(
@@ -196,7 +186,7 @@ def _write(
             "video_path": None,
             "features": {
                 name: {
-                    "dtype": feature.dtype,
+                    "dtype": feature.values.dtype.name,
                     "shape": [feature.values.shape[1]],
                     "names": list(feature.names) or None,
                 }

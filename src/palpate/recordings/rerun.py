@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import PalpateError
+from palpate.errors import extra_module
 from palpate.recordings.channel import Channel, Events
 from palpate.recordings.recording import Recording
 from palpate.runs.storage import write_bytes
@@ -27,13 +27,7 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
 
     Raises `PalpateError` when rerun-sdk is missing or the file cannot be written.
     """
-    try:
-        import rerun
-    except ImportError as error:
-        raise PalpateError(
-            "Rerun files are written by the package rerun-sdk, which is not installed: "
-            "pip install 'palpate[viz]'"
-        ) from error
+    rerun = extra_module("rerun", "viz", "rerun-sdk")
     stream = rerun.RecordingStream("palpate")
     memory = stream.memory_recording()
     stream.set_log_time_enabled(False)  # when the file was written is of no interest

@@ -49,8 +49,7 @@ def build_report(
     what families add, and what was run. `notes` are sentences shown on top.
     The same files give the same page.
 
-    Raises `PalpateError` when a folder holds no run, when a file in it is damaged, or when `out`
-    cannot be written.
+    Raises `PalpateError` for a folder without a run, a damaged file, or an `out` that is refused.
     """
     if not runs:
         raise PalpateError("a report needs at least one run: give the folder of one")

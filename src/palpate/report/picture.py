@@ -1,4 +1,4 @@
-"""Pictures of results: panels, curves with their spread, and the files, still or moving."""
+"""Pictures by Matplotlib: panels, curves with their spread, one legend, and the file."""
 
 import io
 from collections.abc import Sequence
@@ -7,19 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import PalpateError
 from palpate.report.style import Style
 from palpate.runs.storage import write_bytes
 
-# Without date or the name of the program: the same figure is the same file.
-_STAMPS = {".png": {"Software": None}, ".svg": {"Date": None}}
 
-
-def canvas_of(width: float | int, height: float | int) -> Any:
+def canvas_of(width: float | int, height: float | int, dpi: int = 150) -> Any:
     """An empty Matplotlib figure, inches."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
 def curve(axis: Any, x: Any, y: Any, style: Style, label: str, **look: Any) -> None:
@@ -34,34 +30,28 @@ def band(axis: Any, x: Any, low: np.ndarray, high: np.ndarray, style: Style) -> 
 
 
 def legend_of(canvas: Any, place: str, **look: Any) -> None:
-    """One legend for all panels, outside at `place`; a series that several show stands once."""
-    series: dict[str, Any] = {}
+    """One legend for all panels outside at `place`, a label that stands in several shown once."""
+    handles = {}
     for axis in canvas.axes:
-        for line, name in zip(*axis.get_legend_handles_labels(), strict=True):
-            series.setdefault(name, line)
-    settings = {"loc": f"outside {place}", "ncols": len(series), "frameon": False}
-    canvas.legend(list(series.values()), list(series), **(settings | look))
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    look = {"ncols": len(handles), "frameon": False} | look
+    canvas.legend(list(handles.values()), list(handles), loc=f"outside {place}", **look)
 
 
-def check_suffix(path: Path) -> None:
-    """Raise `PalpateError` for a file that is to be neither a .png nor a .svg."""
-    if path.suffix not in _STAMPS:
-        expected = " or ".join(_STAMPS)
-        raise PalpateError(f"{path} has the suffix '{path.suffix}': expected {expected}")
-
-
-def save_picture(path: Path, canvas: Any, dpi: int | str = 150) -> None:
-    """Write a Matplotlib figure, as SVG where `path` ends so, else as PNG."""
-    kind, buffer = ".svg" if path.suffix == ".svg" else ".png", io.BytesIO()
-    canvas.savefig(buffer, format=kind[1:], dpi=dpi, metadata=_STAMPS[kind])
+def save_picture(path: Path, canvas: Any) -> None:
+    """Write a PNG or SVG, without program and date, so that the same figure is the same file."""
+    buffer = io.BytesIO()
+    stamp = {"Date": None} if path.suffix == ".svg" else {"Software": None}
+    canvas.savefig(buffer, format=path.suffix[1:] or "png", metadata=stamp)
     write_bytes(path, buffer.getvalue())
 
 
 def save_animation(
-    path: Path, pictures: Sequence[Any], milliseconds: int | list[int], **settings: Any
+    path: Path, pictures: Sequence[Any], milliseconds: int | list[int], **options: Any
 ) -> None:
-    """Write pictures of PIL as an endless animation, .gif or .webp; each stands so long."""
-    buffer, first = io.BytesIO(), pictures[0]
-    kept = {"append_images": pictures[1:], "duration": milliseconds, "loop": 0, **settings}
-    first.save(buffer, path.suffix[1:].upper(), save_all=True, **kept)
+    """Write Pillow's images as an endless GIF or WebP, each shown for so many milliseconds."""
+    buffer = io.BytesIO()
+    options |= {"save_all": True, "append_images": pictures[1:], "loop": 0}
+    pictures[0].save(buffer, path.suffix[1:].upper(), duration=milliseconds, **options)
     write_bytes(path, buffer.getvalue())

@@ -163,8 +163,7 @@ class Run:
     def elapsed(self) -> float:
         """Seconds of work behind the present state, that of earlier processes included.
 
-        Pauses and work that was lost, since the last checkpoint of a process that was killed, do
-        not count.
+        Pauses do not count, nor work that was lost with a process that was killed.
         """
         return time.monotonic() - self._began
 

@@ -103,8 +103,7 @@ def plain(value: Any, name: str = "") -> Any:
     Scalars and arrays of NumPy and JAX become numbers and nested lists, tuples become lists,
     dataclasses dicts, paths strings. `name` is what errors call the whole.
 
-    Raises `PalpateError` for NaN, infinity, keys that are not strings and every other type,
-    naming the key path.
+    Raises `PalpateError`, naming the key path, for NaN, infinity, other keys and other types.
     """
     here = name or "the value"
     if value is None or isinstance(value, str | bool):

@@ -1,12 +1,12 @@
 """`palpate reproduce cart-online`: furniture brought to its places by who learns how it rolls.
 
-The Shopping-Cart and Apartment tasks (`cart_tasks`) in MuJoCo, learnt online from the first
-decision on. PBRL climbs the posterior of a planar model of each piece as data arrive and plans
-through its mode; OO-LWR and LWR plan through regressions of the same decisions in the pieces' own
-axes, with and without the deck's oriented contact predicates; random takes any action. TRUE is told
-the planar model that explains best how the same pieces moved when they were wiggled apart, pushed
-anyhow, and then brought to their places from other starts, searched for from the hidden constants
-on: MuJoCo itself as the planner's model would take hours.
+The Shopping-Cart and Apartment tasks (`palpate.tasks.furniture.cart`) in MuJoCo, learnt online from
+the first decision on. PBRL climbs the posterior of a planar model of each piece as data arrive and
+plans through its mode; OO-LWR and LWR plan through regressions of the same decisions in the pieces'
+own axes, with and without the deck's oriented contact predicates; random takes any action. TRUE is
+told the planar model that explains best how the same pieces moved when they were wiggled apart,
+pushed anyhow, and then brought to their places from other starts, searched for from the hidden
+constants on: MuJoCo itself as the planner's model would take hours.
 All plan by the same MPPI with the same samples, on the same seeds: the same hidden parameters and
 starts.
 
@@ -26,14 +26,18 @@ from palpate.runs import Figure, Result
 from palpate.runs.progress import progress
 from palpate.runs.result import two_standard_errors
 from palpate.tasks.furniture.cart import DECISION, CartTask, apartment, shopping_cart
-from palpate.trials.furniture.cart_agents import Agent, Knowing, PhysicsAgent, RegressionAgent
+from palpate.trials.furniture.cart_controllers import (
+    CartController,
+    PhysicsController,
+    Planning,
+    RegressionController,
+)
 from palpate.trials.furniture.cart_trials import (
     HANDLED,
     PRACTISED,
     TOSSED,
-    Planning,
-    Trial,
     best_scene,
+    rewards_by_episode,
 )
 from palpate.trials.trial import resumable
 
@@ -127,23 +131,23 @@ def _earned(experiment: Experiment, name: str, seeds: list[int], decisions: int)
 def _work(name: str, who: str, seed: int, decisions: int) -> np.ndarray:
     """What one agent earns in one world, beginning with nothing, decision by decision."""
     task = TASKS[name]()
-    trial = Trial(task, _agent(task, who, seed, decisions), PLANNING[name], seed, who == NOTHING)
-    watch = progress(range(decisions), f"{name}, {who}, world {seed}")
-    rewards = np.zeros(decisions)
-    for index in watch:
-        rewards[index] = trial.decide()
-        watch.show(reward=rewards[index])
-    return rewards
+    episodes = rewards_by_episode(task, _controller(task, who, seed, decisions), seed, decisions)
+    watch = progress(range(0, decisions, task.episode), f"{name}, {who}, world {seed}")
+    rewards = []
+    for _ in watch:
+        rewards.append(next(episodes))
+        watch.show(reward=rewards[-1].mean())
+    return np.concatenate(rewards)
 
 
-def _agent(task: CartTask, who: str, seed: int, decisions: int) -> Agent:
-    if who == TRUE:
-        return Knowing(best_scene(task, PLANNING[task.name], seed))
+def _controller(task: CartTask, who: str, seed: int, decisions: int) -> CartController:
+    planning = PLANNING[task.name]
     if who == PBRL:
-        return PhysicsAgent(task, seed)
+        return PhysicsController(task, planning, seed)
     if who in (OO_LWR, LWR):
-        return RegressionAgent(task, who.lower(), decisions)
-    return Knowing(None)
+        return RegressionController(task, planning, seed, who.lower(), decisions)
+    scene = best_scene(task, planning, seed) if who == TRUE else None
+    return CartController(task, planning, seed, scene=scene, idle=who == NOTHING)
 
 
 def regret(rewards: Rewards, agent: str, window: slice) -> np.ndarray:

@@ -30,7 +30,6 @@ from palpate.trials.furniture.namo_episode import (
     SEARCH,
     THRESHOLD,
     Episode,
-    Fixed,
     Flag,
     Learner,
     Opinion,
@@ -57,8 +56,8 @@ def planners(room: Room) -> dict[str, Callable[[], Opinion]]:
     world = room.world()
     return {
         OURS: lambda: Learner(world.outlines, room.seed),
-        TOLD: lambda: Fixed(truth_of(room)),
-        ALL: lambda: Fixed(dict.fromkeys(world.names, Constraint(FREE))),
+        TOLD: lambda: Opinion(truth_of(room)),
+        ALL: lambda: Opinion(dict.fromkeys(world.names, Constraint(FREE))),
         FLAG: lambda: Flag(world.names),
     }
 
@@ -162,7 +161,7 @@ def show(folder: Path, room: Room, outcome: Episode) -> None:
         world,
         room.goal,
         np.array([frame.robot for frame in frames]),
-        [dict(zip(world.movables, frame.poses, strict=True)) for frame in frames],
+        np.array([frame.poses for frame in frames]),
         [frame.held for frame in frames],
         movability=believed,
     )

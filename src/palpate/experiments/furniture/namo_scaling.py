@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from scipy.cluster.hierarchy import DisjointSet
+from scipy.stats import linregress
 from shapely.geometry import Polygon, box
 
 from palpate.experiments.experiment import Experiment
@@ -128,12 +130,8 @@ def figures(tried: list[Timed]) -> list[Figure]:
 
 def exponent(points: list[tuple[int, float]]) -> tuple[float, float]:
     """The slope of log time over log objects by least squares, and its 90 % half-width."""
-    x, y = np.log(np.array(points, float)).T
-    slope, offset = np.polyfit(x, y, 1)
-    residual = y - slope * x - offset
-    freedom = max(1, len(x) - 2)
-    covariance = (residual @ residual) / freedom / ((x - x.mean()) @ (x - x.mean()))
-    return float(slope), float(1.645 * math.sqrt(covariance))
+    line = linregress(*np.log(np.array(points, float)).T)
+    return float(line.slope), 1.645 * float(line.stderr)
 
 
 # --- maps -------------------------------------------------------------------------------------
@@ -194,21 +192,10 @@ def _doors(
     """Pairs of neighbouring rooms: a random spanning tree first, then some of the others."""
     pairs = [((r, c), (r, c + 1)) for r in range(rows) for c in range(columns - 1)]
     pairs += [((r, c), (r + 1, c)) for r in range(rows - 1) for c in range(columns)]
-    leader = {(r, c): (r, c) for r in range(rows) for c in range(columns)}
-
-    def root(room: tuple[int, int]) -> tuple[int, int]:
-        while leader[room] != room:
-            room = leader[room]
-        return room
-
+    joined = DisjointSet((r, c) for r in range(rows) for c in range(columns))
     tree, others = [], []
     for index in random.permutation(len(pairs)):
-        one, other = pairs[index]
-        if root(one) == root(other):
-            others.append((one, other))
-        else:
-            leader[root(one)] = root(other)
-            tree.append((one, other))
+        (tree if joined.merge(*pairs[index]) else others).append(pairs[index])
     return tree + others[: round(EXTRA_DOORS * len(others))]
 
 

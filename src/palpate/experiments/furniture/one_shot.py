@@ -208,7 +208,7 @@ def _judged(posterior: Posterior, pushes: Recording) -> dict[str, Any]:
     model = posterior.target.coordinates.reference
     asked = pushes_of(pushes, model)
     return {
-        **judged(model, posterior.predict(asked), asked).to_dict(),
+        **vars(judged(model, posterior.predict(asked), asked)),
         "rhat": posterior.rhat_of_predictions,
         "ess": posterior.size_of_predictions,
         "sampling_s": posterior.draws.seconds,

@@ -6,7 +6,6 @@ is predicted.
 
 import dataclasses
 import time
-from typing import Any
 
 import numpy as np
 
@@ -44,24 +43,16 @@ APART = 4.0  # m between the pieces of the scene
 
 @dataclasses.dataclass(frozen=True)
 class Pushes:
-    """What became of some pushes: errors of the median prediction after 2 s and ways gone, m.
+    """What became of some pushes: errors of the median prediction after 2 s and ways gone.
 
-    `inside` is the share of all poses seen that lay within the central 90 % of predictions.
+    `inside` is the share of all poses seen that lay within the central 90 % of predictions, and
+    `drift_m` the farthest from where it is seen first that a piece is predicted to be.
     """
 
-    error: np.ndarray
-    displacement: np.ndarray
+    error_m: np.ndarray
+    displacement_m: np.ndarray
     inside: float
-    drift: float  # m, the farthest from where it is seen first that a piece is predicted to be
-
-    def to_dict(self) -> dict[str, Any]:
-        """For a stage's `result.json`."""
-        return {
-            "error_m": self.error.tolist(),
-            "displacement_m": self.displacement.tolist(),
-            "inside": self.inside,
-            "drift_m": self.drift,
-        }
+    drift_m: float
 
 
 def recordings(kind: str, seed: int, pushes: int) -> tuple[Recording, Recording]:
@@ -109,10 +100,10 @@ def judged(model: Model, predicted: Predicted, pieces: Segments) -> Pushes:
     within = (low <= 0.0) & (high >= 0.0)
     every = np.broadcast_to(pushed[:, None, :, None], within.shape) & np.asarray(pieces.seen)
     return Pushes(
-        error=np.linalg.norm((motion - target)[:, -1, :, :2], axis=-1)[pushed],
-        displacement=np.linalg.norm((target[:, -1] - start)[..., :2], axis=-1)[pushed],
+        error_m=np.linalg.norm((motion - target)[:, -1, :, :2], axis=-1)[pushed],
+        displacement_m=np.linalg.norm((target[:, -1] - start)[..., :2], axis=-1)[pushed],
         inside=float(within[every].mean()),
-        drift=float(np.linalg.norm((motion[:, -1] - start)[..., :2], axis=-1).max()),
+        drift_m=float(np.linalg.norm((motion[:, -1] - start)[..., :2], axis=-1).max()),
     )
 
 

@@ -88,7 +88,7 @@ def _ours(handled: Recording, seen: Aligned, pushes: Recording, draws: int, seed
     posterior = compare(targets, draws, CHAINS, seed).posterior
     asked = pushes_of(pushes, model)
     result = judged(model, posterior.predict(asked), asked)
-    return error_share(result.error, result.displacement)
+    return error_share(result.error_m, result.displacement_m)
 
 
 def _theirs(handled: Recording, aligned: Aligned, pushes: Recording, kind: str, size: int) -> float:

@@ -59,14 +59,10 @@ class ToldScene:
 
     def shares(self, parameters: PieceParameters) -> list[float]:
         """Where constants stand within their bounds."""
-        values = {
-            "mass": parameters.mass,
-            "load x": parameters.load_place[0],
-            "load y": parameters.load_place[1],
-            "friction": parameters.friction,
-            "rolling resistance": parameters.rolling_resistance,
-        }
-        return [(values[name] - low) / (high - low) for name, (low, high) in self.bounds.items()]
+        low, high = np.array([*self.bounds.values()]).T
+        values = [parameters.mass, *parameters.load_place]
+        values += [parameters.friction, parameters.rolling_resistance]
+        return ((values[: len(low)] - low) / (high - low)).tolist()
 
     @property
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
@@ -90,16 +86,10 @@ class ToldScene:
 
     def parameters(self, *shares: float) -> PieceParameters:
         """The constants at these shares."""
-        pairs = zip(self.bounds.items(), shares, strict=True)
-        values = {name: low + share * (high - low) for (name, (low, high)), share in pairs}
-        return PieceParameters(
-            mass=values["mass"],
-            load_place=(values["load x"], values["load y"]),
-            friction=values["friction"],
-            rolling_resistance=values.get("rolling resistance", 0.0),
-            locked=self.locked,
-            anchor=self.anchor,
-        )
+        low, high = np.array([*self.bounds.values()]).T
+        mass, x, y, friction, *rolling = (low + np.array(shares) * (high - low)).tolist()
+        resistance = rolling[0] if rolling else 0.0
+        return PieceParameters(mass, (x, y), friction, resistance, self.locked, self.anchor)
 
     def spec(self, parameters: PieceParameters) -> mujoco.MjSpec:
         """The scene, free casters at 0, with room for what is measured as sensor data."""

@@ -90,8 +90,7 @@ def fit_scene(
         seed: draws these constants.
 
     Raises `PalpateError` when the extra is missing, the piece is bolted down, the recording has
-    gaps or another number of bodies; `CastersUnknownError` when it does not tell where casters
-    point.
+    gaps or other bodies; `CastersUnknownError` when it does not tell where casters point.
     """
     sysid = mujoco_sysid()
     if kind.bolted:

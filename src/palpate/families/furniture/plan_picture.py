@@ -1,7 +1,7 @@
 """A map among movable obstacles, and the plan on it: as a picture, or moving.
 
 Walls are solid, objects numbered by the order in which they are moved; where an object began is
-dashed, where it is left is filled. Ways differ in line as well as in colour.
+dashed, where it is left is filled. Ways are told apart by line as well as by colour.
 """
 
 import math
@@ -26,13 +26,14 @@ from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.maps.regions import regions_of
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan
-from palpate.report.picture import check_suffix, legend_of, save_animation, save_picture
+from palpate.report.picture import legend_of, save_animation, save_picture
 
 _INK, _QUIET, _WALL = "#1c2127", "#5b6570", "#3d4650"
 _OBJECT, _MOVED, _ROBOT, _CARRY = "#f3d9a0", "#e8a33d", "#0062a8", "#c04d00"
 _TINTS = ("#e4eef7", "#e6f3ec", "#f6ebf3", "#fbf3df", "#ececf6", "#f0f0ea")
 _WIDE = 7.0  # inches of the longer side
 _GHOSTS = 6  # poses of an object that are shown on its way
+_SUFFIXES = (".png", ".svg")
 _STAR: Any = {
     "marker": "*", "ms": 11, "color": _ROBOT, "mec": _INK, "mew": 0.6, "ls": "", "zorder": 9
 }  # fmt: skip
@@ -56,25 +57,26 @@ def plan_picture(
     Raises `PalpateError` for another suffix.
     """
     out = Path(out)
-    check_suffix(out)
+    if out.suffix not in _SUFFIXES:
+        raise PalpateError(f"{out} has the suffix '{out.suffix}': expected .png or .svg")
     with matplotlib.rc_context(_SETTINGS):
         figure, axes = _scene(world)
         _draw_regions(axes, world)
         _draw_walls(axes, world)
-        final = _final_poses(world, plan)
+        final = (plan.leaves(world) if plan else world).movables
         order = {name: k + 1 for k, name in enumerate(plan.moved)} if plan else {}
         for name, movable in world.movables.items():
             moved = name in order
-            _draw_object(axes, placed(movable.outline, np.array(movable.pose)), moved=moved)
+            _draw_object(axes, placed(movable.outline, movable.pose), moved=moved)
             if moved:
-                _draw_ghosts(axes, world, plan, name)
-                _draw_object(axes, placed(movable.outline, final[name]), left=True)
+                _draw_object(axes, placed(movable.outline, final[name].pose), left=True)
             label = str(order[name]) if moved else ""
             if movability and name in movability:
                 label += f"{' ' if label else ''}{movability[name]:.0%}"
-            x, y = final[name][:2]
+            x, y = final[name].pose[:2]
             axes.text(x, y, label, ha="center", va="center", color=_INK, zorder=8)
         if plan is not None:
+            _draw_ghosts(axes, world, plan)
             _draw_ways(axes, plan)
         if driven is not None:
             axes.plot(*driven[:, :2].T, color=_INK, lw=0.8, ls=":", label="driven", zorder=6)
@@ -83,7 +85,7 @@ def plan_picture(
         if goal is not None:
             axes.plot(*goal[:2], label="goal", **_STAR)
         legend_of(figure, "upper center", handlelength=2.6)
-        save_picture(out, figure, "figure")
+        save_picture(out, figure)
     return out
 
 
@@ -108,15 +110,15 @@ def scene_animation(
     world: Map,
     goal: Sequence[float],
     robots: np.ndarray,
-    objects: Sequence[Mapping[str, np.ndarray]],
+    objects: np.ndarray,
     held: Sequence[str | None],
     period: float = 0.08,
     movability: Sequence[Mapping[str, float]] | None = None,
 ) -> Path:
-    """A GIF from poses: `robots` (frames, 3), for each frame the objects' poses and what is held.
+    """A GIF of poses: `robots` (frames, 3), `objects` (frames, movables, 3), and what is held then.
 
-    `movability` is what is believed of the objects in each frame. Where an object's pose is not
-    given, it stands as on the map. An execution is shown so as well as a plan.
+    `movability` is what is believed of the objects in each frame. An execution is shown so as well
+    as a plan.
     """
     out = Path(out)
     pictures = []
@@ -130,13 +132,12 @@ def scene_animation(
         for index, robot in enumerate(robots):
             drawn: list[Any] = axes.plot(*goal[:2], **_STAR)
             drawn += axes.plot(*robots[: index + 1, :2].T, color=_ROBOT, lw=1.0, zorder=5)
-            for name, movable in world.movables.items():
-                pose = np.asarray(objects[index].get(name, movable.pose))
+            for (name, movable), pose in zip(world.movables.items(), objects[index], strict=True):
                 corners = placed(movable.outline, pose)
                 drawn += _draw_object(axes, corners, left=name == held[index])
                 if movability is not None and name in movability[index]:
                     text = f"{movability[index][name]:.0%}"
-                    x, y = float(pose[0]), float(pose[1])
+                    x, y = pose[:2]
                     drawn.append(axes.text(x, y, text, ha="center", va="center", zorder=8))
             drawn += _draw_robot(axes, world, robot)
             canvas.restore_region(background)
@@ -146,7 +147,8 @@ def scene_animation(
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
             colours = 64, Image.Quantize.FASTOCTREE
             pictures.append(picture.quantize(*colours, dither=Image.Dither.NONE))
-    save_animation(out, pictures, [round(1000 * period)] * (len(pictures) - 1) + [1500])
+    milliseconds = [round(1000 * period)] * (len(pictures) - 1) + [1500]
+    save_animation(out, pictures, milliseconds)
     return out
 
 
@@ -155,45 +157,27 @@ def scene_animation(
 
 def _timeline(
     world: Map, plan: Plan, frames: int
-) -> tuple[np.ndarray, list[dict[str, np.ndarray]], list[str | None]]:
-    """Poses at even steps of the way, a turn counted as its arc at the robot's rim."""
-    robots, objects, held = [], [], []
-    standing: dict[str, np.ndarray] = {}
+) -> tuple[np.ndarray, np.ndarray, list[str | None]]:
+    """Robot, objects and what is held at even steps of the way, a turn counted as the rim's arc."""
+    names, standing = list(world.movables), [one.pose for one in world.movables.values()]
+    poses, held = [], []
     for segment in plan.segments:
         for index, pose in enumerate(segment.poses):
-            robots.append(pose)
-            if segment.kind == TRANSFER:
-                assert segment.name is not None
-                assert segment.object_poses is not None
-                standing = standing | {segment.name: segment.object_poses[index]}
-            objects.append(standing)
+            if segment.name is not None and segment.object_poses is not None:
+                standing[names.index(segment.name)] = segment.object_poses[index]
+            poses.append([pose, *standing])
             held.append(segment.name)
-    poses = np.array(robots)
-    turned = np.abs(np.angle(np.exp(1j * np.diff(poses[:, 2]))))
-    steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1) + world.robot.radius * turned
-    along = np.concatenate([[0.0], np.cumsum(steps)])
+    all_poses = np.array(poses, float)
+    all_poses[:, 0, 2] = np.unwrap(all_poses[:, 0, 2])
+    steps = np.abs(np.diff(all_poses[:, 0], axis=0))
+    moved = np.linalg.norm(steps[:, :2], axis=1) + world.robot.radius * steps[:, 2]
+    along = np.concatenate([[0.0], np.cumsum(moved)])
     wanted = np.linspace(0, along[-1], frames)
-    before = np.clip(np.searchsorted(along, wanted, side="right") - 1, 0, len(poses) - 2)
-    share = (wanted - along[before]) / np.maximum(along[before + 1] - along[before], 1e-12)
-    change = poses[before + 1] - poses[before]
-    change[:, 2] = np.angle(np.exp(1j * change[:, 2]))
-    between = poses[before] + np.clip(share, 0, 1)[:, None] * change
-    shown = []
-    for index, part in zip(before, share, strict=True):
-        now = dict(objects[index])
-        for name, pose in objects[index + 1].items():
-            first = now.get(name, np.array(world.movables[name].pose))
-            now[name] = first + min(part, 1.0) * (pose - first)
-        shown.append(now)
-    return between, shown, [held[index + 1] for index in before]
-
-
-def _final_poses(world: Map, plan: Plan | None) -> dict[str, np.ndarray]:
-    poses = {name: np.array(movable.pose) for name, movable in world.movables.items()}
-    for segment in plan.segments if plan is not None else ():
-        if segment.object_poses is not None and segment.name is not None:
-            poses[segment.name] = segment.object_poses[-1]
-    return poses
+    columns = all_poses.reshape(len(along), -1).T
+    between = np.stack([np.interp(wanted, along, column) for column in columns], axis=1)
+    between = between.reshape(frames, -1, 3)
+    after = np.clip(np.searchsorted(along, wanted, side="right"), 1, len(along) - 1)
+    return between[:, 0], between[:, 1:], [held[index] for index in after]
 
 
 # --- drawing ----------------------------------------------------------------------------------
@@ -243,13 +227,14 @@ def _draw_object(
     return [axes.add_patch(Polygon(corners, closed=True, **look))]
 
 
-def _draw_ghosts(axes: Axes, world: Map, plan: Plan | None, name: str) -> None:
-    for segment in plan.segments if plan is not None else ():
-        if segment.name != name or segment.object_poses is None:
+def _draw_ghosts(axes: Axes, world: Map, plan: Plan) -> None:
+    """Objects on their ways."""
+    for segment in plan.segments:
+        if segment.name is None or segment.object_poses is None:
             continue
         chosen = np.linspace(0, len(segment.object_poses) - 1, _GHOSTS).round().astype(int)
         for pose in segment.object_poses[chosen[1:-1]]:
-            corners = placed(world.movables[name].outline, pose)
+            corners = placed(world.movables[segment.name].outline, pose)
             axes.add_patch(Polygon(corners, fc=_MOVED, alpha=0.12, ec=_CARRY, lw=0.4, zorder=3))
 
 

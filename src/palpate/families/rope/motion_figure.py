@@ -12,7 +12,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.report.charts import quantiles
 from palpate.report.evidence import Curves, Motion
-from palpate.report.picture import check_suffix, legend_of, save_picture
+from palpate.report.picture import canvas_of, legend_of, save_picture
 from palpate.report.style import STYLES, Style, numbered
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _NOTHING = "the motion holds nothing but gaps: there is nothing to draw"
 _INK, _QUIET, _RULE = "#1c2127", "#5b6570", "#dfe3e7"
+_SUFFIXES = (".png", ".svg")
 _SETTINGS: Any = {
     "font.size": 9,
     "axes.edgecolor": _RULE,
@@ -48,10 +49,11 @@ def motion_figure(
     Raises `PalpateError` for another suffix, no instants, or a file that cannot be written.
     """
     import matplotlib
-    from matplotlib.figure import Figure
 
     out = Path(out)
-    check_suffix(out)
+    if out.suffix not in _SUFFIXES:
+        expected = " or ".join(_SUFFIXES)
+        raise PalpateError(f"{out} has the suffix '{out.suffix}': expected {expected}")
     if not len(instants):
         raise PalpateError("a motion figure needs at least one instant, in seconds")
     labels = [*motion.chains, *(energy.values if energy else ())]
@@ -62,7 +64,7 @@ def motion_figure(
     panel = 1.4 * np.clip(np.ptp(limits[0]) / np.ptp(limits[1]), 0.5, 2.0)
     widths = [panel] * len(instants) + [2.8] * (energy is not None)
     with matplotlib.rc_context(_SETTINGS):
-        figure = Figure(figsize=(sum(widths) + 0.8, 2.4), dpi=200, layout="constrained")
+        figure = canvas_of(sum(widths) + 0.8, 2.4, dpi=200)
         axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
         for ax, frame in zip(axes, frames, strict=False):
             for label, chain in seen.items():
@@ -79,7 +81,7 @@ def motion_figure(
         if len(looks) > 1:
             across = max(1, int(figure.get_figwidth() / 1.6))  # inches that an entry takes
             legend_of(figure, "upper left", ncols=across, handlelength=3.5)
-        save_picture(out, figure, "figure")
+        save_picture(out, figure)
     return out
 
 
@@ -130,8 +132,14 @@ def _draw_energy(ax: "Axes", energy: Curves, looks: dict[str, Style]) -> None:
         low, median, high = quantiles(np.maximum(values, 1e-9), (0.05, 0.5, 0.95))
         if len(values) > 1:
             ax.fill_between(energy.time, low, high, color=style.light, alpha=0.16, lw=0)
-        look = {"color": style.light, "lw": style.width * 0.75, "ls": style.linestyle}
-        ax.plot(energy.time, median, label=label, **look)
+        ax.plot(
+            energy.time,
+            median,
+            color=style.light,
+            lw=style.width * 0.75,
+            ls=style.linestyle,
+            label=label,
+        )
     ax.axhline(0.01, color=_INK, lw=0.8, ls=(0, (4, 3)))
     ax.set(yscale="log", ylim=(10**-4.2, None), xlabel="time (s)")
     ax.set_title("energy relative to the start", color=_INK)

@@ -2,8 +2,7 @@
 
 What is fitted are the parameters and, for each segment, the state that it starts in: a smoothed
 start is off, and a model held to it would bend its parameters to make up for that (errors in
-variables). A start's errors are whitened by its vague deviation (`Segments.moved`), and eliminated
-segment by segment.
+variables). A start's errors are whitened by their deviation (`Segments.moved`) and eliminated.
 
 With few unknowns and many residuals the Jacobian is taken column by column in forward mode and only
 products of its columns are kept: memory does not grow with the recording.
@@ -197,8 +196,8 @@ class Intervals:
     `warnings` about combinations of parameters.
     """
 
-    lower: dict[str, Array]
-    upper: dict[str, Array]
+    lower: dict[str, np.ndarray]
+    upper: dict[str, np.ndarray]
     verdict: dict[str, str | None]
     warnings: tuple[str, ...]
 
@@ -210,9 +209,8 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     A = J^T W J / s^2 + 1 (the prior's precision is one in whitened coordinates) and the scores
     g_b = J^T W r / s^2 over a tenth of a trial each, the covariance is
     A^-1 (sum g_b g_b^T + 1) A^-1 (Huber 1967; White 1982): residuals next to each other in time are
-    not counted as independent evidence. Never below the covariance A^-1 of independent noise. What
-    a descent that ended early has left to go, a Gauss-Newton step, widens them as an error of that
-    size.
+    not counted as independent evidence. Never below the covariance A^-1 of independent noise. The
+    Gauss-Newton step that a descent has left to go widens them as an error of its size.
     """
     segments = SegmentSource.of(aligned, coordinates.reference).whole()
     offset = jnp.zeros((segments.count, 2, *segments.pose.shape[1:]))
@@ -247,17 +245,11 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     lower, upper, verdicts = {}, {}, {}
     for path, declaration in coordinates.declarations.items():
         reference = value_of(coordinates.reference, path)
-        low, high = (
-            jnp.broadcast_to(
-                declaration.prior.to_value(free[path] + sign * deviation[path], reference),
-                reference.shape,
-            )
-            for sign in (-QUANTILE, QUANTILE)
-        )
-        lower[path], upper[path] = low, high
-        verdicts[path] = verdict(
-            undecided(*(np.asarray(of[path]).ravel() for of in (deviation, free)))
-        )
+        for edge, sign in ((lower, -QUANTILE), (upper, QUANTILE)):
+            value = declaration.prior.to_value(free[path] + sign * deviation[path], reference)
+            edge[path] = np.broadcast_to(np.asarray(value), reference.shape)
+        share, shift = (np.asarray(of[path]).ravel() for of in (deviation, free))
+        verdicts[path] = verdict(undecided(share, shift))
     return Intervals(lower, upper, verdicts, _undecided(information, unravel))
 
 

@@ -36,9 +36,8 @@ _CONSTANT = 1e-6  # of the largest value: an input that varies by less says noth
 class LocallyWeighted(eqx.Module):
     """Data and how far each speaks for its neighbours; made by `locally_weighted`.
 
-    `inputs` and `targets` are standardised by `centre`, `scale` and `target_centre`,
-    `target_scale`. Places without a datum have `weight` 0, and a condition of no bits is the plain
-    regression.
+    `inputs` and `targets` are standardised by `centre`, `scale`, `target_centre`, `target_scale`.
+    Places without a datum have `weight` 0; a condition of no bits is the plain regression.
     """
 
     inputs: Float[Array, "*parts data inputs"]

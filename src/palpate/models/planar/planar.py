@@ -133,7 +133,7 @@ class Planar(PlanarParameters):
         self, state: PlanarState, action: Float[Array, "*batch bodies 3"]
     ) -> Float[Array, "*batch bodies 6"]:
         """Velocity and wrench of each body in its own axes: m/s, m/s, rad/s, N, N, N m."""
-        own = [_turned(each, -state.pose[..., 2]) for each in (state.velocity, action)]
+        own = [turned(each, -state.pose[..., 2]) for each in (state.velocity, action)]
         return jnp.concatenate(own, axis=-1)
 
     def corrected(
@@ -144,7 +144,7 @@ class Planar(PlanarParameters):
         In m/s along each body's own axes, and in m/s at `even_gyration` from its origin.
         """
         turning = correction[..., 2] / self.even_gyration
-        added = _turned(correction.at[..., 2].set(turning), state.pose[..., 2])
+        added = turned(correction.at[..., 2].set(turning), state.pose[..., 2])
         return PlanarState(state.pose, state.velocity + (1.0 - self.bolted[..., None]) * added)
 
     def correction_between(
@@ -152,7 +152,7 @@ class Planar(PlanarParameters):
     ) -> Float[Array, "*batch bodies 3"]:
         """Change of the velocities of what is not bolted, as `corrected` adds them."""
         change = (1.0 - self.bolted[..., None]) * (following.velocity - state.velocity)
-        change = _turned(change, -state.pose[..., 2])
+        change = turned(change, -state.pose[..., 2])
         return change.at[..., 2].set(change[..., 2] * self.even_gyration)
 
     def independent_parts(self) -> tuple[tuple["Planar", tuple[int, ...]], ...]:
@@ -250,10 +250,11 @@ def _side_by_side(arrays: Sequence[Array], axes: Sequence[int], lanes: int = 1) 
     return [jnp.broadcast_to(array, (*array.shape[:-1], lanes)) for array in last]
 
 
-def _turned(vectors: Array, angle: Array) -> Array:
-    """(*batch, bodies, 3) velocities or wrenches after their body was turned by an angle."""
+def turned(vectors: Array, angle: Array) -> Array:
+    """(..., 2 or 3) points, velocities or wrenches after their body was turned by an angle."""
     x, y = turn(vectors[..., 0], vectors[..., 1], jnp.cos(angle), jnp.sin(angle))
-    return jnp.stack([x, y, vectors[..., 2]], axis=-1)
+    rest = jnp.broadcast_to(vectors[..., 2:], (*x.shape, vectors.shape[-1] - 2))
+    return jnp.concatenate([jnp.stack([x, y], axis=-1), rest], axis=-1)
 
 
 def wrapped(angle: Array) -> Array:

@@ -43,8 +43,7 @@ class Rope(RopeParameters):
 
         Each node carries half of its neighbouring segments, so that the inertia of a swing is that
         of the rope to second order: equal nodes would weigh down the free end.
-        Other parameters are given in `fields`, a number standing for all elements, or start from
-        the centre of their prior.
+        Others are given in `fields`, a number standing for all elements, or their priors' centres.
         """
         rest_length = np.asarray(rest_length)
         if not np.all(np.isfinite(rest_length)) or np.any(rest_length <= 0):

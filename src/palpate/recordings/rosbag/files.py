@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, extra_module
 from palpate.recordings.alignment import MAX_BYTES
 from palpate.recordings.rosbag.decoding import Decode, ros_decoder
 from palpate.runs.storage import DamagedFileError, parse_json
@@ -76,14 +76,8 @@ def open_bag(path: Path) -> Bag:
     Raises `PalpateError` without the extra `io` and for what is no log, `OSError` as the file
     system does, and whatever the libraries raise for damaged files.
     """
-    try:
-        import mcap  # noqa: F401
-        import rosbags  # noqa: F401
-    except ImportError as error:
-        raise PalpateError(
-            "logs of robots are read by the packages mcap and rosbags, which are not installed: "
-            "pip install 'palpate[io]'"
-        ) from error
+    for package in ("mcap", "rosbags"):
+        extra_module(package, "io")
     if path.is_dir():
         if not (path / "metadata.yaml").exists():
             raise PalpateError(

@@ -139,14 +139,10 @@ def clearance(kinds: tuple[str, ...], poses: np.ndarray) -> float:
 
 
 class Turns:
-    """Which piece is held: one after another; see the module."""
+    """Which piece is held in an episode: one after another; see the module."""
 
     def __init__(self, task: CartTask):
         self._task = task
-        self._held, self._since = 0, 0
-
-    def begin(self) -> None:
-        """A new episode."""
         self._held, self._since = 0, 0
 
     def held(self, poses: np.ndarray) -> int:

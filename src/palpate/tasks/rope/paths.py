@@ -91,9 +91,8 @@ def named_path(
     """The curve of that name as displacements from its first point: (samples, 3) in m.
 
     It is `size` m long and gone through once in `duration` s, the soft start included; for
-    `beyond` s more it goes on as before (a preview looks there). It lies in a plane that is tilted
-    by `tilt` about the curve's own direction of length and then turned by `azimuth` about the
-    vertical (rad).
+    `beyond` s more it goes on as before (a preview looks there). Its plane is tilted by `tilt`
+    about the direction of its length and then turned by `azimuth` about the vertical (rad).
 
     Raises `PalpateError` for a name that does not exist and a duration below the soft start's.
     """

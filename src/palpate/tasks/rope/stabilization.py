@@ -29,21 +29,20 @@ STATES_PER_MOTION = 16
 _HANGING = np.array([0.0, 0.0, -1.0], np.float32)
 
 
-class RopeTask(Task):
-    """What tasks of a hanging rope share whose gripper's velocity is commanded.
+class HangingRopeTask(Task):
+    """A task for a rope that hangs from a gripper: what is seen of it, and its symmetries.
 
-    The model is driven by `velocity` at its first node. Limits in m/s and m/s^2.
+    The model is driven by `velocity` at its first node.
     """
 
     goal_features: ClassVar[int] = 0  # of `features`: what is seen of the goal
     action_name: ClassVar[str] = "gripper velocity"
     action_unit: ClassVar[str] = "m/s"
-    duration: float = eqx.field(static=True, default=2.0)
-    action_limit: float = eqx.field(static=True, default=1.5)
-    action_rate_limit: float = eqx.field(static=True, default=10.0)
+    action_limit: float = eqx.field(static=True, default=1.5)  # m/s
+    action_rate_limit: float = eqx.field(static=True, default=10.0)  # m/s^2
 
     def check_driven(self, model: Rope) -> None:
-        """Raise `PalpateError` unless the rope is driven by velocity at its first node."""
+        """Raise `PalpateError` when the rope is not driven by velocity at its first node."""
         if model.driven != (0,) or model.drive != "velocity":
             raise PalpateError(
                 f"{self.name} needs a rope driven by velocity at node 0, "
@@ -79,11 +78,10 @@ class RopeTask(Task):
         )
         return eqx.tree_at(lambda s: s.state, start, own)
 
-    def features(self, state: RopeState, goal: None = None) -> Float[Array, "*batch features"]:
+    def features(self, state: RopeState, goal: Any = None) -> Float[Array, "*batch features"]:
         """Positions relative to the gripper (m) and velocities (m/s) of all nodes but the gripper.
 
-        Exactly the same wherever the rope is. The gripper's velocity is the command, which a
-        policy carries.
+        The same wherever the rope is. The gripper's velocity is the command, which policies carry.
         """
         relative = state.position[..., 1:, :] - state.position[..., :1, :]
         seen = jnp.concatenate([relative, state.velocity[..., 1:, :]], axis=-2)
@@ -98,7 +96,7 @@ class RopeTask(Task):
         )
 
 
-class RopeStabilization(RopeTask):
+class RopeStabilization(HangingRopeTask):
     """A hanging rope of one driven end comes to rest, wherever the gripper then is.
 
     The loss of an episode, with the energy e(t) = E_rope(X^t) / E_rope(X^0) above hanging rest and
@@ -117,6 +115,7 @@ class RopeStabilization(RopeTask):
         "settling_periods": "periods",
         "final_speed": "m/s",
     }
+    duration: float = eqx.field(static=True, default=2.0)
     final_weight: float = eqx.field(static=True, default=1.0)
     settling_weight: float = eqx.field(static=True, default=1.0)
     rest_weight: float = eqx.field(static=True, default=1.0)

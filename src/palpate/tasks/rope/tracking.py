@@ -16,7 +16,7 @@ from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import Channel
 from palpate.tasks.rope.paths import DesiredPath, random_paths
-from palpate.tasks.rope.stabilization import RopeTask
+from palpate.tasks.rope.stabilization import HangingRopeTask
 from palpate.tasks.task import Start
 
 # What is seen of the path, s ahead. A hanging chain's grip has to know where its tip should be
@@ -30,7 +30,7 @@ AT_THE_BEGINNING = 0.2  # of the starts: at rest, where the path starts softly
 MOST_MIXED = 0.5  # share of the path itself in how the gripper moves before the others
 
 
-class RopeTracking(RopeTask):
+class RopeTracking(HangingRopeTask):
     """The tip of a hanging rope follows a path that is seen some way ahead.
 
     The goal is a `DesiredPath` in the world frame. With the tip at p_N and the path at g, the loss
@@ -117,7 +117,7 @@ class RopeTracking(RopeTask):
         """
         steps = np.round(np.array(PREVIEW) / goal.period).astype(int)
         path = goal.ahead(jnp.asarray(steps)) - state.position[..., :1, :]
-        seen = super().features(state, None)
+        seen = super().features(state)
         return jnp.concatenate([seen, path.reshape(*path.shape[:-2], -1)], axis=-1)
 
     def feature_channels(self, model: Rope) -> tuple[Channel, ...]:

@@ -1,186 +1,120 @@
-"""An agent at work: 1,000 decisions in one world, by one planner, and what they earned."""
+"""Episodes of the Shopping-Cart and Apartment tasks in MuJoCo, and the controller that is told."""
 
 import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import shapely
-from jaxtyping import Array, Float
 
-from palpate.models.model import Model
-from palpate.models.planar import Planar, PlanarState, furniture
+from palpate.errors import PalpateError
+from palpate.models.planar import Planar
 from palpate.parameters import with_values
-from palpate.planning.sampling import Mppi, SamplingPlanner
 from palpate.recordings import Aligned
-from palpate.tasks.furniture.cart import HEADING_WEIGHT, CartTask, Turns
-from palpate.trials.furniture.cart_agents import (
+from palpate.runs import Figure
+from palpate.tasks.furniture.cart import CartTask
+from palpate.trials.furniture.cart_controllers import (
     FRAMES,
-    Agent,
-    Decision,
-    Episode,
-    Handled,
-    Knowing,
-    PhysicsAgent,
+    CartController,
+    PhysicsController,
+    Planning,
     piece_model,
 )
-from palpate.worlds.furniture.furniture import CONTROL_PERIOD, FurnitureWorld, Piece
+from palpate.trials.trial import Record, Trial, run_trials
+from palpate.worlds.furniture.furniture import (
+    CONTROL_PERIOD,
+    FurnitureObservation,
+    FurnitureTruth,
+    FurnitureWorld,
+    Piece,
+)
 from palpate.worlds.furniture.handling import record_handling
 from palpate.worlds.furniture.scene import GRAVITY
 
-ESTIMATED = 5  # frames that velocities are estimated from
-VISIBLE = 0.02  # m or rad, in a decision: what moves by more has moved
-SHARES = 1.0, 0.0, 1.0, 0.5  # of the plan that samples are about: forces may cancel
-CLOSE = 0.02  # m: what is nearer is taken as touching
 HANDLED, TOSSED, PRACTISED = 15.0, 2, 4  # s, three times; and episodes: of TRUE
 HANDLING, PRACTICE, TOSSING = 10_000, 20_000, 30_000  # episodes' numbers, unlike those that count
 
 
 @dataclasses.dataclass(frozen=True)
-class Planning:
-    """The same for every agent, as in `SamplingPlanner`; `spacing` is counted in decisions.
+class Rewards(Record):
+    """What was earned in episodes; see `Record`.
 
-    The horizon is (knots - 1) spacing decisions.
+    `reward` (trials, times) of a decision that would end then, of where the pieces truly are;
+    `poses` (drawn trials, times, bodies, 3) m, m, rad, as seen.
     """
 
-    samples: int = 128
-    knots: int = 7
-    spacing: int = 3
-    deviation: float = 1.0
-    iterations: int = 1
-    temperature: float = 0.1
+    observed: ClassVar[str] = "poses"
+    reward: np.ndarray
+    poses: np.ndarray
+    failures: dict[int, str]
 
 
-def stage_loss(
-    states: PlanarState, actions: Float[Array, "plans 3"], goal: Float[Array, "bodies 3"]
-) -> Float[Array, " plans"]:
-    """Minus the reward of a decision, and a little for effort so that what is done is not noise."""
-    off = states.pose - goal
-    heading = jnp.abs(off[..., 2] - 2 * jnp.pi * jnp.round(off[..., 2] / (2 * jnp.pi)))
-    distance = jnp.sqrt(jnp.sum(off[..., :2] ** 2, axis=-1) + 1e-8)
-    effort = 0.03 * jnp.sum(actions**2, axis=-1)
-    return jnp.mean(distance + HEADING_WEIGHT * heading, axis=-1) + effort
-
-
-@dataclasses.dataclass
-class Trial:
-    """One agent in one world, from the first decision on."""
+@dataclasses.dataclass(frozen=True)
+class CartTrial(Trial[Rewards]):
+    """One episode in the world of a seed, from pieces at rest at `start` (bodies, 3) on."""
 
     task: CartTask
-    agent: Agent
-    planning: Planning
     seed: int
-    idle: bool = False  # does nothing where it has nothing to plan with, instead of anything
-    first_episode: int = 0  # with the seed draws starts and noise
+    episode: int  # with the seed draws casters and noise
+    start: np.ndarray
+    steps: int
 
-    def __post_init__(self) -> None:
-        self._world = self.task.world()
-        self._random = np.random.default_rng([self.seed, 7, self.first_episode])
-        self._starts = np.random.default_rng([self.seed, 8, self.first_episode])
-        self._turns = Turns(self.task)
-        self._tracker = furniture(self.task.outlines, control_period=CONTROL_PERIOD)
-        self._shapes = [shapely.Polygon(outline) for outline in self.task.outlines]
-        self._walls = shapely.MultiPolygon([shapely.Polygon(wall) for wall in self.task.walls])
-        self.episodes: list[Episode] = []
+    @property
+    def control_period(self) -> float:
+        return CONTROL_PERIOD
 
-    def decide(self) -> float:
-        """Take one decision and learn from it; the reward is of where the pieces truly are."""
-        if not self.episodes or len(self.episodes[-1].decisions) == self.task.episode:
-            self._begin()
-        held = self._turns.held(self._frames[-1])
-        before = self._state()
-        model = self.agent.believed(held)
-        action = self._unplanned() if model is None else self._planned(model, held, before)
-        handled = self._handled(self._tracker if model is None else model, held)
-        wrench = np.asarray(_wrench(handled, before.pose, jnp.asarray(action)))
-        seen = [self._world.step(wrench) for _ in range(FRAMES)]
-        poses = np.array([one.poses for one in seen])
-        moved = np.abs(poses[-1] - self._frames[-1]).max(axis=-1) > VISIBLE
-        moved[held] = True
-        touched = self._touching(poses[-1]) | self._touching(self._frames[-1])
-        self._frames = [*self._frames, *poses][-ESTIMATED:]
-        self.episodes[-1].decisions.append(
-            Decision(
-                poses,
-                np.array([one.wrench for one in seen]),
-                before,
-                self._state(),
-                wrench,
-                held,
-                moved,
-                touched,
-            )
-        )
-        self.agent.learn(self.episodes)
-        return float(self.task.reward(self._world.truth().poses))
+    @property
+    def group(self) -> str:
+        """See `Trial`: the task."""
+        return self.task.name
 
-    def _begin(self) -> None:
-        start = self.task.start(self._starts)
-        number = self.first_episode + len(self.episodes)
-        first = self._world.reset(self.seed, episode=number, poses=start).poses
-        self.episodes.append(Episode(first))
-        self._frames = [first] * ESTIMATED  # at rest, as everybody knows
-        self._turns.begin()
-        self._plan = None
-        self._planned_for = -1
+    @property
+    def reset_options(self) -> Mapping[str, Any]:
+        return {"episode": self.episode, "poses": self.start}
 
-    def _state(self) -> PlanarState:
-        return _estimated(self._tracker, jnp.asarray(np.array(self._frames), jnp.float32))
+    @property
+    def command(self) -> np.ndarray:
+        """See `Trial`: nobody holds anything."""
+        return np.zeros((len(self.task.kinds), 3))
 
-    def _unplanned(self) -> np.ndarray:
-        """Anything within the ball of actions, or nothing."""
-        if self.idle:
-            return np.zeros(3, np.float32)
-        direction = self._random.normal(size=3)
-        size = self._random.uniform() ** (1 / 3) / np.linalg.norm(direction)
-        return np.asarray(size * direction, np.float32)
+    def world(self) -> FurnitureWorld:
+        return self.task.world()
 
-    def _planned(self, model: Model, held: int, state: PlanarState) -> np.ndarray:
-        options = self.planning
-        planner = SamplingPlanner(
-            model=self._handled(model, held),
-            stage_loss=stage_loss,
-            limit=1.0,
-            rate_limit=None,
-            knots=options.knots,
-            spacing=options.spacing,
-            rule=Mppi(options.temperature),
-            samples=options.samples,
-            iterations=options.iterations,
-            deviation=options.deviation,
-            shares=SHARES,
-        )
-        if self._plan is None or held != self._planned_for:
-            key = jax.random.key(int(self._random.integers(2**31)))
-            self._plan, self._planned_for = planner.init(jnp.zeros(3), key), held
-        goals = jnp.broadcast_to(
-            jnp.asarray(self.task.goals, jnp.float32), (planner.horizon, *self.task.goals.shape)
-        )
-        self._plan, action = planner(self._plan, state, goals)
-        return np.asarray(action)
+    def measure(
+        self, observation: FurnitureObservation, truth: FurnitureTruth
+    ) -> Mapping[str, Any]:
+        return {"reward": self.task.reward(truth.poses)}
 
-    def _handled(self, model: Model, held: int) -> Handled:
-        dtype = jnp.zeros(()).dtype
-        return Handled(
-            inner=model,
-            held=jnp.asarray(held),
-            strength=jnp.asarray(self.task.strength, dtype),
-            handle=jnp.asarray(self.task.handles, dtype),
-        )
+    @classmethod
+    def record(cls, trials: Sequence["CartTrial"], steps: int, drawn: int) -> Rewards:
+        shape = steps + 1, len(trials[0].task.kinds), 3
+        reward = np.full((len(trials), steps + 1), np.nan)
+        return Rewards(reward, np.full((drawn, *shape), np.nan), {})
 
-    def _touching(self, poses: np.ndarray) -> np.ndarray:
-        """Which pieces (bodies,) are near another or a wall."""
-        placed = [
-            shapely.Polygon(np.asarray(shape.exterior.coords)[:-1] @ _rotation(angle).T + (x, y))
-            for shape, (x, y, angle) in zip(self._shapes, poses, strict=True)
-        ]
-        return np.array(
-            [
-                min([self._walls.distance(one), *(one.distance(o) for o in placed if o is not one)])
-                < CLOSE
-                for one in placed
-            ]
-        )
+    @classmethod
+    def figures(
+        cls, trials: Sequence["CartTrial"], record: Rewards, suffix: str = ""
+    ) -> list[Figure]:
+        mean = float(np.nanmean(record.reward))
+        return [Figure(f"mean_reward{suffix}", mean, "m", better="higher")]
+
+
+def rewards_by_episode(
+    task: CartTask, controller: CartController, seed: int, decisions: int, first_episode: int = 0
+) -> Iterator[np.ndarray]:
+    """The reward of each decision, episode by episode, in the world of a seed.
+
+    Raises `PalpateError` when the simulation diverges.
+    """
+    starts = np.random.default_rng([seed, 8, first_episode])
+    for done in range(0, decisions, task.episode):
+        episode, left = first_episode + done // task.episode, min(task.episode, decisions - done)
+        steps = left * FRAMES + 1  # the last shows what became of the last decision
+        trial = CartTrial(task, seed, episode, task.start(starts), steps)
+        record = run_trials([trial], controller)
+        if record.failures:
+            raise PalpateError(record.failures[0])
+        yield record.reward[0, FRAMES::FRAMES]
 
 
 def best_scene(task: CartTask, planning: Planning, seed: int) -> Planar:
@@ -194,20 +128,18 @@ def best_scene(task: CartTask, planning: Planning, seed: int) -> Planar:
     move. Nor does wiggling tell at what force a caster gives way that holds more than that takes.
     """
     stretches = _wiggled(task, seed)
-    tossed = Trial(task, Knowing(None), planning, seed, first_episode=TOSSING)
-    for _ in range(TOSSED * task.episode):
-        tossed.decide()
+    tossed = CartController(task, planning, seed, TOSSING)
+    list(rewards_by_episode(task, tossed, seed, TOSSED * task.episode, TOSSING))
     for body, handled in enumerate(stretches):
         handled += [one for episode in tossed.episodes for one in episode.handling(body)]
-    agent = PhysicsAgent(task, seed, stretches, _told(task, seed))
-    agent.search()
-    trial = Trial(task, agent, planning, seed, first_episode=PRACTICE)
-    for _ in range(PRACTISED * task.episode):
-        trial.decide()
-    return agent.search()
+    hidden = _hidden(task, seed)
+    practising = PhysicsController(task, planning, seed, PRACTICE, stretches, hidden)
+    practising.search()
+    list(rewards_by_episode(task, practising, seed, PRACTISED * task.episode, PRACTICE))
+    return practising.search()
 
 
-def _told(task: CartTask, seed: int) -> list[Planar]:
+def _hidden(task: CartTask, seed: int) -> list[Planar]:
     """Each piece with the hidden constants that mean the same in a planar model."""
     world = task.world()
     world.reset(seed)
@@ -252,17 +184,3 @@ def _wiggled(task: CartTask, seed: int) -> list[list[tuple[Aligned, bool]]]:
             aligned = Aligned(CONTROL_PERIOD, poses[None], wrenches[None], np.array([len(poses)]))
             stretches[body].append((aligned, True))
     return stretches
-
-
-def _rotation(angle: float) -> np.ndarray:
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-
-
-@jax.jit
-def _estimated(tracker: Planar, frames: Array) -> PlanarState:
-    return tracker.initial_state(frames)
-
-
-@jax.jit
-def _wrench(handled: Handled, pose: Array, action: Array) -> Array:
-    return handled.wrench(pose, action)

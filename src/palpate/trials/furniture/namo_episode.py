@@ -7,13 +7,12 @@ be carried off, or something that can until it was seen not to.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.maps.map import Map
-from palpate.planning.movable_obstacles.motion.belief import SceneBelief
+from palpate.planning.movable_obstacles.motion.belief import ObjectBelief, cut
 from palpate.planning.movable_obstacles.motion.physics_manipulation import (
     ConstrainedManipulation,
     Drawn,
@@ -31,7 +30,6 @@ from palpate.planning.movable_obstacles.search.policy import NoWayError
 from palpate.planning.movable_obstacles.search.tree_search import Settings
 from palpate.trials.furniture.namo_execution import FORCE, Contact, Execution, Frame, OutOfTimeError
 from palpate.trials.furniture.rooms import MARGIN, TIGHT, Room, ends_of
-from palpate.worlds.furniture.furniture import FurnitureTruth, FurnitureWorld
 
 # Written down before the first full run.
 BUDGET, ATTEMPTS = 240.0, 12  # simulated s, and transfers begun, of an episode
@@ -45,70 +43,38 @@ MOVABLE, THRESHOLD, ERRS = 0.7, 0.5, 0.1  # flag: prior, and how often a transfe
 MARGINS = (MARGIN, TIGHT, 0.0)
 
 
-@runtime_checkable
-class Opinion(Protocol):
-    """What a planner believes of objects; `curious` if it wants to feel what holds a stuck one."""
+class Opinion:
+    """What a planner takes the objects to be; this one was told so beforehand and never learns."""
 
-    curious: bool
-
-    def model(self) -> ConstrainedManipulation:
-        """For planning now."""
-        ...
-
-    def immovable(self) -> set[str]:
-        """Objects that count as walls."""
-        ...
-
-    def felt(self, contact: Contact) -> None:
-        """What was seen and felt while something was touched."""
-        ...
-
-    def tried(self, name: str, share: float) -> None:
-        """A transfer has ended after that share of its way."""
-        ...
-
-    def relent(self) -> None:
-        """No way was found: perhaps to believe less firmly."""
-        ...
-
-    def movability(self) -> dict[str, float]:
-        """The believed probability that an object gives way, by name."""
-        ...
-
-
-class Fixed:
-    """Never learns: told the truth, or taking everything to be freely movable."""
-
-    curious = False
+    curious = False  # whether it wants to feel what holds a stuck object
 
     def __init__(self, constraints: Mapping[str, Constraint]) -> None:
         self._constraints = dict(constraints)
-        drawn = {name: Drawn((one,)) for name, one in constraints.items()}
-        self._model = ConstrainedManipulation(drawn, FORCE)
 
     def model(self) -> ConstrainedManipulation:
-        """See `Opinion`."""
-        return self._model
-
-    def immovable(self) -> set[str]:
-        """See `Opinion`."""
-        return {name for name, one in self._constraints.items() if one.kind == STATIC}
-
-    def felt(self, contact: Contact) -> None:
-        """See `Opinion`."""
-
-    def tried(self, name: str, share: float) -> None:
-        """See `Opinion`."""
-
-    def relent(self) -> None:
-        """See `Opinion`."""
+        """For planning now."""
+        drawn = {name: Drawn((one,)) for name, one in self._constraints.items()}
+        return ConstrainedManipulation(drawn, FORCE)
 
     def movability(self) -> dict[str, float]:
-        """See `Opinion`."""
+        """The believed probability that an object gives way, by name."""
         return {name: float(one.kind != STATIC) for name, one in self._constraints.items()}
 
+    def immovable(self) -> set[str]:
+        """Objects that count as walls."""
+        return {name for name, share in self.movability().items() if share < THRESHOLD}
 
-class Flag(Fixed):
+    def felt(self, contact: Contact) -> None:
+        """What was seen and felt while something was touched."""
+
+    def tried(self, name: str, share: float) -> None:
+        """A transfer has ended after that share of its way."""
+
+    def relent(self) -> None:
+        """No way was found: perhaps to believe less firmly."""
+
+
+class Flag(Opinion):
     """Levihn, Scholz and Stilman (ICRA 2013): movable or not, by a thresholded probability.
 
     An object that came along or failed to counts as movable with Bayes' probability; below the
@@ -119,56 +85,47 @@ class Flag(Fixed):
         super().__init__(dict.fromkeys(names, Constraint(FREE)))
         self._probability = dict.fromkeys(names, MOVABLE)
 
-    def immovable(self) -> set[str]:
-        """See `Opinion`."""
-        return {name for name, share in self._probability.items() if share < THRESHOLD}
+    def movability(self) -> dict[str, float]:
+        return dict(self._probability)
 
     def tried(self, name: str, share: float) -> None:
-        """See `Opinion`."""
         prior = self._probability[name]
         told = 1 - ERRS if share >= DONE else ERRS  # of a movable object
         self._probability[name] = prior * told / (prior * told + (1 - prior) * (1 - told))
 
-    def movability(self) -> dict[str, float]:
-        """See `Opinion`."""
-        return dict(self._probability)
 
-
-class Learner:
+class Learner(Opinion):
     """Ours: plans with draws of a posterior that every contact sharpens."""
 
     curious = True
 
     def __init__(self, outlines: Mapping[str, np.ndarray], seed: int) -> None:
-        self.belief = SceneBelief(outlines, seed)
+        super().__init__({})
+        self.objects = {
+            name: ObjectBelief(np.asarray(outline, float), seed + 1000 * number)
+            for number, (name, outline) in enumerate(outlines.items())
+        }
 
     def model(self) -> ConstrainedManipulation:
-        """See `Opinion`."""
-        return ConstrainedManipulation(self.belief.drawn(DRAWS), FORCE)
+        drawn = {name: one.drawn(DRAWS) for name, one in self.objects.items()}
+        return ConstrainedManipulation(drawn, FORCE)
+
+    def movability(self) -> dict[str, float]:
+        return {name: one.movability(FORCE) for name, one in self.objects.items()}
 
     def immovable(self) -> set[str]:
-        """See `Opinion`."""
+        """See `Opinion`: anything may give way."""
         return set()
 
     def felt(self, contact: Contact) -> None:
-        """See `Opinion`."""
-        self.belief.learn(
-            contact.name,
-            np.array(contact.poses),
-            np.array(contact.wrenches),
-            np.array(contact.alone),
-        )
-
-    def tried(self, name: str, share: float) -> None:
-        """See `Opinion`."""
+        seen = contact.poses, contact.wrenches, contact.alone
+        self.objects[contact.name].learn(cut(*map(np.array, seen)))
 
     def relent(self) -> None:
-        """See `Opinion`."""
-        self.belief.relax()
-
-    def movability(self) -> dict[str, float]:
-        """See `Opinion`."""
-        return self.belief.movability(FORCE)
+        """See `Opinion`: of all that was touched."""
+        for one in self.objects.values():
+            if one.version:
+                one.relax()
 
 
 @dataclass
@@ -269,9 +226,11 @@ def _seen(run: Execution, room: Room, margin: float) -> Map:
 # --- the truth, for the planner that is told ----------------------------------------------------
 
 
-def told(room: Room, world: FurnitureWorld, truth: FurnitureTruth) -> dict[str, Constraint]:
+def truth_of(room: Room) -> dict[str, Constraint]:
     """Each object's true constraint."""
-    found = {}
+    world, found = room.world(), {}
+    world.reset(room.seed)
+    truth = world.truth()
     for body, (name, construction) in enumerate(zip(world.names, room.constructions, strict=True)):
         parameters, kind = truth.parameters[body], truth.kinds[body]
         if construction in ("casters", "feet"):
@@ -289,10 +248,3 @@ def told(room: Room, world: FurnitureWorld, truth: FurnitureTruth) -> dict[str, 
                 place = truth.wheel_places[body][mount]
             found[name] = Constraint(PIVOT, (float(place[0]), float(place[1])))
     return found
-
-
-def truth_of(room: Room) -> dict[str, Constraint]:
-    """`told`, of the room's own world."""
-    world = room.world()
-    world.reset(room.seed)
-    return told(room, world, world.truth())

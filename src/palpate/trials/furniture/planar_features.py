@@ -9,10 +9,12 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+import shapely
 from jaxtyping import Array, Bool, Float
 
 from palpate.identification.regression.model import Features
 from palpate.models.planar import PlanarState
+from palpate.models.planar.planar import turned
 
 SECTORS = 12  # around each object: the deck's P
 NEAR = 0.03  # m: what is nearer counts as touching
@@ -38,7 +40,9 @@ def body_features(
     """
     if not len(outlines):
         return Features(_body_inputs, _body_change, _body_apply)
-    points = [_around(np.asarray(outline, float)) for outline in outlines]
+    # corners and points between them, the first not again
+    rings = [shapely.segmentize(shapely.Polygon(outline), SPACING) for outline in outlines]
+    points = [shapely.get_coordinates(ring)[:-1] for ring in rings]
     tried = np.stack([np.resize(p, (max(map(len, points)), 2)) for p in points])
     condition = functools.partial(
         touching,
@@ -67,7 +71,7 @@ def touching(
     """
     pose = state.pose
     count = pose.shape[-2]
-    world = _placed(points, pose[..., None, :])  # (..., bodies, points, 2)
+    world = turned(points, pose[..., None, 2]) + pose[..., None, :2]  # (..., bodies, points, 2)
     bits = []
     for body in range(count):
         own = world[..., body, :, :]
@@ -76,7 +80,8 @@ def touching(
                 bits.append(jnp.zeros((*pose.shape[:-2], sectors), bool))
                 continue
             there = pose[..., other, None, :]
-            inside = _inside(_in_frame(own, there), sides[other])
+            local = turned(own - there[..., :2], -there[..., 2])
+            inside = _inside(local, sides[other])
             bits.append(_by_sector(points[body], inside, sectors))
         at_walls = jnp.zeros(own.shape[:-1], bool)
         for wall in walls:
@@ -103,42 +108,19 @@ def _raw_apply(state: PlanarState, change: Array) -> PlanarState:
 
 def _body_inputs(state: PlanarState, action: Array) -> Array:
     angle = -state.pose[..., 2]
-    return jnp.concatenate([_turned(state.velocity, angle), _turned(action, angle)], axis=-1)
+    return jnp.concatenate([turned(state.velocity, angle), turned(action, angle)], axis=-1)
 
 
 def _body_change(state: PlanarState, following: PlanarState) -> Array:
     angle = -state.pose[..., 2]
-    moved = _turned(following.pose - state.pose, angle)
-    return jnp.concatenate([moved, _turned(following.velocity - state.velocity, angle)], axis=-1)
+    moved = turned(following.pose - state.pose, angle)
+    return jnp.concatenate([moved, turned(following.velocity - state.velocity, angle)], axis=-1)
 
 
 def _body_apply(state: PlanarState, change: Array) -> PlanarState:
     angle = state.pose[..., 2]
-    pose = state.pose + _turned(change[..., :3], angle)
-    return PlanarState(pose, state.velocity + _turned(change[..., 3:], angle))
-
-
-def _turned(vectors: Array, angle: Array) -> Array:
-    """(x, y, and a third that stays) turned by an angle."""
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return jnp.stack([cosine * x - sine * y, sine * x + cosine * y, vectors[..., 2]], axis=-1)
-
-
-def _placed(points: Array, pose: Array) -> Array:
-    """Points of a body's frame in the world."""
-    cosine, sine = jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2])
-    x, y = points[..., 0], points[..., 1]
-    turned = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
-    return turned + pose[..., :2]
-
-
-def _in_frame(points: Array, pose: Array) -> Array:
-    """Points of the world in a body's frame."""
-    cosine, sine = jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2])
-    off = points - pose[..., :2]
-    x, y = off[..., 0], off[..., 1]
-    return jnp.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
+    pose = state.pose + turned(change[..., :3], angle)
+    return PlanarState(pose, state.velocity + turned(change[..., 3:], angle))
 
 
 def _inside(points: Array, sides: np.ndarray) -> Array:
@@ -154,21 +136,10 @@ def _by_sector(points: Array, chosen: Array, sectors: int) -> Array:
     return jnp.any(chosen[..., None] & (sector[..., None] == jnp.arange(sectors)), axis=-2)
 
 
-def _around(outline: np.ndarray) -> np.ndarray:
-    """Points along a polygon: its corners and others between them."""
-    found = []
-    for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        count = max(1, int(np.ceil(np.linalg.norm(end - start) / SPACING)))
-        found.append(start + np.arange(count)[:, None] / count * (end - start))
-    return np.concatenate(found)
-
-
 def _sides(polygon: np.ndarray) -> np.ndarray:
     """Half planes (sides, 3) a x + b y <= c, (a, b) of length one, of a convex polygon."""
+    polygon = shapely.get_coordinates(shapely.orient_polygons(shapely.Polygon(polygon)))[:-1]
     edge = np.roll(polygon, -1, axis=0) - polygon
     outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    offset = (outward * polygon).sum(axis=1)
-    if np.any(outward @ polygon.mean(axis=0) > offset):
-        return np.column_stack([-outward, -offset])  # it ran clockwise
-    return np.column_stack([outward, offset])
+    return np.column_stack([outward, (outward * polygon).sum(axis=1)])

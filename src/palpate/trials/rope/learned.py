@@ -12,7 +12,7 @@ from palpate.networks import CommandPolicy
 from palpate.perception.rope.marker_observer import MarkerObserver
 from palpate.perception.velocity import VelocityEstimator
 from palpate.tasks.rope import RopeStabilization
-from palpate.tasks.rope.stabilization import RopeTask
+from palpate.tasks.rope.stabilization import HangingRopeTask
 from palpate.trials.controller import FeedbackController
 from palpate.worlds.rope.rope import RopeObservation
 
@@ -62,7 +62,7 @@ class LearnedController(FeedbackController):
     What is carried: the observer's window, the policy's own carry, and how many steps were taken.
     """
 
-    def __init__(self, policy: CommandPolicy, task: RopeTask):
+    def __init__(self, policy: CommandPolicy, task: HangingRopeTask):
         self.policy, self.period = policy, policy.period
         # 3 coordinates and 3 velocities of each node, beside what is seen of the goal.
         segments = (policy.mean.shape[0] - task.goal_features) // 6

@@ -18,7 +18,7 @@ from palpate.planning.gradient import GradientPlanner
 from palpate.planning.sampling import Cem, Mppi, SamplingPlanner
 from palpate.tasks.rope import RopeStabilization, RopeTracking
 from palpate.tasks.rope.paths import DesiredPath
-from palpate.tasks.rope.stabilization import LEAST_ENERGY, STABILISED, RopeTask
+from palpate.tasks.rope.stabilization import LEAST_ENERGY, STABILISED, HangingRopeTask
 from palpate.tasks.rope.tracking import hanging_rope
 from palpate.trials.controller import FeedbackController
 from palpate.trials.rope.learned import RopeObserver
@@ -73,7 +73,9 @@ def following_planner(
     return _sampling_planner(method, shared, FOLLOWING, samples, iterations)
 
 
-def _shared(task: RopeTask, model: Rope, stage_loss: StageLoss, tuning: Tuning) -> dict[str, Any]:
+def _shared(
+    task: HangingRopeTask, model: Rope, stage_loss: StageLoss, tuning: Tuning
+) -> dict[str, Any]:
     return {
         "model": model,
         "stage_loss": stage_loss,

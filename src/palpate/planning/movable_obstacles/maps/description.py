@@ -52,6 +52,7 @@ GRID_KEYS = {"robot", "movables", "start", "goals", "cell_size", "margin"}
 _MAP_KEYS = GRID_KEYS | {"bounds", "walls", "format", "name"}
 _DRAWING_KEYS = {"movables"}
 _ROBOT_KEYS = {"radius", "footprint", "drive", "reach", "push_only"}
+_OBJECTS = "names with polygons or hints"
 _TRUTHS: dict[str, bool] = dict.fromkeys(("yes", "on", "true", "1"), True)
 _TRUTHS |= dict.fromkeys(("no", "off", "false", "0"), False)
 _CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
@@ -123,9 +124,9 @@ def with_hints(world: Map, path: Path) -> Map:
     is not on the map.
     """
     what = f"the side-car of {path}"
-    given = _mapping(side_car(path, _DRAWING_KEYS).get("movables", {}), f"movables in {what}")
+    given = side_car(path, _DRAWING_KEYS).get("movables", {})
     movables = dict(world.movables)
-    for key, item in given.items():
+    for key, item in keys_of(given, f"movables in {what}", _OBJECTS).items():
         name = str(key)
         if name not in movables:
             raise PalpateError(
@@ -133,7 +134,7 @@ def with_hints(world: Map, path: Path) -> Map:
                 + listed(world.movables)
             )
         said = checked_keys(item, f"movable {shown(name)} in {what}", {"hints"})
-        hints = _hints(said.get("hints"), f"hints of {shown(name)} in {what}")
+        hints = keys_of(said.get("hints") or {}, f"hints of {shown(name)} in {what}")
         movables[name] = dataclasses.replace(movables[name], hints=hints)
     return dataclasses.replace(world, movables=movables)
 
@@ -185,14 +186,21 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 def checked_keys(content: Any, what: str, known: set[str]) -> dict[str, Any]:
     """A mapping with no other keys; raises `PalpateError` otherwise."""
-    if not isinstance(content, Mapping):
-        raise PalpateError(f"{what} holds a {type(content).__name__}: expected keys and values")
+    content = keys_of(content, what)
     unknown = sorted({str(key) for key in content} - known)
     if unknown:
         raise PalpateError(
             f"{what} has the unknown key {shown(unknown[0])}; there are: "
             + ", ".join(sorted(known))
         )
+    return content
+
+
+def keys_of(content: Any, what: str, meant: str = "keys and values") -> dict[str, Any]:
+    """A mapping; raises `PalpateError` for anything else, with what is `meant`."""
+    if not isinstance(content, Mapping):
+        kind = type(content).__name__
+        raise PalpateError(f"{what}: expected {meant}, not {shown(content)} of type {kind}")
     return dict(content)
 
 
@@ -215,14 +223,14 @@ def robot_from(content: Any, what: str) -> Robot:
 def movables_from(content: Any, what: str) -> list[Movable]:
     """The objects that `content` describes; see the head of this file."""
     movables = []
-    for key, value in _mapping(content, f"movables of {what}").items():
+    for key, value in keys_of(content, f"movables of {what}", _OBJECTS).items():
         name = str(key)
         called = f"movable {shown(name)} of {what}"
         item: Any = value if isinstance(value, Mapping) else {"polygon": value}
         item = checked_keys(item, called, {"polygon", "pose", "hints"})
         if "polygon" not in item:
             raise PalpateError(f"{called} lacks its polygon: expected [[x, y], ...] in m")
-        hints = _hints(item.get("hints"), f"hints of {called}")
+        hints = keys_of(item.get("hints") or {}, f"hints of {called}")
         if "pose" in item:
             pose = checked_pose(item["pose"], f"the pose of {called}")
             movables.append(_at(name, item["polygon"], pose, hints, called))
@@ -266,22 +274,6 @@ def truth(value: Any, what: str) -> bool:
     if isinstance(value, bool | int) and value in (0, 1):
         return bool(value)
     raise PalpateError(f"{what} is {shown(value)}: expected 0, 1, true or false")
-
-
-def _mapping(content: Any, what: str) -> Mapping[Any, Any]:
-    if not isinstance(content, Mapping):
-        raise PalpateError(
-            f"{what} are of type {type(content).__name__}: expected names with polygons or hints"
-        )
-    return content
-
-
-def _hints(content: Any, what: str) -> dict[str, Any]:
-    if content is None:
-        return {}
-    if not isinstance(content, Mapping):
-        raise PalpateError(f"{what} are {shown(content)}: expected keys and values")
-    return dict(content)
 
 
 def _bounds(value: Any, what: str) -> tuple[float, float, float, float]:

@@ -14,7 +14,12 @@ import shapely
 
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import checked_pose, circumscribed_radius, shown
-from palpate.planning.movable_obstacles.maps.description import number, truth, with_hints
+from palpate.planning.movable_obstacles.maps.description import (
+    keys_of,
+    number,
+    truth,
+    with_hints,
+)
 from palpate.planning.movable_obstacles.maps.map import Map, Pose, Robot, map_of
 from palpate.planning.movable_obstacles.maps.ros import described, read_grid
 from palpate.planning.movable_obstacles.maps.svg import (
@@ -72,13 +77,14 @@ def _margin(content: dict[str, Any], what: str) -> float | None:
 
 def _agent(content: Any, drawing: Drawing | None, what: str) -> tuple[Robot, Pose]:
     """An agent, and where it stands."""
-    agent = _keys(content, f"an agent in {what}")
+    agent = keys_of(content, f"an agent in {what}")
     for key in ("id", "radius"):
         if key not in agent:
             raise PalpateError(f"{what} has an agent without {key}: expected id and radius")
-    behaviour = _keys(agent.get("behavior"), f"behavior in {what}")
+    behaviour = keys_of(agent.get("behavior") or {}, f"behavior in {what}")
+    parameters = behaviour.get("parameters") or {}
     # an older file has what the robot can do beside its radius
-    parameters = agent | _keys(behaviour.get("parameters"), f"parameters of the behavior in {what}")
+    parameters = agent | keys_of(parameters, f"parameters of the behavior in {what}")
     robot = Robot(
         number(agent["radius"], f"radius in {what}"),
         str(parameters.get("drive_type", "differential")),
@@ -101,11 +107,3 @@ def _agent(content: Any, drawing: Drawing | None, what: str) -> tuple[Robot, Pos
     x, y, *degrees = (number(value, f"initial_pose in {what}") for value in pose)
     theta = math.radians(degrees[0]) if degrees else 0.0
     return robot, checked_pose((x, y, theta), f"initial_pose in {what}")
-
-
-def _keys(content: Any, what: str) -> dict[str, Any]:
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise PalpateError(f"{what} is {shown(content)}: expected keys and values")
-    return content

@@ -19,6 +19,7 @@ from palpate.numerics.polygons import shown
 from palpate.planning.movable_obstacles.maps.description import (
     GRID_KEYS,
     described_map,
+    keys_of,
     number,
     read_yaml,
     side_car,
@@ -57,10 +58,7 @@ def read_ros(path: str | Path) -> Map:
 
 def described(path: Path) -> dict[str, Any]:
     """The keys and values of a YAML; raises `PalpateError` for a file that holds none."""
-    content = read_yaml(path)
-    if not isinstance(content, dict):
-        raise PalpateError(f"{path} is no map: expected keys and values")
-    return content
+    return keys_of(read_yaml(path), f"{path} is no map")
 
 
 def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds, float]:

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.special import logsumexp
 
 from palpate.models.planar import Planar, PlanarState, furniture
 from palpate.models.planar.shapes import centred, even_gyration, rectangle
@@ -100,6 +101,7 @@ class ObjectBelief:
         self._log_weight = np.full(shape, -math.log(PARTICLES))
         self._log_hypothesis = np.log([prior for *_, prior in HYPOTHESES])
         self.version = 0
+        self._drawn: Drawn | None = None
 
     @property
     def probabilities(self) -> np.ndarray:
@@ -125,7 +127,7 @@ class ObjectBelief:
                 given = zip(self._log_weight, fit, left, strict=True)
                 change = np.array([_change(*each) for each in given])
             weight = self._log_weight + change[:, None] * fit
-            evidence = _log_sum(weight)
+            evidence = logsumexp(weight, axis=-1)
             self._log_hypothesis = self._log_hypothesis + evidence
             self._log_weight = weight - evidence[:, None]
             self._move()
@@ -139,6 +141,13 @@ class ObjectBelief:
         prior = np.log([prior for *_, prior in HYPOTHESES])
         self._log_hypothesis = 0.5 * (np.log(self.probabilities) + prior)
         self.version += 1
+
+    def drawn(self, count: int) -> Drawn:
+        """`draws`, the same until something was learnt."""
+        known = self._drawn
+        if known is None or known.version != self.version or len(known.constraints) != count:
+            self._drawn = known = Drawn(self.draws(count), self.version)
+        return known
 
     def draws(self, count: int) -> tuple[Constraint, ...]:
         """Constraints drawn systematically from hypotheses and particles, in random order."""
@@ -213,47 +222,12 @@ class ObjectBelief:
             self._log_weight[index] = -math.log(PARTICLES)
 
 
-class SceneBelief:
-    """What is believed of every object, by outlines (points, 2), all from one shared prior."""
-
-    def __init__(self, outlines: Mapping[str, np.ndarray], seed: int = 0) -> None:
-        self.objects = {
-            name: ObjectBelief(np.asarray(outline, float), seed + 1000 * number)
-            for number, (name, outline) in enumerate(outlines.items())
-        }
-        self._drawn: dict[str, Drawn] = {}
-
-    def learn(self, name: str, poses: np.ndarray, wrenches: np.ndarray, alone: np.ndarray) -> None:
-        """Take in a contact: poses and wrenches (frames, 3) at 0.02 s, and `alone` (frames,).
-
-        m, rad, N and N m, in world axes about the body frame's origin; frames in which something
-        else may have touched the object (`alone` false) are passed over.
-        """
-        self.objects[name].learn(cut(poses, wrenches, alone))
-
-    def relax(self) -> None:
-        """See `ObjectBelief.relax`, of all objects that were touched."""
-        for one in self.objects.values():
-            if one.version:
-                one.relax()
-
-    def drawn(self, count: int) -> dict[str, Drawn]:
-        """Draws of every object, the same until something of it was learnt."""
-        for name, one in self.objects.items():
-            known = self._drawn.get(name)
-            if known is None or known.version != one.version or len(known.constraints) != count:
-                self._drawn[name] = Drawn(one.draws(count), one.version)
-        return dict(self._drawn)
-
-    def movability(self, force: float) -> dict[str, float]:
-        """See `ObjectBelief.movability`, by name."""
-        return {name: one.movability(force) for name, one in self.objects.items()}
-
-
 def cut(poses: np.ndarray, wrenches: np.ndarray, alone: np.ndarray) -> Pieces:
-    """Pieces of a contact (frames, 3), spread over those of it in which the object was alone.
+    """Pieces of a contact: poses and wrenches (frames, 3) at 0.02 s, and `alone` (frames,).
 
-    A contact too short for one piece gives none in use.
+    m, rad, N and N m, in world axes about the body frame's origin. They are spread over the frames
+    in which nothing else may have touched the object (`alone`); a contact too short for one piece
+    gives none in use.
     """
     poses = np.asarray(poses, float).reshape(-1, 3)
     wrenches = np.asarray(wrenches, float).reshape(-1, 3)
@@ -312,11 +286,6 @@ def _effective(log_weight: np.ndarray) -> float:
     """The share of particles that count."""
     weight = np.exp(log_weight - log_weight.max())
     return float(weight.sum() ** 2 / (weight**2).sum() / len(weight))
-
-
-def _log_sum(values: np.ndarray) -> np.ndarray:
-    greatest = values.max(axis=-1)
-    return greatest + np.log(np.exp(values - greatest[..., None]).sum(axis=-1))
 
 
 def _model(

@@ -6,9 +6,9 @@ for each draw of a belief: a search meets the same draws again, and a rollout ca
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -64,28 +64,28 @@ class Motion:
     energy: np.ndarray
 
 
-@runtime_checkable
-class ManipulationModel(Protocol):
+class ManipulationModel(ABC):
     """What a planner needs to know of objects' dynamics.
 
     `draws`: how many draws of the belief there are; one if it is certain. Draw k is the same world
     each time it is asked for, and objects' draws of one k belong together.
     """
 
-    draws: int
+    draws: int = 1
 
     def belief(self, name: str) -> Hashable:
         """Changes when what is believed of that object does: what was found out is then void."""
-        ...
+        return None
 
     def grasps(self, movable: Movable, spacing: float) -> Sequence[Grasp]:
         """Where it may be held, about `spacing` m apart."""
-        ...
+        return outline_grasps(movable.outline, spacing)
 
+    @abstractmethod
     def primitives(self, movable: Movable, grasp: Grasp, drive: str) -> Sequence[Primitive]:
         """What is worth trying with that grasp on a "differential" or "holonomic" base."""
-        ...
 
+    @abstractmethod
     def motion(
         self,
         movable: Movable,
@@ -96,21 +96,10 @@ class ManipulationModel(Protocol):
         draw: int,
     ) -> Motion:
         """What happens from those poses (3,) on, at the ascending `lengths` (steps,), m or rad."""
-        ...
 
 
-class RigidCarry:
+class RigidCarry(ManipulationModel):
     """The object moves with the base as one body: namosim's assumption. Energy is not known: 0."""
-
-    draws = 1
-
-    def belief(self, name: str) -> Hashable:
-        """Nothing is ever found out."""
-        return None
-
-    def grasps(self, movable: Movable, spacing: float) -> Sequence[Grasp]:
-        """See `outline_grasps`."""
-        return outline_grasps(movable.outline, spacing)
 
     def primitives(self, movable: Movable, grasp: Grasp, drive: str) -> Sequence[Primitive]:
         """All that the base can do."""
@@ -125,7 +114,6 @@ class RigidCarry:
         lengths: np.ndarray,
         draw: int,
     ) -> Motion:
-        """See `ManipulationModel.motion`."""
         robot = base_poses(robot_pose, primitive, lengths)
         return Motion(carried(object_pose, robot_pose, robot), robot, np.zeros(len(lengths)))
 

@@ -20,6 +20,7 @@ from palpate.planning.movable_obstacles.motion.manipulation import (
     LEFT,
     RIGHT,
     Grasp,
+    ManipulationModel,
     Motion,
     Primitive,
     base_poses,
@@ -50,8 +51,8 @@ class Drawn:
     version: int = 0
 
 
-class ConstrainedManipulation:
-    """A `ManipulationModel` of draws by object name; `force` in N is the most that the hand exerts.
+class ConstrainedManipulation(ManipulationModel):
+    """Draws of a belief by object name; `force` in N is the most that the hand exerts.
 
     Every object has as many draws. With one draw each it is a planner that knows, or thinks so.
     """

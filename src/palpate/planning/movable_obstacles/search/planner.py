@@ -10,8 +10,8 @@ down halfway and held elsewhere. Where the cells leave no way at all, smaller on
 """
 
 import dataclasses
+import math
 from collections.abc import Hashable, Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -41,15 +41,6 @@ _DEPTH = 2  # blockers of blockers that are cleared away
 _MOST_BLOCKING = 4  # objects in the way of one
 _HALVINGS = 2  # of cells that walls alone seem to close
 _GROWN = 2.5  # sizes of object and robot that a window reaches beyond what it holds
-
-
-@dataclass(frozen=True)
-class _Resolved:
-    """A move made, with whatever had to be moved before: `cost_m` in m as costs are counted."""
-
-    ahead: Progress
-    cost_m: float
-    probability: float
 
 
 class Planner:
@@ -152,11 +143,12 @@ class Planner:
                     graph.fail(move.action)
                     failed = True
                     break
-                cost, probability = spent.get(move.action, (0.0, 1.0))
-                cost, probability = cost + resolved.cost_m, probability * resolved.probability
+                cost, probability = _spent(ahead, resolved)
+                before = spent.get(move.action, (0.0, 1.0))
+                cost, probability = before[0] + cost, before[1] * probability
                 spent[move.action] = cost, probability
                 changed |= graph.learn(move, cost, probability)
-                ahead = resolved.ahead
+                ahead = resolved
                 if farthest is None or len(ahead.segments) > len(farthest.segments):
                     farthest = ahead
             if failed or (changed and not graph.good_enough(moves)):
@@ -170,7 +162,7 @@ class Planner:
 
     # --- below --------------------------------------------------------------------------------
 
-    def _resolve(self, ahead: Progress, move: Move, depth: int) -> _Resolved | None:
+    def _resolve(self, ahead: Progress, move: Move, depth: int) -> Progress | None:
         """Make the move, after clearing what stands in its way if it is not possible at once.
 
         What stands in its way is what the best transfer would hit if the object were the only one
@@ -178,7 +170,7 @@ class Planner:
         """
         opening = self._open(ahead, move)
         if opening is not None:
-            return _Resolved(carried_out(ahead, opening), opening.cost, opening.probability)
+            return carried_out(ahead, opening)
         if depth == 0:
             return None
         others = set(ahead.space.movables) - {move.name}
@@ -189,7 +181,7 @@ class Planner:
                 return resolved
         return None
 
-    def _cleared(self, ahead: Progress, move: Move, away: set[str], depth: int) -> _Resolved | None:
+    def _cleared(self, ahead: Progress, move: Move, away: set[str], depth: int) -> Progress | None:
         """The move, planned as if the objects `away` were not there, and these put aside first."""
         alone = Progress(ahead.space.without(away), ahead.robot)
         lone_move = dataclasses.replace(move, ignored=move.ignored - away)
@@ -203,7 +195,6 @@ class Planner:
         blocking = sorted({names[index] for index in hit} & away - move.ignored)
         if not blocking or len(blocking) > _MOST_BLOCKING:
             return None
-        probability, cost = 1.0, 0.0
         x, y = (float(value) for value in wanted.parts[0].robot_poses[0, :2])
         for index, name in enumerate(blocking):
             later = move.ignored | {move.name} | set(blocking[index + 1 :])
@@ -211,27 +202,19 @@ class Planner:
             resolved = self._resolve(ahead, aside, depth - 1)
             if resolved is None:
                 return None
-            ahead = resolved.ahead
-            probability, cost = probability * resolved.probability, cost + resolved.cost_m
+            ahead = resolved
         opening = self._open(ahead, move)
-        if opening is None:
-            return None
-        return _Resolved(
-            carried_out(ahead, opening), cost + opening.cost, probability * opening.probability
-        )
+        return None if opening is None else carried_out(ahead, opening)
 
-    def _regrasped(self, ahead: Progress, move: Move) -> _Resolved | None:
+    def _regrasped(self, ahead: Progress, move: Move) -> Progress | None:
         """The move in two carries of the same object, the cheaper the better."""
-        best: _Resolved | None = None
+        found = []
         for stop in self._stops(ahead, move):
             halfway = carried_out(ahead, stop)
             opening = self._open(halfway, move)
-            if opening is None:
-                continue
-            cost, probability = stop.cost + opening.cost, stop.probability * opening.probability
-            if best is None or cost / probability < best.cost_m / best.probability:
-                best = _Resolved(carried_out(halfway, opening), cost, probability)
-        return best
+            if opening is not None:
+                found.append(carried_out(halfway, opening))
+        return min(found, key=lambda one: np.divide(*_spent(ahead, one)), default=None)
 
     def _stops(self, ahead: Progress, move: Move) -> list[Opening]:
         """Where the object may be put down to be held elsewhere."""
@@ -283,6 +266,12 @@ class Planner:
             tuple((name, movable.pose) for name, movable in space.fixed.items()),
             (window[0].start, window[0].stop, window[1].start, window[1].stop),
         )
+
+
+def _spent(before: Progress, after: Progress) -> tuple[float, float]:
+    """What it costs to get from one to the other, m as costs are counted, and how sure that is."""
+    made = after.segments[len(before.segments) :]
+    return sum(one.cost for one in made), math.prod(one.probability for one in made)
 
 
 def window_of(space: Space, robot: np.ndarray, move: Move) -> Window:

@@ -18,7 +18,7 @@ from palpate.errors import PalpateError
 from palpate.family import check_name
 from palpate.identification.gradient import descent
 from palpate.identification.gradient.descent import Settings
-from palpate.identification.gradient.least_squares import intervals
+from palpate.identification.gradient.least_squares import Intervals, intervals
 from palpate.identification.posterior.comparison import Comparison, compare, posterior_of
 from palpate.identification.posterior.posterior import SAMPLERS, Posterior
 from palpate.identification.verdicts import verdict
@@ -33,19 +33,14 @@ INTERVAL = 0.05, 0.95  # of the draws
 
 
 @dataclasses.dataclass(frozen=True)
-class Identified:
+class Identified(Intervals):
     """What was found of a model, and how far to trust it.
 
-    `model` is the fitted one, or the most probable of the draws. `lower` and `upper` are the ends
-    of 90 % intervals by parameter, in its unit and shape; `verdict` a sentence where the data left
-    it as the prior has it. `comparison`, None of a fit, has draws and hypotheses' probabilities.
+    `model` is the fitted one, or the most probable of the draws, of which the intervals are then
+    quantiles. `comparison`, None of a fit, has draws and hypotheses' probabilities.
     """
 
     model: Model
-    lower: dict[str, np.ndarray]
-    upper: dict[str, np.ndarray]
-    verdict: dict[str, str | None]
-    warnings: tuple[str, ...]
     comparison: Comparison | None = None
 
     @property
@@ -96,7 +91,7 @@ def fitted(start: Model, aligned: Aligned, settings: Settings, run: Run | None) 
     model = descent.identify(start, aligned, settings, run)
     coordinates = FreeParameters(model)
     found = intervals(coordinates, coordinates.initial, aligned)
-    return Identified(model, **vars(found))
+    return Identified(**vars(found), model=model)
 
 
 def drawn(comparison: Comparison) -> Identified:
@@ -109,10 +104,12 @@ def drawn(comparison: Comparison) -> Identified:
     best = posterior.flat[np.argmax(posterior.draws.density)]
     rows = posterior.rows_of
     return Identified(
-        posterior.target.model(jnp.asarray(best)),
-        lower,
-        upper,
-        {path: verdict(np.array([row.undecided for row in of])) for path, of in rows.items()},
-        posterior.warnings,
-        comparison,
+        lower=lower,
+        upper=upper,
+        verdict={
+            path: verdict(np.array([row.undecided for row in of])) for path, of in rows.items()
+        },
+        warnings=posterior.warnings,
+        model=posterior.target.model(jnp.asarray(best)),
+        comparison=comparison,
     )

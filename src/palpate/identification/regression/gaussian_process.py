@@ -12,7 +12,6 @@ a short time is nearly, so that the other need not stand for it by a length beyo
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +20,7 @@ import scipy.optimize
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
-from palpate.identification.regression.locally_weighted import checked, standard
+from palpate.identification.regression.locally_weighted import Regression, checked, standard
 
 LARGEST = 2000  # data: time grows with the cube of their number
 _LENGTHS = 1.0, 8.0  # standard deviations, where the two descents begin
@@ -31,18 +30,13 @@ _SIZE, _NOISE, _SLOPE, _LENGTH = (1e-2, 10.0), (3e-3, 3.0), (1e-2, 10.0), (1e-2,
 _ITERATIONS = 100
 
 
-class GaussianProcess(eqx.Module):
+class GaussianProcess(Regression):
     """Data, what they were fitted with, and their covariance solved; made by `gaussian_process`.
 
     For each output `solved` is K^-1 y, `whitener` the inverse of K's Cholesky factor, and `linear`
     the slopes that the linear term comes to.
     """
 
-    inputs: Float[Array, "*parts data inputs"]
-    centre: Float[Array, "*parts inputs"]
-    scale: Float[Array, "*parts inputs"]
-    target_centre: Float[Array, "*parts outputs"]
-    target_scale: Float[Array, "*parts outputs"]
     length: Float[Array, "*parts outputs inputs"]
     size: Float[Array, "*parts outputs"]
     noise: Float[Array, "*parts outputs"]
@@ -57,7 +51,7 @@ class GaussianProcess(eqx.Module):
         """The posterior's mean. A Gaussian process has no use for conditions."""
         asked = self._asked(inputs)
         mean = jnp.einsum("oqn,on->qo", self._near(asked), self.solved) + asked @ self.linear.T
-        return (mean * self.target_scale + self.target_centre).reshape(*inputs.shape[:-1], -1)
+        return self._answered(mean, inputs)
 
     def variance(self, inputs: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         """The posterior's variance of a new observation, noise included, in the target's unit^2."""
@@ -67,9 +61,6 @@ class GaussianProcess(eqx.Module):
         before = self.size[:, None] ** 2 + self.slope[:, None] ** 2 * jnp.sum(asked**2, axis=1)
         left = jnp.maximum(before - jnp.sum(whitened**2, axis=2), 0.0) + self.noise[:, None] ** 2
         return (left.T * self.target_scale**2).reshape(*inputs.shape[:-1], -1)
-
-    def _asked(self, inputs: Array) -> Array:
-        return ((inputs - self.centre) / self.scale).reshape(-1, inputs.shape[-1])
 
     def _near(self, asked: Array) -> Array:
         """The squared exponential of every query and every datum, for each output."""

@@ -33,21 +33,33 @@ _ROUNDING = 1e-5  # of the sum of weights
 _CONSTANT = 1e-6  # of the largest value: an input that varies by less says nothing
 
 
-class LocallyWeighted(eqx.Module):
-    """Data and how far each speaks for its neighbours; made by `locally_weighted`.
-
-    `inputs` and `targets` are standardised by `centre`, `scale`, `target_centre`, `target_scale`.
-    Places without a datum have `weight` 0; a condition of no bits is the plain regression.
-    """
+class Regression(eqx.Module):
+    """Inputs in standard deviations of the data, and how questions and answers are scaled."""
 
     inputs: Float[Array, "*parts data inputs"]
-    targets: Float[Array, "*parts data outputs"]
-    condition: Bool[Array, "*parts data bits"]
-    weight: Float[Array, "*parts data"]
     centre: Float[Array, "*parts inputs"]
     scale: Float[Array, "*parts inputs"]
     target_centre: Float[Array, "*parts outputs"]
     target_scale: Float[Array, "*parts outputs"]
+
+    def _asked(self, inputs: Float[Array, "*batch inputs"]) -> Float[Array, "queries inputs"]:
+        return ((inputs - self.centre) / self.scale).reshape(-1, inputs.shape[-1])
+
+    def _answered(self, outputs: Array, inputs: Array) -> Float[Array, "*batch outputs"]:
+        scaled = outputs * self.target_scale + self.target_centre
+        return scaled.reshape(*inputs.shape[:-1], -1)
+
+
+class LocallyWeighted(Regression):
+    """Data and how far each speaks for its neighbours; made by `locally_weighted`.
+
+    `targets` are standardised too. Places without a datum have `weight` 0; a condition of no bits
+    is the plain regression.
+    """
+
+    targets: Float[Array, "*parts data outputs"]
+    condition: Bool[Array, "*parts data bits"]
+    weight: Float[Array, "*parts data"]
     bandwidth: Float[Array, "*parts"]
     ridge: Float[Array, "*parts"]
 
@@ -55,13 +67,12 @@ class LocallyWeighted(eqx.Module):
         self, inputs: Float[Array, "*batch inputs"], condition: Bool[Array, "*batch bits"]
     ) -> Float[Array, "*batch outputs"]:
         """The prediction at each of many inputs, of the regression of their condition."""
-        batch = inputs.shape[:-1]
-        asked = ((inputs - self.centre) / self.scale).reshape(-1, inputs.shape[-1])
+        asked = self._asked(inputs)
         weight = self._eligible(condition.reshape(len(asked), self.condition.shape[-1]))
         weight = _kernel(_squares(asked, self.inputs), weight, self.bandwidth)
         moments = weight @ _products(self.inputs, self.targets)
         predicted = _solved(moments, asked, self.ridge, self.targets.shape[-1])
-        return (predicted * self.target_scale + self.target_centre).reshape(*batch, -1)
+        return self._answered(predicted, inputs)
 
     def _eligible(self, condition: Bool[Array, "queries bits"]) -> Float[Array, "queries data"]:
         """The data of the query's condition, all data where there is none."""
@@ -92,21 +103,17 @@ def locally_weighted(
     if room < count:
         raise PalpateError(f"there are {count} data, more than the capacity of {room}: enlarge it")
     dtype = jnp.zeros(()).dtype
-    fields = []
-    for values in (inputs, targets):
-        centre, scale = standard(values)
-        fields += [_padded((values - centre) / scale, room), centre, scale]
+    (centre, scale), (target_centre, target_scale) = standard(inputs), standard(targets)
+    arrays = {
+        "inputs": _padded((inputs - centre) / scale, room),
+        "targets": _padded((targets - target_centre) / target_scale, room),
+        "weight": _padded(np.ones(count), room),
+        **{"centre": centre, "scale": scale, "bandwidth": 1.0, "ridge": 1.0},
+        **{"target_centre": target_centre, "target_scale": target_scale},
+    }
     regression = LocallyWeighted(
-        inputs=jnp.asarray(fields[0], dtype),
-        targets=jnp.asarray(fields[3], dtype),
         condition=jnp.asarray(_padded(condition, room)),
-        weight=jnp.asarray(_padded(np.ones(count), room), dtype),
-        centre=jnp.asarray(fields[1], dtype),
-        scale=jnp.asarray(fields[2], dtype),
-        target_centre=jnp.asarray(fields[4], dtype),
-        target_scale=jnp.asarray(fields[5], dtype),
-        bandwidth=jnp.ones((), dtype),
-        ridge=jnp.ones((), dtype),
+        **{name: jnp.asarray(values, dtype) for name, values in arrays.items()},
     )
     if count == 1:
         return regression  # which has nothing to be chosen by: it predicts the one datum

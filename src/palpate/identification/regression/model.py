@@ -4,7 +4,7 @@ With it everything that takes a `Model` takes a regression too: `rollout` predic
 iterating it, `prediction_error` says how well, and planners plan through it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +15,10 @@ import numpy as np
 from jaxtyping import Array
 
 from palpate.errors import PalpateError
-from palpate.identification.regression.gaussian_process import GaussianProcess, gaussian_process
-from palpate.identification.regression.locally_weighted import LocallyWeighted, locally_weighted
+from palpate.identification.regression.gaussian_process import gaussian_process
+from palpate.identification.regression.locally_weighted import Regression, locally_weighted
 from palpate.models.model import Model, Wrapper
 from palpate.parameters import Parameter
-
-Regression = LocallyWeighted | GaussianProcess
 
 KINDS = ("lwr", "oo-lwr", "gp")
 
@@ -93,16 +91,11 @@ def regressed(
     inputs, changes, conditions = jax.tree.map(
         np.asarray, _data(features, states, actions, following)
     )
-    parts: Sequence[Regression]
-    if kind == "gp":
-        parts = [
-            gaussian_process(inputs[:, part], changes[:, part]) for part in range(inputs.shape[1])
-        ]
-    else:
-        parts = [
-            locally_weighted(inputs[:, part], changes[:, part], conditions[:, part], capacity)
-            for part in range(inputs.shape[1])
-        ]
+    parts: list[Regression] = []
+    for part in range(inputs.shape[1]):
+        x, y = inputs[:, part], changes[:, part]
+        own = conditions[:, part], capacity
+        parts.append(gaussian_process(x, y) if kind == "gp" else locally_weighted(x, y, *own))
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
     return RegressedModel(
         inner=prototype,

@@ -58,19 +58,22 @@ def parameters(rows: Sequence[Parameter]) -> Chart | None:
     most = max(dot.value for dot in dots) * _REACH
     intervals = [dot for dot in dots if dot.kind in (_SURE, _UNINFORMED)]
     shown = [(max(dot.lower, least), min(dot.upper, most)) for dot in intervals]
-    data = [_whiskers([(dot.y, *ends) for dot, ends in zip(intervals, shown, strict=True)])]
+    whiskers = {
+        "x": [x for ends in shown for x in (*ends, None)],
+        "y": [y for dot in intervals for y in (-dot.y, -dot.y, None)],
+        "line": {"color": _COLOUR, "width": 2},
+        "hoverinfo": "skip",
+    }
+    data = [{"type": "scatter", "mode": "lines", "showlegend": False} | whiskers]
     for kind, symbol in _SYMBOLS.items():
-        chosen = [(dot.value, dot.y, dot.size, dot.text) for dot in dots if dot.kind == kind]
-        if chosen:
-            data.append(_markers(kind, symbol, chosen, legend=True))
+        data += _markers(kind, symbol, [dot for dot in dots if dot.kind == kind], legend=True)
     for side, symbol in enumerate(_ARROWS):
         beyond = [
-            (ends[side], dot.y, dot.size, "the interval goes on")
+            dot._replace(value=ends[side], text="the interval goes on")
             for dot, ends in zip(intervals, shown, strict=True)
             if ends[side] != (dot.lower, dot.upper)[side]
         ]
-        if beyond:
-            data.append(_markers("beyond", symbol, beyond, legend=False))
+        data += _markers("beyond", symbol, beyond, legend=False)
     limits = [0.8, 1.25, *(dot.value for dot in dots), *(end for ends in shown for end in ends)]
     return {"data": data, "layout": _layout(drawn, ticks, top, min(limits), max(limits))}
 
@@ -113,39 +116,28 @@ def _dots(row: Parameter, top: float, pitch: float) -> Iterator[_Dot]:
         )
 
 
-def _whiskers(intervals: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "x": [x for _, lower, upper in intervals for x in (lower, upper, None)],
-        "y": [y for top, _, _ in intervals for y in (-top, -top, None)],
-        "line": {"color": _COLOUR, "width": 2},
-        "hoverinfo": "skip",
-        "showlegend": False,
+def _markers(name: str, symbol: str, dots: Sequence[_Dot], legend: bool) -> list[dict[str, Any]]:
+    """A trace of markers at the dots; none without dots."""
+    marker = {
+        "symbol": symbol,
+        "size": [dot.size for dot in dots],
+        "opacity": 1,
+        "color": _COLOUR,
+        "line": {"color": _COLOUR, "width": 1.5},
     }
-
-
-def _markers(
-    name: str, symbol: str, dots: Sequence[tuple[float, float, float, str]], legend: bool
-) -> dict[str, Any]:
-    return {
+    trace = {
         "type": "scatter",
         "mode": "markers",
         "name": name,
-        "x": [x for x, _, _, _ in dots],
-        "y": [-y for _, y, _, _ in dots],
-        "text": [text for _, _, _, text in dots],
-        "marker": {
-            "symbol": symbol,
-            "size": [size for _, _, size, _ in dots],
-            "opacity": 1,
-            "color": _COLOUR,
-            "line": {"color": _COLOUR, "width": 1.5},
-        },
+        "x": [dot.value for dot in dots],
+        "y": [-dot.y for dot in dots],
+        "text": [dot.text for dot in dots],
+        "marker": marker,
         "hovertemplate": "%{text}<extra></extra>",
         "showlegend": legend,
         "cliponaxis": False,
     }
+    return [trace] if dots else []
 
 
 def _layout(

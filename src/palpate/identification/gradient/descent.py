@@ -17,6 +17,7 @@ import optax
 from jaxtyping import Array
 
 from palpate.errors import PalpateError
+from palpate.family import check_name
 from palpate.identification.data.prediction import observation_scale
 from palpate.identification.data.segments import Segments, SegmentSource
 from palpate.identification.gradient.least_squares import KNEE, Free, Objective
@@ -201,11 +202,9 @@ def identify(
     check_shapes(model, aligned)
     coordinates = FreeParameters(model)
     source = SegmentSource.of(aligned, model)
-    if settings.method not in METHODS:
-        raise PalpateError(f"unknown method '{settings.method}'; there are: {', '.join(METHODS)}")
     scale = observation_scale(aligned, model)
     objective = Objective(coordinates, scale, KNEE, settings.prior_weight)
-    method = METHODS[settings.method](objective, settings)
+    method = METHODS[check_name("method", settings.method, METHODS)](objective, settings)
     tiles = source.tiles(_horizon(source, settings.horizons[-1]))
     offset = jnp.zeros((len(tiles), 2, *model.observation_shape))
     free = coordinates.initial

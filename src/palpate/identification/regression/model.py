@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from palpate.errors import PalpateError
+from palpate.family import check_name
 from palpate.identification.regression.gaussian_process import gaussian_process
 from palpate.identification.regression.locally_weighted import Regression, locally_weighted
 from palpate.models.model import Model, Wrapper
@@ -80,8 +81,7 @@ def regressed(
     Raises:
         PalpateError: an unknown kind, "oo-lwr" without conditions, or as the regression.
     """
-    if kind not in KINDS:
-        raise PalpateError(f"unknown regression '{kind}'; there are: {', '.join(KINDS)}")
+    check_name("regression", kind, KINDS)
     if kind == "oo-lwr" and features.condition is None:
         raise PalpateError(
             "the object-oriented regression needs features with a condition: give one, or fit 'lwr'"

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
+from palpate.family import check_name
 from palpate.models.model import Model
 from palpate.parameters import LogNormal, Normal, Parameter, axes_of, parameter
 
@@ -122,10 +123,7 @@ class RopeParameters(Model):
                 f"rest_bend of a rope of {nodes} nodes must have the shape ({nodes - 2}, 3), "
                 f"got {self.rest_bend.shape}"
             )
-        if self.drive not in ("position", "velocity", "acceleration"):
-            raise PalpateError(
-                f"unknown drive '{self.drive}'; there are: position, velocity, acceleration"
-            )
+        check_name("drive", self.drive, ("position", "velocity", "acceleration"))
         if not self.driven or any(not 0 <= node < nodes for node in self.driven):
             raise PalpateError(
                 f"driven nodes must lie in 0 to {nodes - 1} and be at least one, got {self.driven}"

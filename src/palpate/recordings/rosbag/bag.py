@@ -62,16 +62,19 @@ def _trials(path: Path, bag: Bag, chosen: Chosen) -> list[tuple[str, MarkerTable
             (COMMAND, Role.COMMAND, chosen.command),
         ):
             if track is not None:
-                # An order given before the piece began is in force when it does.
-                earlier = times[track][times[track] <= begin]
-                since = max(earlier) if role is Role.COMMAND and len(earlier) else begin
-                rows = _within(times[track], since, end)
+                time, since = times[track], begin
+                if (
+                    role is Role.COMMAND
+                ):  # one given before the piece began is in force when it does
+                    since = max(time[time <= begin], default=begin)
+                rows = (time >= since) & (time <= end)
                 values = np.stack([sight.points for sight in track.sights])[rows]
-                inputs.append(InputTable(name, role, times[track][rows], values))
-        rows = _within(times[chosen.markers], begin, end)
+                inputs.append(InputTable(name, role, time[rows], values))
+        time = times[chosen.markers]
+        rows = (time >= begin) & (time <= end)
         table = MarkerTable(
             f"{bag.format}, topic {chosen.markers.topic}",
-            times[chosen.markers][rows],
+            time[rows],
             chosen.positions[rows],
             chosen.names,
             notes=tuple(notes) if number == 0 else (),
@@ -79,10 +82,6 @@ def _trials(path: Path, bag: Bag, chosen: Chosen) -> list[tuple[str, MarkerTable
         )
         trials.append((path.stem if len(long) == 1 else f"{path.stem}/{number}", table))
     return trials
-
-
-def _within(time: np.ndarray, begin: float, end: float) -> np.ndarray:
-    return (time >= begin) & (time <= end)
 
 
 def _times(chosen: Chosen) -> tuple[dict[Track, np.ndarray], list[str]]:

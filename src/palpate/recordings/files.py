@@ -77,7 +77,15 @@ def read_recording(
             recording = found
         else:
             recording = recording_of(found, str(path), rate, unit, up)
-        _check_rate(recording, rate)
+        # Stamps of an observation may contradict the rate by no more than a tenth.
+        for trial in recording.trials:
+            for channel in trial.channels.values():
+                own = 1 / channel.nominal_period
+                if rate and channel.role is Role.OBSERVATION and abs(rate / own - 1) > 0.1:
+                    raise PalpateError(
+                        f"'{channel.name}' of trial '{trial.name}' has stamps at {own:.4g} Hz, "
+                        f"not at {rate:.4g} Hz: leave the rate out"
+                    )
     except PalpateError as error:
         raise type(error)(f"{path}: {error}") from error
     except OSError as error:
@@ -144,16 +152,3 @@ def _foreign(
         )
         for i, trial in enumerate(positions)
     ]
-
-
-def _check_rate(recording: Recording, rate: float | None) -> None:
-    """Refuse a rate that the stamps of an observation contradict by more than a tenth."""
-    if rate is None:
-        return
-    for trial in recording.trials:
-        for channel in trial.channels.values():
-            if channel.role is Role.OBSERVATION and abs(channel.nominal_period * rate - 1) > 0.1:
-                raise PalpateError(
-                    f"'{channel.name}' of trial '{trial.name}' has stamps at "
-                    f"{1 / channel.nominal_period:.4g} Hz, not at {rate:.4g} Hz: leave the rate out"
-                )

@@ -72,8 +72,29 @@ def recording_of(
 
 
 def _trial(name: str, table: MarkerTable, rate: float | None, unit: str, up: str) -> Trial:
+    positions, notes = table.positions, list(table.notes)
     try:
-        channels = [_markers(table, rate, unit, up)]
+        if np.isinf(positions).any():
+            frame, marker, _ = (int(i) for i in np.argwhere(np.isinf(positions))[0])
+            raise PalpateError(
+                f"marker {marker} is infinite in frame {frame}: what was not seen has to be NaN"
+            )
+        seen = ~np.isnan(positions).any(axis=-1)
+        rows = np.flatnonzero(seen.any(axis=-1))
+        if not len(rows):
+            raise PalpateError("no marker is seen in any frame")
+        # Padding of a short trial, or a capture that ran before and after the markers were there.
+        kept = slice(rows[0], rows[-1] + 1)
+        if cut := len(positions) - (kept.stop - kept.start):
+            notes.append(f"{cut} frames at the ends in which nothing was seen were left out")
+        if never := [str(i) for i in np.flatnonzero(~seen.any(axis=0))]:
+            notes.append(f"never seen: marker {', '.join(never)}")
+        time = np.arange(len(positions)) / (rate or 1.0) if table.time is None else table.time
+        metres = _in_metres(positions[kept], unit, up)
+        if positions.dtype.kind == "f" and positions.dtype.itemsize <= 4:
+            metres = metres.astype(np.float32)
+        role = Role.OBSERVATION
+        channels = [Channel("markers", role, time[kept], metres, "m", notes=tuple(notes))]
         for part in table.inputs:
             si = "m/s" if part.role is Role.COMMAND else "m"
             values = _in_metres(part.values, unit, up)
@@ -81,31 +102,6 @@ def _trial(name: str, table: MarkerTable, rate: float | None, unit: str, up: str
     except PalpateError as error:
         raise PalpateError(f"trial '{name}': {error}") from error
     return Trial(name, {channel.name: channel for channel in channels})
-
-
-def _markers(table: MarkerTable, rate: float | None, unit: str, up: str) -> Channel:
-    positions = table.positions
-    if np.isinf(positions).any():
-        frame, marker, _ = (int(i) for i in np.argwhere(np.isinf(positions))[0])
-        raise PalpateError(
-            f"marker {marker} is infinite in frame {frame}: what was not seen has to be NaN"
-        )
-    seen = ~np.isnan(positions).any(axis=-1)
-    rows = np.flatnonzero(seen.any(axis=-1))
-    if not len(rows):
-        raise PalpateError("no marker is seen in any frame")
-    notes = list(table.notes)
-    # Padding of a short trial, or a capture that ran before and after the markers were there.
-    kept = slice(rows[0], rows[-1] + 1)
-    if cut := len(positions) - (kept.stop - kept.start):
-        notes.append(f"{cut} frames at the ends in which nothing was seen were left out")
-    if never := [str(i) for i in np.flatnonzero(~seen.any(axis=0))]:
-        notes.append(f"never seen: marker {', '.join(never)}")
-    time = np.arange(len(positions)) / (rate or 1.0) if table.time is None else table.time
-    metres = _in_metres(positions[kept], unit, up)
-    if positions.dtype.kind == "f" and positions.dtype.itemsize <= 4:
-        metres = metres.astype(np.float32)
-    return Channel("markers", Role.OBSERVATION, time[kept], metres, "m", notes=tuple(notes))
 
 
 def _in_metres(values: np.ndarray, unit: str, up: str) -> np.ndarray:

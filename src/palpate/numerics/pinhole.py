@@ -8,8 +8,6 @@ principal point c in pixels, a point (x, y, z) of that frame appears at
 where the centre of the upper left pixel is (0, 0). Pictures have to be without lens distortion.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,7 +60,7 @@ class Pinhole:
         width: int,
         height: int,
         field_of_view: float,
-    ) -> Pinhole:
+    ) -> "Pinhole":
         """A camera at `position` (m) with `target` in the middle of an upright picture.
 
         `field_of_view` is the horizontal one in radians. Raises `PalpateError` when the camera

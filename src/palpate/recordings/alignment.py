@@ -3,8 +3,6 @@
 Algorithms do not work on channels but on `Aligned`, which `Recording.align` makes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

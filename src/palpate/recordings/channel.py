@@ -5,8 +5,6 @@ where it can be, and is written down in `notes`. What may not happen (NaN in an 
 value, a time that is not a number) is refused.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ One file is one trial. A reader finds the columns and the unit that the file dec
 marker's metres are and which way is up is settled in `palpate.recordings.tables`.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re

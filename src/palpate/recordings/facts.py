@@ -3,8 +3,6 @@
 Facts are kept as JSON, checked whenever one is made, and equal when their contents are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

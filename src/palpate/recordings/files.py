@@ -4,8 +4,6 @@ Files come from anywhere, so nothing in them is believed: nothing is unpickled, 
 before memory is taken, and what is damaged or does not fit is refused with one sentence.
 """
 
-from __future__ import annotations
-
 import math
 import zipfile
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ The layout is that of `LeRobotDataset` with `codebase_version` "v3.0" (huggingfa
 episodes and tasks as tables that point into them, and statistics for normalisation.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -6,8 +6,6 @@ lost marker is reported where it was last seen. `repair_markers` undoes the firs
 others into "not seen"; it changes nothing that fast motion or dropped frames could explain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Our own recordings on disk: an NPZ file of plain arrays and one JSON text."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -6,8 +6,6 @@ trials and says where they came from. What was put right on the way is written d
 `Recording.notes`. Algorithms work on what `Recording.align` makes of it.
 """
 
-from __future__ import annotations
-
 import math
 import numbers
 from collections.abc import Mapping, Sequence
@@ -52,12 +50,12 @@ class Recording:
             for note in channel.notes
         )
 
-    def select(self, indices: Sequence[int]) -> Recording:
+    def select(self, indices: Sequence[int]) -> "Recording":
         """The trials at `indices`, in that order; negative ones count from the end."""
         chosen = resolve_indices(indices, len(self.trials), "trial")
         return replace(self, trials=tuple(self.trials[i] for i in chosen))
 
-    def split(self, fraction: float, seed: int) -> tuple[Recording, Recording]:
+    def split(self, fraction: float, seed: int) -> "tuple[Recording, Recording]":
         """(train, validation) by trial: `fraction` of the trials, drawn by `seed`, validate.
 
         At least one trial stands on each side; the order of the trials is kept.

@@ -1,7 +1,5 @@
 """Recordings as files of the Rerun viewer, to be looked at in space and time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

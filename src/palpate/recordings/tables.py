@@ -1,7 +1,5 @@
 """Tables of markers, as foreign files hold them, as recordings in metres and z up."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

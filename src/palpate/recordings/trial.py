@@ -1,7 +1,5 @@
 """One uninterrupted run: its channels, its events and what does not change meanwhile."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

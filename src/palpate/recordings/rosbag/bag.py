@@ -3,8 +3,6 @@
 Reads MCAP files, rosbag2 folders and databases, and ROS 1 bags. No ROS has to be installed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -5,8 +5,6 @@ and runs it. A definition out of a foreign file is therefore checked here before
 identifiers and small numbers gets into that code.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from typing import Any

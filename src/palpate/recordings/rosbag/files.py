@@ -4,8 +4,6 @@ The containers are read by the `mcap` and `rosbags` libraries, of the extra `io`
 what they unpack to is checked before memory is taken.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field

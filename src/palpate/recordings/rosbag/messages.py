@@ -4,8 +4,6 @@ A message is a tree: objects with named fields (ROS) or dictionaries (JSON). It 
 shape and not by the name of its type, so that message types of one laboratory are read too.
 """
 
-from __future__ import annotations
-
 import base64
 import enum
 from dataclasses import dataclass

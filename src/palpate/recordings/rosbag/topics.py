@@ -1,7 +1,5 @@
 """Which topics of a robot's log are the markers, the gripper and its command."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -11,8 +11,6 @@ The folder holds
     depth/NAME.png  16 bits, millimetres along the optical axis, 0 where unknown; optional
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from pathlib import Path

@@ -5,8 +5,6 @@ of the exposure; their mean is the picture, so edges are soft and what moves is 
 not move is cast once; then only pixels near something that moves.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Gripper motions that make an object show its physics, and recordings of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

@@ -4,8 +4,6 @@ Nothing is learned from pictures: the rope's colour is given. A rope is about as
 its pixels are mixtures with what lies behind; hence a share of each pixel and not a yes or no.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

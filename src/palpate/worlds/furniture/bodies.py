@@ -1,7 +1,5 @@
 """Reads off a running furniture scene where the pieces are and what they weigh."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

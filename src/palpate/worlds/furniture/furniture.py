@@ -5,8 +5,6 @@ and viscous friction, slide by Coulomb's law, hang on hinges, and collide with w
 other. See `pieces` for the kinds and `scene` for how they are built.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

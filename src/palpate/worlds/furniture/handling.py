@@ -1,7 +1,5 @@
 """How somebody handles furniture to learn what it does, and recordings of it."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

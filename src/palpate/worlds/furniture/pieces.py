@@ -7,8 +7,6 @@ please a method. Lengths are taken from ordinary furniture; masses, loads, rolli
 A body frame has its origin at the centroid of the outline, on the floor, x forward, z up.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ grasp is a weld, made where the gripper touches an outline. What is sensed: enco
 and a force-torque sensor in the wrist.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ turns about a vertical hinge with the wheel trailing behind, and a locked caster
 What collides with what besides: the bands of the pieces, walls and the robot, with each other.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Which body a robot's force sensors have felt, from where things were seen to be."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

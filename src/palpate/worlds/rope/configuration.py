@@ -1,7 +1,5 @@
 """The constants of a rope world, and ropes drawn around them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

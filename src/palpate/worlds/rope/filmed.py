@@ -1,7 +1,5 @@
 """The MuJoCo rope as a camera sees it: no markers, but pictures before a cluttered background."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

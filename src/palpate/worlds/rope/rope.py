@@ -6,8 +6,6 @@ hangs in the gripper, a body on three slides. Nothing collides: neither with the
 only drawn, nor the rope with itself.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

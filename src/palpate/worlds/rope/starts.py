@@ -1,7 +1,5 @@
 """How a rope lies when an episode begins: curves, and the shaking it is released from."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

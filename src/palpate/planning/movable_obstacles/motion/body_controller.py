@@ -6,8 +6,6 @@ the base v_b. Here the arm returns to its nominal posture while the base follows
 base's limited acceleration does not allow at once. Pure kinematics, no state.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -11,7 +11,7 @@ from namo_rooms import IN_DOOR, two_rooms, write_map
 from palpate.commands.plan import run
 from palpate.errors import PalpateError
 from palpate.families.furniture import planning
-from palpate.families.furniture.plan_options import PlanNamo
+from palpate.families.furniture.options import PlanNamo
 from palpate.families.furniture.planning import ANIMATION, PICTURE
 from palpate.planning.movable_obstacles.search.plan import read_plan
 from palpate.planning.movable_obstacles.search.verification import faults_of

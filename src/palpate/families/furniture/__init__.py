@@ -11,7 +11,7 @@ FAMILY = Family(
     options={
         "record": {"furniture": f"{_OPTIONS}:RecordFurniture"},
         "identify": {"furniture": f"{_OPTIONS}:IdentifyFurniture"},
-        "plan": {"namo": "palpate.families.furniture.plan_options:PlanNamo"},
+        "plan": {"namo": f"{_OPTIONS}:PlanNamo"},
     },
     experiments={
         "namo-scenarios": f"{_EXPERIMENTS}.namo_scenarios:reproduce",

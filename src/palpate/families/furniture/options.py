@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from palpate.errors import PalpateError
-from palpate.families.options import Hypotheses, Identify, Method, Record
+from palpate.families.options import Hypotheses, Identify, Method, Names, Plan, Problem, Record
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -139,3 +140,34 @@ class IdentifyFurniture(Identify):
         assert isinstance(models, Planar)  # by `hypotheses`
         assert isinstance(prior, Planar)
         return wheel_rows(models, prior, viscous=self.law == "viscous")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanNamo(Plan):
+    """Plan a robot's way on a map, moving what can be moved where it has to.
+
+    The map is a namosim .svg, a ROS map_server .yaml with a .movables.json beside it that says
+    what robot there is and what can be moved, or a .json of our own. Written are the plan as JSON,
+    a picture and an animation of it.
+
+    1. To the map's own goal:              palpate plan namo rooms.svg
+    2. To another one, with a box fixed:   palpate plan namo rooms.svg --goal 3 2 0 --immovable box
+    """
+
+    problem: ClassVar[str] = "namo"
+
+    map: Annotated[Positional[Path], arg(metavar="MAP")]
+    """A .svg, .yaml or .json file."""
+    goal: Annotated[
+        tuple[float, float, float] | None,
+        arg(metavar="X Y THETA", help_behavior_hint="(default: the map's first)"),
+    ] = None
+    """x and y in m and theta in rad."""
+    immovable: Names = ()
+    """Objects that are to stay where they are."""
+
+    def read(self) -> Problem:
+        """See `palpate.families.furniture.planning.read`."""
+        from palpate.families.furniture.planning import read
+
+        return read(self.map, self.goal, self.immovable, self.seed)

@@ -211,11 +211,10 @@ class Map:
     @property
     def finer(self) -> "Map | None":
         """The same in cells of half the size; None where there would be too many or too small."""
-        left, bottom, right, top = self.bounds
-        cells = (right - left) * (top - bottom) / (self.cell_size / 2) ** 2
-        if cells > MOST_CELLS or self.cell_size / 2 < LEAST_CELL:
+        try:
+            return dataclasses.replace(self, cell_size=self.cell_size / 2)
+        except PalpateError:
             return None
-        return dataclasses.replace(self, cell_size=self.cell_size / 2)
 
     def check(self, goal: Pose | None = None) -> Pose:
         """The goal pose to plan to, after a look at whether it and the start are possible at all.

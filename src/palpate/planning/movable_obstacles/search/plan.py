@@ -16,7 +16,6 @@ from palpate.runs.storage import read_json, write_json
 
 TRANSIT, TRANSFER = "transit", "transfer"
 FORMAT = "palpate plan among movable obstacles 1"
-_TOLERANCE = 1e-5  # m: of clearances that are compared
 
 
 @dataclass(frozen=True)
@@ -157,23 +156,21 @@ def read_plan(path: str | Path) -> Plan:
             raise PalpateError(f"{path} has the format {document['format']!r}: expected {FORMAT!r}")
         segments = []
         for item in document["segments"]:
-            segment = Segment(item["kind"], _poses(item["poses"]), float(item["cost_m"]))
-            if segment.kind == TRANSFER:
-                x, y = (float(value) for value in item["grasp"]["point"])
-                segment = Segment(
-                    segment.kind,
-                    segment.poses,
-                    segment.cost,
-                    str(item["object"]),
-                    Grasp((x, y), float(item["grasp"]["normal"])),
-                    _poses(item["object_poses"]),
-                    tuple(map(str, item["primitives"])),
-                    float(item["probability"]),
-                    float(item["energy_J"]),
-                )
-            elif segment.kind != TRANSIT:
-                raise ValueError(f"a segment is a transit or a transfer, not {segment.kind!r}")
-            segments.append(segment)
+            if item["kind"] not in (TRANSIT, TRANSFER):
+                raise ValueError(f"a segment is a transit or a transfer, not {item['kind']!r}")
+            held: dict[str, Any] = {}
+            if item["kind"] == TRANSFER:
+                x, y = map(float, item["grasp"]["point"])
+                held = {
+                    "name": str(item["object"]),
+                    "grasp": Grasp((x, y), float(item["grasp"]["normal"])),
+                    "object_poses": _poses(item["object_poses"]),
+                    "primitives": tuple(map(str, item["primitives"])),
+                    "probability": float(item["probability"]),
+                    "energy": float(item["energy_J"]),
+                }
+            poses, cost = _poses(item["poses"]), float(item["cost_m"])
+            segments.append(Segment(item["kind"], poses, cost, **held))
         return Plan(
             str(document["map"]),
             as_pose(document["goal"]),

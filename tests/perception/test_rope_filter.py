@@ -8,7 +8,7 @@ import numpy as np
 
 from palpate.models.rope import Rope
 from palpate.perception.rope import filter as rope_filter
-from palpate.perception.rope.filter import RopeBelief, Sighting, View, advance, correct
+from palpate.perception.rope.filter import RopeBelief, Sighting, advance, correct, project
 from palpate.worlds.rope.filmed import TRIPOD
 
 GRIPPER = np.array([0.0, 0.0, 1.5], np.float32)
@@ -54,7 +54,7 @@ def sighting(nodes: np.ndarray, age: float = 0.0) -> Sighting:
 
 def test_the_view_is_the_pinhole_s():
     points = np.random.default_rng(0).uniform((-0.5, -0.5, 0.5), (0.5, 0.5, 1.5), (20, 3))
-    pixels, depth = View.of(TRIPOD).project(jnp.asarray(points, jnp.float32))
+    pixels, depth = project(TRIPOD, jnp.asarray(points, jnp.float32))
     expected = TRIPOD.project(points)
     assert np.allclose(pixels, expected[0], atol=1e-3)
     assert np.allclose(depth, expected[1], atol=1e-5)
@@ -96,7 +96,7 @@ def test_a_sighting_corrects_towards_what_is_seen_and_makes_certain():
     prior = belief()
     nodes = np.asarray(prior.state().position)
     moved = nodes + np.linspace(0, 0.06, 11)[:, None] * [np.cos(np.pi / 6), 0.5, 0.5]
-    after, fit = jitted[1](MODEL, View.of(TRIPOD), prior, sighting(moved))
+    after, fit = jitted[1](MODEL, TRIPOD, prior, sighting(moved))
     error = np.linalg.norm(np.asarray(after.state().position) - moved, axis=-1)
     assert int(fit.explained.sum()) > 90
     assert error.max() < 0.012
@@ -112,12 +112,12 @@ def test_a_frame_of_earlier_is_seen_where_the_rope_was():
     prior = RopeBelief(jnp.asarray(mean), 1e-2 * prior.covariance, prior.gripper, jnp.zeros(3))
     earlier = np.asarray(prior.state().position).copy()
     earlier[1:] -= 0.005 * speed
-    after, _ = jitted[1](MODEL, View.of(TRIPOD), prior, sighting(earlier, age=0.005))
+    after, _ = jitted[1](MODEL, TRIPOD, prior, sighting(earlier, age=0.005))
     assert np.allclose(after.mean[:30], prior.mean[:30], atol=1e-3)
 
 
 def test_points_far_from_the_rope_are_not_believed():
     prior = belief(0.005)
     nodes = np.asarray(prior.state().position)
-    _, fit = jitted[1](MODEL, View.of(TRIPOD), prior, sighting(nodes + np.array([0.0, 0.4, 0.0])))
+    _, fit = jitted[1](MODEL, TRIPOD, prior, sighting(nodes + np.array([0.0, 0.4, 0.0])))
     assert int(fit.explained.sum()) < 0.1 * 100

@@ -87,25 +87,13 @@ class Fit(eqx.Module):
     surprise: Float[Array, ""]
 
 
-class View(eqx.Module):
-    """A pinhole camera as arrays; see `Pinhole`."""
-
-    focal: Float[Array, "2"]
-    centre: Float[Array, "2"]
-    position: Float[Array, "3"]
-    world_from_camera: Float[Array, "3 3"]
-
-    @classmethod
-    def of(cls, pinhole: Pinhole) -> "View":
-        """The same camera."""
-        fields = (pinhole.focal, pinhole.centre, pinhole.position, pinhole.world_from_camera)
-        return cls(*(jnp.asarray(field, jnp.float32) for field in fields))
-
-    def project(self, points: Array) -> tuple[Array, Array]:
-        """Pixels (..., 2) and depths (...) of points (..., 3)."""
-        local = (points - self.position) @ self.world_from_camera
-        depth = jnp.maximum(local[..., 2], 1e-2)
-        return self.centre + local[..., :2] / depth[..., None] * self.focal, depth
+def project(pinhole: Pinhole, points: Array) -> tuple[Array, Array]:
+    """`Pinhole.project` in single precision, of what lies before the camera."""
+    fields = pinhole.focal, pinhole.centre, pinhole.position, pinhole.world_from_camera
+    focal, centre, position, rotation = (jnp.asarray(field, jnp.float32) for field in fields)
+    local = (points - position) @ rotation
+    depth = jnp.maximum(local[..., 2], 1e-2)
+    return centre + local[..., :2] / depth[..., None] * focal, depth
 
 
 def advance(model: Rope, belief: RopeBelief, gripper: Float[Array, "3"]) -> RopeBelief:
@@ -134,7 +122,7 @@ def advance(model: Rope, belief: RopeBelief, gripper: Float[Array, "3"]) -> Rope
 
 
 def correct(
-    model: Rope, view: View, belief: RopeBelief, sighting: Sighting
+    model: Rope, pinhole: Pinhole, belief: RopeBelief, sighting: Sighting
 ) -> tuple[RopeBelief, Fit]:
     """The belief after a frame, and how that fits.
 
@@ -158,14 +146,14 @@ def correct(
     def residual(mean: Array, match: Array, tip: Array) -> Array:
         """Whitened: across the curve, in depth, of the tip, and of each segment's stretch."""
         position = nodes(mean)
-        expected, depth = view.project(curve[match] @ position)
-        behind, _ = view.project((curve[match] - 1e-2 * slope[match]) @ position)
+        expected, depth = project(pinhole, curve[match] @ position)
+        behind, _ = project(pinhole, (curve[match] - 1e-2 * slope[match]) @ position)
         along = jax.lax.stop_gradient(expected - behind)
         along /= jnp.linalg.norm(along, axis=-1, keepdims=True) + 1e-6
         miss = sighting.pixels - expected
         across = along[:, 0] * miss[:, 1] - along[:, 1] * miss[:, 0]
         further = jnp.where(jnp.isfinite(sighting.depth), sighting.depth - depth, 0.0)
-        end, _ = view.project(position[-1])
+        end, _ = project(pinhole, position[-1])
         state = eqx.tree_at(lambda b: b.mean, belief, mean).state()
         edge = jnp.diff(state.position, axis=0)
         length = jnp.linalg.norm(edge, axis=-1)
@@ -176,7 +164,7 @@ def correct(
 
     def iterate(w: Array, _) -> tuple[Array, tuple[Array, Fit]]:
         mean = belief.mean + root @ w
-        match, close = _associate(view, curve @ nodes(mean), sighting)
+        match, close = _associate(pinhole, curve @ nodes(mean), sighting)
         on_rope = match < (model.nodes - 1) * PER_SEGMENT + 1
         reach = jnp.where(close & sighting.valid, match, -1)
         tip = jnp.argmax(reach)
@@ -215,9 +203,9 @@ def correct(
     return corrected, fit
 
 
-def _associate(view: View, places: Array, sighting: Sighting) -> tuple[Array, Array]:
+def _associate(pinhole: Pinhole, places: Array, sighting: Sighting) -> tuple[Array, Array]:
     """To which of the `places` (k, 3) along the curve each point belongs, and whether to any."""
-    pixels, depth = view.project(places)
+    pixels, depth = project(pinhole, places)
     squared = jnp.sum((sighting.pixels[:, None] - pixels) ** 2, axis=-1)
     further = sighting.depth[:, None] - depth
     further = jnp.where(jnp.isfinite(further), further, 0.0)

@@ -23,7 +23,6 @@ from palpate.perception.rope.filter import (
     PER_SEGMENT,
     RopeBelief,
     Sighting,
-    View,
     advance,
     bent,
     correct,
@@ -70,7 +69,6 @@ class RopeTracker:
         self.pinhole, self._rope = pinhole, rope
         self._model = dataclasses.replace(model, drive="position")
         self._rest_length = np.asarray(model.rest_length)
-        self._view = View.of(pinhole)
 
     def start(self, frame: Frame, gripper: np.ndarray) -> RopeState:
         """Begin with a rope seen in `frame`, of unknown velocity, under a gripper at rest."""
@@ -171,7 +169,7 @@ class RopeTracker:
         self, each: _Hypothesis, frame: Frame, seen: Segmentation, sighting: Sighting
     ) -> None:
         """Correct a belief, and take account of how well it explained the frame."""
-        each.belief, fit = _correct(self._model, self._view, each.belief, sighting)
+        each.belief, fit = _correct(self._model, self.pinhole, each.belief, sighting)
         # A rope much longer or shorter than the model's is another, or a mistake; and single
         # precision may not have sufficed.
         if not (np.isfinite(fit.surprise) and abs(float(each.belief.mean[-1])) < OTHER_LENGTH):

@@ -9,7 +9,7 @@ Every constant here was written down before the first full run.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -294,41 +294,6 @@ def _walls(
 # --- the deck's demonstrations ------------------------------------------------------------------
 
 
-def _scene(
-    name: str,
-    doors: list[tuple[float, float]],
-    constructions: tuple[Construction, ...],
-    start: Pose,
-    goal: Pose,
-    sizes: list[tuple[float, float]],
-    parameters: Mapping[int, PieceParameters] | None = None,
-    angle: float = 0.0,
-) -> Room:
-    width, depth, middle = 8.0, 6.8, 4.0
-    pieces = tuple(
-        Piece(
-            cabinet(construction, *size),
-            (middle - 0.1, (low + high) / 2, angle),
-            (parameters or {}).get(place),
-        )
-        for place, ((low, high), construction, size) in enumerate(
-            zip(doors, constructions, sizes, strict=True)
-        )
-    )
-    walls = _walls(width, depth, middle, doors)
-    return Room(name, walls, pieces, constructions, start, goal, (0.0, 0.0, width, depth), 1)
-
-
-_LOCKED_AT = 1.0  # rad of the fork
-
-
-def _one_locked(mount: int) -> PieceParameters:
-    """A cabinet of which caster `mount` is locked: 0 and 1 are in front, 0 and 2 on the left."""
-    locked: list[float | None] = [None] * 4
-    locked[mount] = _LOCKED_AT
-    return PieceParameters(HEAVY, (0.0, 0.0), 0.9, 0.01, tuple(locked))
-
-
 def scenes() -> dict[str, Room]:
     """The demonstrations of Scholz's deck, by name.
 
@@ -336,22 +301,27 @@ def scenes() -> dict[str, Room]:
     constraint that is not static, where nothing else leads on; and a piece whose locked caster only
     a touch can tell.
     """
-    two = [(0.8, 2.2), (4.8, 6.2)]
+    width, depth, middle, doors = 8.0, 6.8, 4.0, [(0.8, 2.2), (4.8, 6.2)]
     table, couch = (0.5, 1.1), (0.55, 1.15)
-    left, right = (1.0, 1.5, 0.0), (7.0, 1.5, 0.0)
-    made: dict[str, Callable[[str], Room]] = {
-        "table then couch": lambda name: _scene(
-            name, two, ("bolted", "feet"), left, right, [table, couch]
-        ),
-        "static constraint": lambda name: _scene(
-            name, two, ("bolted", "casters"), left, right, [table, table]
-        ),
-        "constraint not static": lambda name: _scene(
-            name, two, ("hinged", "bolted"), left, right, [table, table],
-            {0: PieceParameters(HEAVY, (0.0, 0.0), 0.9, 0.01, (None,) * 4, (-0.25, -0.55))},
-        ),
-        "learning by contact": lambda name: _scene(
-            name, two, ("locked", "bolted"), left, right, [table, table], {0: _one_locked(2)}
-        ),
-    }  # fmt: skip
-    return {name: make(name) for name, make in made.items()}
+    load, friction, rolling = (0.0, 0.0), 0.9, 0.01
+    # Casters 0 and 1 are in front, 0 and 2 on the left; rad of the fork.
+    hinged = PieceParameters(HEAVY, load, friction, rolling, (None,) * 4, (-0.25, -0.55))
+    locked = PieceParameters(HEAVY, load, friction, rolling, (None, None, 1.0, None))
+    made: dict[str, tuple[tuple[Construction, ...], tuple, tuple]] = {
+        "table then couch": (("bolted", "feet"), (table, couch), (None, None)),
+        "static constraint": (("bolted", "casters"), (table, table), (None, None)),
+        "constraint not static": (("hinged", "bolted"), (table, table), (hinged, None)),
+        "learning by contact": (("locked", "bolted"), (table, table), (locked, None)),
+    }
+    walls, bounds = _walls(width, depth, middle, doors), (0.0, 0.0, width, depth)
+    start, goal = (1.0, 1.5, 0.0), (7.0, 1.5, 0.0)
+    found = {}
+    for name, (constructions, sizes, parameters) in made.items():
+        pieces = tuple(
+            Piece(cabinet(construction, *size), (middle - 0.1, (low + high) / 2, 0.0), given)
+            for (low, high), construction, size, given in zip(
+                doors, constructions, sizes, parameters, strict=True
+            )
+        )
+        found[name] = Room(name, walls, pieces, constructions, start, goal, bounds, 1)
+    return found

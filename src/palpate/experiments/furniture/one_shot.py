@@ -9,6 +9,7 @@ posterior, and five pieces in one scene fitted jointly.
 
 import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -82,15 +83,32 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     one_shot_sysid.mujoco_sysid()  # an hour later would be late to say that it is missing
     movable = ("cart", "couch") if quick else MOVABLE
     first = SEEDS + 1000 * seed
-    work = _Work(experiment, size)
+
+    def found(folder: str, stage: str, work: Callable[..., dict[str, Any]], **about: Any):
+        return experiment.found(folder, {"stage": stage, **about}, lambda: work(**about))
+
+    given = {"pushes": size.pushes, "draws": size.draws}
     pieces = {
-        kind: [work.piece(kind, first + number) for number in range(size.pieces)]
+        kind: [
+            found(f"{kind}-{piece}", "piece", _piece, kind=kind, seed=piece, **given)
+            for piece in range(first, first + size.pieces)
+        ]
         for kind in progress((*movable, BOLTED), "handling, identifying and pushing")
     }
-    compared = {kind: work.compared(kind, first) for kind in progress(movable, "sample sizes")}
-    sysid = {kind: work.sysid(kind, first) for kind in progress(movable, "mujoco.sysid")}
-    raced = work.raced(first)
-    joint = None if quick else work.joint(first)
+    given = {"seed": first, "pushes": size.pushes, "draws": size.compared_draws}
+    compared = {
+        kind: found(f"samples-{kind}", "samples", _compared, kind=kind, **given)
+        for kind in progress(movable, "sample sizes")
+    }
+    given = {"seed": first, "pushes": size.pushes, "pieces": size.pieces}
+    sysid = {
+        kind: found(f"sysid-{kind}", "sysid", _sysid, kind=kind, **given)
+        for kind in progress(movable, "mujoco.sysid")
+    }
+    given = {"seed": first, "draws": size.raced_draws, "budget_s": size.budget}
+    raced = found("samplers", "samplers", _raced, kind=RACED, **given)
+    given = {"seed": first, "pushes": size.scene_pushes, "draws": size.scene_draws}
+    joint = None if quick else found("scene", "scene", _joint, kinds=SCENE, **given)
     shares_figure(out / FIGURE, compared)
     return experiment.result(
         _figures(pieces, compared, sysid, raced, joint, first),
@@ -108,99 +126,64 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class _Work:
-    """The stages, each found once: see `Experiment.found`."""
+def _piece(kind: str, seed: int, pushes: int, draws: int) -> dict[str, Any]:
+    """One piece: its structure and posterior, and what they say of pushes."""
+    handled, pushed = recordings(kind, seed, pushes)
+    found, seconds = fit(handled, draws, seed)
+    return {
+        **_judged(found.posterior, pushed),
+        "structure": found.structure,
+        "probability": found.probability,
+        "divergences": found.posterior.draws.divergences,
+        "fit_s": seconds,
+    }
 
-    experiment: Experiment
-    size: Size
 
-    def piece(self, kind: str, seed: int) -> dict[str, Any]:
-        """One piece: its structure and posterior, and what they say of pushes."""
-        size = self.size
+def _compared(kind: str, seed: int, pushes: int, draws: int) -> dict[str, Any]:
+    """One piece after growing numbers of samples, beside regressions."""
+    found = shares(*recordings(kind, seed, pushes), draws, seed)
+    return {"shares": {name: {str(n): v for n, v in of.items()} for name, of in found.items()}}
 
-        def work() -> dict[str, Any]:
-            handled, pushes = recordings(kind, seed, size.pushes)
-            found, seconds = fit(handled, size.draws, seed)
-            return {
-                **_judged(found.posterior, pushes),
-                "structure": found.structure,
-                "probability": found.probability,
-                "divergences": found.posterior.draws.divergences,
-                "fit_s": seconds,
-            }
 
-        about = {"stage": "piece", "kind": kind, "seed": seed, "pushes": size.pushes}
-        return self.experiment.found(f"{kind}-{seed}", about | {"draws": size.draws}, work)
+def _sysid(kind: str, seed: int, pushes: int, pieces: int) -> dict[str, Any]:
+    """mujoco.sysid, given all but constants, on the first piece of a kind it can be fitted to.
 
-    def compared(self, kind: str, seed: int) -> dict[str, Any]:
-        """One piece after growing numbers of samples, beside regressions."""
-        size = self.size
+    It needs to know where free casters point, which some handling does not show.
+    """
+    refused = {}
+    for piece in range(seed, seed + pieces):
+        try:
+            return {**_fitted_by_sysid(kind, piece, pushes), "refused": refused}
+        except one_shot_sysid.CastersUnknownError as error:
+            refused[str(piece)] = str(error)
+    return {"error_m": [], "displacement_m": [], "refused": refused}
 
-        def work() -> dict[str, Any]:
-            handled, pushes = recordings(kind, seed, size.pushes)
-            found = shares(handled, pushes, size.compared_draws, seed)
-            by_size = {name: {str(n): v for n, v in of.items()} for name, of in found.items()}
-            return {"shares": by_size}
 
-        about = {"stage": "samples", "kind": kind, "seed": seed, "pushes": size.pushes}
-        about["draws"] = size.compared_draws
-        return self.experiment.found(f"samples-{kind}", about, work)
+def _raced(kind: str, seed: int, draws: int, budget_s: float) -> dict[str, Any]:
+    """The samplers on the posterior of a piece.
 
-    def sysid(self, kind: str, seed: int) -> dict[str, Any]:
-        """mujoco.sysid, given all but constants, on the first piece of a kind it can be fitted to.
+    Ours is timed as a user waits for it: search for modes, compiling, warm-up and draws.
+    """
+    handled, _ = recordings(kind, seed, 1)
+    model = starting_furniture(handled, PERIOD)
+    target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
+    jax.clear_caches()  # what the pieces have compiled would not be there for a user
+    began = time.monotonic()
+    posterior = sample(target, draws=draws, seed=seed)
+    spent = time.monotonic() - began
+    paces = race(posterior, seed, budget_s)
+    return {
+        "free_parameters": posterior.target.parameters,
+        "posterior_s": spent,
+        "compiling_s": posterior.draws.compiling,
+        "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
+    }
 
-        It needs to know where free casters point, which some handling does not show.
-        """
 
-        def work() -> dict[str, Any]:
-            refused = {}
-            for piece in range(seed, seed + self.size.pieces):
-                try:
-                    return {**_fitted_by_sysid(kind, piece, self.size.pushes), "refused": refused}
-                except one_shot_sysid.CastersUnknownError as error:
-                    refused[str(piece)] = str(error)
-            return {"error_m": [], "displacement_m": [], "refused": refused}
-
-        about = {"stage": "sysid", "kind": kind, "seed": seed, "pushes": self.size.pushes}
-        return self.experiment.found(f"sysid-{kind}", about, work)
-
-    def raced(self, seed: int) -> dict[str, Any]:
-        """The samplers on the posterior of a couch.
-
-        Ours is timed as a user waits for it: search for modes, compiling, warm-up and draws.
-        """
-        size = self.size
-
-        def work() -> dict[str, Any]:
-            handled, _ = recordings(RACED, seed, 1)
-            model = starting_furniture(handled, PERIOD)
-            target = posterior_of(model, handled.align(PERIOD, POSE, WRENCH))
-            jax.clear_caches()  # what the pieces have compiled would not be there for a user
-            began = time.monotonic()
-            posterior = sample(target, draws=size.raced_draws, seed=seed)
-            spent = time.monotonic() - began
-            paces = race(posterior, seed, size.budget)
-            return {
-                "free_parameters": posterior.target.parameters,
-                "posterior_s": spent,
-                "compiling_s": posterior.draws.compiling,
-                "paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()},
-            }
-
-        about = {"stage": "samplers", "kind": RACED, "seed": seed, "draws": size.raced_draws}
-        return self.experiment.found("samplers", about | {"budget_s": size.budget}, work)
-
-    def joint(self, seed: int) -> dict[str, Any]:
-        """Five pieces in one scene, fitted together from ten seconds in which all are handled."""
-        size = self.size
-
-        def work() -> dict[str, Any]:
-            handled, pushes = scene(seed, size.scene_pushes)
-            return _judged(fit_jointly(handled, size.scene_draws, seed), pushes)
-
-        about = {"stage": "scene", "kinds": SCENE, "seed": seed, "pushes": size.scene_pushes}
-        return self.experiment.found("scene", about | {"draws": size.scene_draws}, work)
+def _joint(kinds: tuple[str, ...], seed: int, pushes: int, draws: int) -> dict[str, Any]:
+    """Pieces in one scene, fitted together from ten seconds in which all are handled."""
+    handled, pushed = scene(kinds, seed, pushes)
+    return _judged(fit_jointly(handled, draws, seed), pushed)
 
 
 def _judged(posterior: Posterior, pushes: Recording) -> dict[str, Any]:

@@ -6,6 +6,7 @@ is predicted.
 
 import dataclasses
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -61,14 +62,14 @@ def recordings(kind: str, seed: int, pushes: int) -> tuple[Recording, Recording]
     return record_handling(world, seed, HANDLED), record_pushes(world, seed, pushes, PIECE)
 
 
-def scene(seed: int, pushes: int) -> tuple[Recording, Recording]:
-    """Five pieces in a room, all handled for the same ten seconds; and pushes of each in turn."""
-    places = [(APART * (i % 3), APART * (i // 3), 0.0) for i in range(len(SCENE))]
-    pieces = [Piece(kind, place) for kind, place in zip(SCENE, places, strict=True)]
+def scene(kinds: Sequence[str], seed: int, pushes: int) -> tuple[Recording, Recording]:
+    """Pieces in a room, all handled for the same ten seconds; and pushes of each in turn."""
+    places = [(APART * (i % 3), APART * (i // 3), 0.0) for i in range(len(kinds))]
+    pieces = [Piece(kind, place) for kind, place in zip(kinds, places, strict=True)]
     world = FurnitureWorld(pieces)
-    hands = Together([Wiggle(seed, body, HANDLED, body) for body in range(len(SCENE))])
+    hands = Together([Wiggle(seed, body, HANDLED, body) for body in range(len(kinds))])
     handled = record(world, [hands], seed, ["handling of all"])
-    return handled, record_pushes(world, seed, pushes * len(SCENE), PIECE)
+    return handled, record_pushes(world, seed, pushes * len(kinds), PIECE)
 
 
 def fit(handled: Recording, draws: int, seed: int) -> tuple[Comparison, float]:

@@ -40,8 +40,7 @@ from palpate.trials.furniture.cart_controllers import (
 )
 from palpate.trials.furniture.cart_posterior import PiecePosterior
 from palpate.trials.furniture.cart_trials import best_scene, rewards_by_episode
-from palpate.worlds.furniture.furniture import KINDS
-from palpate.worlds.furniture.pieces import draw_parameters
+from palpate.worlds.furniture.pieces import KINDS, draw_parameters
 
 TASKS = [shopping_cart(), apartment()]
 SMALL = Planning(samples=4, knots=3, spacing=1)

@@ -21,12 +21,12 @@ from palpate.identification.data.segments import cut
 from palpate.models.planar import furniture
 from palpate.worlds.furniture.furniture import (
     CONTROL_PERIOD,
-    KINDS,
     FurnitureSensors,
     FurnitureWorld,
     Piece,
 )
 from palpate.worlds.furniture.handling import record_handling, record_pushes
+from palpate.worlds.furniture.pieces import KINDS
 
 PERFECT = FurnitureSensors(0.0, 0.0, 0.0, 0.0, 0.0)
 

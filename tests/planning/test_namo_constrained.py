@@ -11,11 +11,8 @@ from namo_rooms import two_rooms
 from palpate.numerics.polygons import placed, polygons
 from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
-from palpate.planning.movable_obstacles.motion.physics_manipulation import (
-    ConstrainedManipulation,
-    Drawn,
-)
-from palpate.planning.movable_obstacles.motion.primitives import AXIS, PIVOT, STATIC, Constraint
+from palpate.planning.movable_obstacles.motion.constrained import ConstrainedManipulation, Drawn
+from palpate.planning.movable_obstacles.motion.primitives import Constraint
 from palpate.planning.movable_obstacles.search.openings import OpeningSearch
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan
 from palpate.planning.movable_obstacles.search.planner import Planner
@@ -26,7 +23,7 @@ from palpate.planning.movable_obstacles.search.transfers import Move
 from palpate.planning.movable_obstacles.search.verification import faults_of
 
 ALONG_WALL = math.pi / 2  # the wall between the rooms runs along y, and so does the body's y
-NEAR_END = Constraint(PIVOT, (0.0, -0.5))
+NEAR_END = Constraint("pivot", (0.0, -0.5))
 
 
 def doorway(margin: float = 0.05) -> Map:
@@ -68,7 +65,7 @@ def anchors_of(plan: Plan, constraint: Constraint) -> np.ndarray:
 @pytest.mark.parametrize("wheels", [(0.0, -0.45), (0.0, 0.0)])
 def test_a_piece_on_wheels_is_held_by_the_face_that_can_be_reached(wheels):
     """The faces across its axis are at the jambs, where no robot fits."""
-    plan = planned(doorway(), Constraint(AXIS, wheels, ALONG_WALL))
+    plan = planned(doorway(), Constraint("axis", wheels, ALONG_WALL))
     assert plan.moved == ["piece"]
     first = next(segment for segment in plan.segments if segment.kind == TRANSFER)
     assert abs(math.cos(first.grasp.normal - ALONG_WALL)) < 0.1
@@ -82,7 +79,7 @@ def test_a_piece_on_wheels_is_held_by_the_face_that_can_be_reached(wheels):
 @pytest.mark.parametrize("point", [(0.2, 0.4), (0.2, -0.45)])
 def test_what_turns_about_a_point_is_held_elsewhere_where_the_robot_gets_no_farther(point):
     """Held by the face that it first gets to, the robot comes up against the wall too early."""
-    world, constraint = deep_doorway(), Constraint(PIVOT, point)
+    world, constraint = deep_doorway(), Constraint("pivot", point)
     plan = planned(world, constraint)
     transfers = [segment for segment in plan.segments if segment.kind == TRANSFER]
     assert [segment.name for segment in transfers] == ["piece", "piece"]
@@ -95,7 +92,7 @@ def test_what_turns_about_a_point_is_held_elsewhere_where_the_robot_gets_no_fart
 
 
 def test_an_object_is_held_once_where_that_is_enough():
-    assert planned(doorway(), Constraint(PIVOT, (0.2, -0.45))).transfers == 1
+    assert planned(doorway(), Constraint("pivot", (0.2, -0.45))).transfers == 1
 
 
 def test_a_gap_counts_that_is_little_wider_than_the_margin():
@@ -125,7 +122,7 @@ def test_stops_are_apart_and_say_how_sure_they_are():
     assert max(turned) > 0.2
     assert sorted(np.abs(turned), reverse=True) == list(np.abs(turned))
     assert all(stop.probability == 1 and stop.cost > stop.approach for stop in found)
-    assert stops(Constraint(STATIC)) == []
-    doubted = stops(NEAR_END, Constraint(STATIC))
+    assert stops(Constraint("static")) == []
+    doubted = stops(NEAR_END, Constraint("static"))
     assert doubted
     assert all(stop.probability == 0.5 for stop in doubted)

@@ -7,6 +7,11 @@ import pytest
 
 from palpate.numerics.polygons import placed
 from palpate.planning.movable_obstacles.maps.map import Movable
+from palpate.planning.movable_obstacles.motion.constrained import (
+    ConstrainedManipulation,
+    Drawn,
+    swept,
+)
 from palpate.planning.movable_obstacles.motion.manipulation import (
     BACKWARD,
     FORWARD,
@@ -17,18 +22,9 @@ from palpate.planning.movable_obstacles.motion.manipulation import (
     RigidCarry,
     outline_grasps,
 )
-from palpate.planning.movable_obstacles.motion.physics_manipulation import (
-    ConstrainedManipulation,
-    Drawn,
-    swept,
-)
 from palpate.planning.movable_obstacles.motion.primitives import (
-    AXIS,
-    FREE,
     LEVER,
-    PIVOT,
     SEPARATION,
-    STATIC,
     Constraint,
     Turn,
     anchors,
@@ -51,13 +47,13 @@ def moved(constraint: Constraint, primitive, force: float = 100.0):
 
 def test_is_a_model_of_manipulation():
     assert isinstance(
-        ConstrainedManipulation({"piece": Drawn((Constraint(FREE),))}, 1.0), ManipulationModel
+        ConstrainedManipulation({"piece": Drawn((Constraint("free"),))}, 1.0), ManipulationModel
     )
 
 
 @pytest.mark.parametrize("primitive", [FORWARD, LEFT])
 def test_a_free_piece_is_carried_rigidly(primitive):
-    ours = moved(Constraint(FREE), primitive)
+    ours = moved(Constraint("free"), primitive)
     rigid = RigidCarry().motion(PIECE, POSE, ROBOT, primitive, LENGTHS, 0)
     np.testing.assert_allclose(ours.object_poses, rigid.object_poses, atol=1e-9)
     np.testing.assert_allclose(ours.robot_poses, rigid.robot_poses, atol=1e-9)
@@ -65,7 +61,7 @@ def test_a_free_piece_is_carried_rigidly(primitive):
 
 @pytest.mark.parametrize("anchor", [(-0.4, -0.2), (-0.5, 0.3)])
 def test_a_pivot_keeps_its_point_whatever_point_was_meant(anchor):
-    constraint = Constraint(PIVOT, anchor)
+    constraint = Constraint("pivot", anchor)
     motion = moved(constraint, Turn("turn", turn=1.0, anchor=(anchor[0] + 0.1, anchor[1])))
     points = placed(np.array([anchor]), motion.object_poses)[:, 0]
     np.testing.assert_allclose(points - placed(np.array([anchor]), POSE)[0], 0, atol=1e-9)
@@ -79,11 +75,11 @@ def test_a_pivot_keeps_its_point_whatever_point_was_meant(anchor):
 @pytest.mark.parametrize(
     ("constraint", "primitive"),
     [
-        (Constraint(PIVOT, (-0.4, -0.2)), FORWARD),
-        (Constraint(PIVOT, (-0.4, -0.2)), Turn("turn", turn=1.0, anchor=(0.4, 0.2))),
-        (Constraint(AXIS, (-0.4, 0.0), 0.0), LEFT),
-        (Constraint(STATIC), FORWARD),
-        (Constraint(STATIC), Turn("turn", turn=1.0)),
+        (Constraint("pivot", (-0.4, -0.2)), FORWARD),
+        (Constraint("pivot", (-0.4, -0.2)), Turn("turn", turn=1.0, anchor=(0.4, 0.2))),
+        (Constraint("axis", (-0.4, 0.0), 0.0), LEFT),
+        (Constraint("static"), FORWARD),
+        (Constraint("static"), Turn("turn", turn=1.0)),
     ],
 )
 def test_what_a_constraint_holds_stays_where_it_is(constraint, primitive):
@@ -93,7 +89,7 @@ def test_what_a_constraint_holds_stays_where_it_is(constraint, primitive):
 
 
 def test_an_axis_lets_a_piece_roll_along_it_only():
-    slanted = Constraint(AXIS, (-0.4, 0.0), 0.2)
+    slanted = Constraint("axis", (-0.4, 0.0), 0.2)
     motion = moved(slanted, FORWARD)
     step = motion.object_poses[-1, :2] - POSE[:2]
     assert math.atan2(-step[1], -step[0]) == pytest.approx(POSE[2] + 0.2)
@@ -101,26 +97,26 @@ def test_an_axis_lets_a_piece_roll_along_it_only():
 
 
 def test_what_is_too_heavy_for_the_hand_stays_and_energy_is_force_times_way():
-    assert np.ptp(moved(Constraint(FREE, force=101.0), FORWARD).object_poses[:, 0]) == 0
-    motion = moved(Constraint(FREE, force=30.0), FORWARD)
+    assert np.ptp(moved(Constraint("free", force=101.0), FORWARD).object_poses[:, 0]) == 0
+    motion = moved(Constraint("free", force=30.0), FORWARD)
     np.testing.assert_allclose(motion.energy, 30.0 * LENGTHS, atol=1e-9)
 
 
 def test_grasps_stand_as_the_table_says():
     grasps = outline_grasps(OUTLINE, 0.3)
     uniform = np.full(len(grasps), 1 / len(grasps))
-    for constraint in (Constraint(FREE), Constraint(AXIS, (-0.4, 0.0), 0.0)):
+    for constraint in (Constraint("free"), Constraint("axis", (-0.4, 0.0), 0.0)):
         assert grasp_share(constraint, grasps) == pytest.approx(uniform)
     point = (0.0, -0.25)
-    away = grasp_share(Constraint(PIVOT, point), grasps)
+    away = grasp_share(Constraint("pivot", point), grasps)
     levers = np.array([math.dist(grasp.point, point) for grasp in grasps])
     assert ((away > 0) == (levers >= LEVER)).all()
     assert 0 < (away > 0).sum() < len(grasps)
-    assert not grasp_share(Constraint(STATIC), grasps).any()
+    assert not grasp_share(Constraint("static"), grasps).any()
 
 
 def test_a_piece_on_wheels_is_pulled_along_its_axis_from_any_face():
-    axis = Constraint(AXIS, (-0.4, 0.0), 0.0)
+    axis = Constraint("axis", (-0.4, 0.0), 0.0)
     model = ConstrainedManipulation({"piece": Drawn((axis,))}, 100.0)
     for grasp in model.grasps(PIECE, 0.3):
         across = abs(math.cos(grasp.normal)) > 0.9
@@ -135,8 +131,8 @@ def test_a_piece_on_wheels_is_pulled_along_its_axis_from_any_face():
 
 
 def test_a_hand_at_the_point_that_is_held_in_place_turns_nothing():
-    axis, grasp = Constraint(AXIS, (-0.4, 0.0), 0.0), Grasp((-0.5, 0.0), math.pi)
-    for draws, held in (((axis,), False), ((axis, Constraint(FREE)), True)):
+    axis, grasp = Constraint("axis", (-0.4, 0.0), 0.0), Grasp((-0.5, 0.0), math.pi)
+    for draws, held in (((axis,), False), ((axis, Constraint("free")), True)):
         model = ConstrainedManipulation({"piece": Drawn(draws)}, 100.0)
         near = [
             one
@@ -147,8 +143,8 @@ def test_a_hand_at_the_point_that_is_held_in_place_turns_nothing():
 
 
 def test_points_to_turn_about_are_where_most_draws_have_one():
-    near = [Constraint(PIVOT, (0.4, 0.2 + 0.01 * k)) for k in range(3)]
-    found = anchors([Constraint(STATIC), Constraint(FREE), *near])
+    near = [Constraint("pivot", (0.4, 0.2 + 0.01 * k)) for k in range(3)]
+    found = anchors([Constraint("static"), Constraint("free"), *near])
     assert found[0] == pytest.approx((0.4, 0.21))
     assert (0.0, 0.0) in found
     assert all(math.dist(a, b) >= SEPARATION for a in found for b in found if a != b)
@@ -167,7 +163,7 @@ def test_a_twist_is_swept_as_small_steps_of_it_are():
 
 
 def test_a_hand_gives_way_by_a_share_only():
-    constraint = Constraint(PIVOT, (0.0, 0.0))
+    constraint = Constraint("pivot", (0.0, 0.0))
     wanted = np.array([0.0, -0.1, 1.0])  # a turn about (0.1, 0)
     assert twist(constraint, wanted, 0.5, 0.35)[2] == 1.0
     assert not twist(constraint, wanted, 0.25, 0.35).any()

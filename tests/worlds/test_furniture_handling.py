@@ -5,8 +5,9 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.recordings import Labels, Polygons, Role
-from palpate.worlds.furniture.furniture import KINDS, FurnitureWorld, Piece
+from palpate.worlds.furniture.furniture import FurnitureWorld, Piece
 from palpate.worlds.furniture.handling import Push, Wiggle, record, record_handling, record_pushes
+from palpate.worlds.furniture.pieces import KINDS
 from trolley import sledge, trolley
 
 MOVABLE = [name for name, kind in KINDS.items() if not kind.bolted]

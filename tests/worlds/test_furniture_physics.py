@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from palpate.worlds.furniture.furniture import KINDS, FurnitureWorld, Piece
-from palpate.worlds.furniture.pieces import placed
+from palpate.numerics.polygons import placed
+from palpate.worlds.furniture.furniture import FurnitureWorld, Piece
+from palpate.worlds.furniture.pieces import KINDS
 from trolley import EXACT, LENGTH, MASS, OUTLINE, PLACES, WIDTH, sledge, trolley
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate.worlds.furniture.pieces import KINDS, centroid, placed
+from palpate.numerics.polygons import placed
+from palpate.worlds.furniture.pieces import KINDS, centroid
 
 
 def test_placing_turns_and_moves():

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.numerics.polygons import placed
 from palpate.planning.movable_obstacles.motion.body_controller import BodyController, moved_with
 from palpate.worlds.furniture.furniture import FurnitureWorld, Piece, Robot, RobotAction
-from palpate.worlds.furniture.pieces import placed
 from palpate.worlds.furniture.robot import RobotObservation
 from palpate.worlds.furniture.touch import felt_wrenches
 from trolley import EXACT, LENGTH, MASS, OUTLINE, sledge

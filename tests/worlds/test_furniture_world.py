@@ -7,13 +7,13 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.worlds.furniture.furniture import (
-    KINDS,
     FurnitureSensors,
     FurnitureWorld,
     Piece,
     PieceKind,
     PieceParameters,
 )
+from palpate.worlds.furniture.pieces import KINDS
 from palpate.worlds.world import DivergedError
 from trolley import EXACT, sledge, trolley
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from palpate.experiments.experiment import Experiment, share_of
 from palpate.families.furniture.plan_picture import plan_picture, scene_animation
-from palpate.planning.movable_obstacles.motion.primitives import FREE, Constraint
+from palpate.planning.movable_obstacles.motion.primitives import Constraint
 from palpate.runs import Figure, Result
 from palpate.runs.run import read_metrics
 from palpate.trials.furniture import rooms as namo_rooms
@@ -57,7 +57,7 @@ def planners(room: Room) -> dict[str, Callable[[], Opinion]]:
     return {
         OURS: lambda: Learner(world.outlines, room.seed),
         TOLD: lambda: Opinion(truth_of(room)),
-        ALL: lambda: Opinion(dict.fromkeys(world.names, Constraint(FREE))),
+        ALL: lambda: Opinion(dict.fromkeys(world.names, Constraint("free"))),
         FLAG: lambda: Flag(world.names),
     }
 

@@ -12,13 +12,13 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Float
 
+from palpate.numerics.polygons import placed
 from palpate.worlds.furniture.furniture import SETTLING, STEPS_PER_PERIOD
 from palpate.worlds.furniture.pieces import (
     LOAD_REACH,
     MASS_SPREAD,
     PieceKind,
     PieceParameters,
-    placed,
 )
 from palpate.worlds.furniture.scene import TIME_STEP, furniture_scene
 

@@ -32,8 +32,9 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from palpate.worlds.furniture.furniture import KINDS, FurnitureWorld, Piece
-from palpate.worlds.furniture.pieces import placed
+from palpate.numerics.polygons import placed
+from palpate.worlds.furniture.furniture import FurnitureWorld
+from palpate.worlds.furniture.pieces import KINDS, Piece
 
 DECISION = 0.2  # s
 HEADING_WEIGHT = 0.5  # m/rad

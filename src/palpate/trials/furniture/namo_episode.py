@@ -13,17 +13,8 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.motion.belief import ObjectBelief, cut
-from palpate.planning.movable_obstacles.motion.physics_manipulation import (
-    ConstrainedManipulation,
-    Drawn,
-)
-from palpate.planning.movable_obstacles.motion.primitives import (
-    AXIS,
-    FREE,
-    PIVOT,
-    STATIC,
-    Constraint,
-)
+from palpate.planning.movable_obstacles.motion.constrained import ConstrainedManipulation, Drawn
+from palpate.planning.movable_obstacles.motion.primitives import Constraint
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan, timed
 from palpate.planning.movable_obstacles.search.planner import Planner
 from palpate.planning.movable_obstacles.search.policy import NoWayError
@@ -58,7 +49,7 @@ class Opinion:
 
     def movability(self) -> dict[str, float]:
         """The believed probability that an object gives way, by name."""
-        return {name: float(one.kind != STATIC) for name, one in self._constraints.items()}
+        return {name: float(one.kind != "static") for name, one in self._constraints.items()}
 
     def immovable(self) -> set[str]:
         """Objects that count as walls."""
@@ -82,7 +73,7 @@ class Flag(Opinion):
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
-        super().__init__(dict.fromkeys(names, Constraint(FREE)))
+        super().__init__(dict.fromkeys(names, Constraint("free")))
         self._probability = dict.fromkeys(names, MOVABLE)
 
     def movability(self) -> dict[str, float]:
@@ -234,17 +225,17 @@ def truth_of(room: Room) -> dict[str, Constraint]:
     for body, (name, construction) in enumerate(zip(world.names, room.constructions, strict=True)):
         parameters, kind = truth.parameters[body], truth.kinds[body]
         if construction in ("casters", "feet"):
-            found[name] = Constraint(FREE)
+            found[name] = Constraint("free")
         elif construction == "bolted":
-            found[name] = Constraint(STATIC)
+            found[name] = Constraint("static")
         elif construction == "wheels":
             places = [mount.place for mount in kind.mounts if mount.type == "fixed"]
             x, y = np.mean(places, axis=0)
-            found[name] = Constraint(AXIS, (float(x), float(y)), 0.0)
+            found[name] = Constraint("axis", (float(x), float(y)), 0.0)
         else:
             place = parameters.anchor
             if place is None:
                 (mount,) = (k for k, angle in enumerate(parameters.locked) if angle is not None)
                 place = truth.wheel_places[body][mount]
-            found[name] = Constraint(PIVOT, (float(place[0]), float(place[1])))
+            found[name] = Constraint("pivot", (float(place[0]), float(place[1])))
     return found

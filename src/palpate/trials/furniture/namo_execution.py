@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from shapely.ops import nearest_points
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import placed, turned
 from palpate.planning.movable_obstacles.motion.body_controller import BodyController, moved_with
 from palpate.planning.movable_obstacles.search.plan import Segment
 from palpate.trials.furniture.rooms import BASE_RADIUS, MARGIN, POSTURE, RADIUS, REACH, Pose, Room
@@ -260,9 +260,7 @@ class Execution:
         """Pull sideways, back and forth, as hard as the hand may."""
         wrench = np.zeros(3)
         for forward, left in WIGGLES:
-            heading = _robot(self.now).gripper_pose[2]
-            cosine, sine = math.cos(heading), math.sin(heading)
-            wanted = np.array([cosine * forward - sine * left, sine * forward + cosine * left, 0.0])
+            wanted = np.append(turned((forward, left), _robot(self.now).gripper_pose[2]), 0.0)
             for _ in range(round(WIGGLING / self.period)):
                 wrench += SMOOTHING * (_robot(self.now).wrist_wrench - wrench)
                 # Free to turn: what pivots can then follow the hand.
@@ -283,19 +281,10 @@ class Execution:
         """The object's velocity (3,) here and now that the path has at step `at`."""
         change = path[at + 1] - path[at]
         angle = pose[2] - 0.5 * (path[at, 2] + path[at + 1, 2])
-        cosine, sine = math.cos(angle), math.sin(angle)
-        turned = np.array(
-            [
-                cosine * change[0] - sine * change[1],
-                sine * change[0] + cosine * change[1],
-                change[2],
-            ]
-        )
-        hand = moved_with(turned, pose, gripper[:2])
-        time = max(
-            np.hypot(*hand[:2]) / SPEED, np.hypot(*turned[:2]) / SPEED, abs(turned[2]) / RATE
-        )
-        return turned / max(time, 1e-9)
+        moved = np.append(turned(change[:2], angle), change[2])
+        hand = moved_with(moved, pose, gripper[:2])
+        time = max(*(np.hypot(*of[:2]) / SPEED for of in (hand, moved)), abs(moved[2]) / RATE)
+        return moved / max(time, 1e-9)
 
     def _fold(self) -> None:
         self._posture(self._arm.folded)

@@ -16,15 +16,14 @@ import shapely
 from numpy.typing import ArrayLike
 
 from palpate.errors import PalpateError
+from palpate.numerics.polygons import placed
 from palpate.worlds.furniture.bodies import Bodies
 from palpate.worlds.furniture.pieces import (
-    KINDS,
     Piece,
     PieceKind,
     PieceParameters,
     draw_parameters,
     draw_swivels,
-    placed,
 )
 from palpate.worlds.furniture.robot import (
     Robot,
@@ -37,12 +36,6 @@ from palpate.worlds.furniture.robot import (
 from palpate.worlds.furniture.scene import TIME_STEP, convex_parts, furniture_scene
 from palpate.worlds.furniture.touch import felt_wrenches
 from palpate.worlds.world import DivergedError, OffscreenCamera, World
-
-__all__ = [
-    "KINDS", "FurnitureObservation", "FurnitureSensors", "FurnitureTruth", "FurnitureWorld",
-    "Piece", "PieceKind", "PieceParameters", "Robot", "RobotAction", "RobotObservation",
-    "RobotTruth",
-]  # fmt: skip
 
 CONTROL_PERIOD = 0.02  # s
 STEPS_PER_PERIOD = round(CONTROL_PERIOD / TIME_STEP)

@@ -177,12 +177,6 @@ def centroid(polygon: np.ndarray) -> np.ndarray:
     return ((polygon + following) * cross[:, None]).sum(0) / (3 * cross.sum())
 
 
-def placed(outline: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Points (points, 2) of a body frame in the world, m, for `pose` (3,) in m, m, rad."""
-    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-    return np.asarray(outline) @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2]
-
-
 def _rectangle(length: float, width: float) -> tuple[tuple[float, float], ...]:
     x, y = length / 2, width / 2
     return ((-x, -y), (x, -y), (x, y), (-x, y))

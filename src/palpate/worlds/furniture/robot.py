@@ -16,8 +16,9 @@ import numpy as np
 import shapely
 
 from palpate.errors import PalpateError
+from palpate.numerics.polygons import placed
 from palpate.worlds.furniture.bodies import Bodies
-from palpate.worlds.furniture.pieces import BAND, HANDLE_HEIGHT, placed
+from palpate.worlds.furniture.pieces import BAND, HANDLE_HEIGHT
 from palpate.worlds.furniture.scene import BODY_BIT, DRAWN, SOLID
 
 BASE_MASS = 30.0  # kg

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from shapely.ops import nearest_points
 
-from palpate.worlds.furniture.pieces import placed
+from palpate.numerics.polygons import placed
 from palpate.worlds.furniture.robot import GRIPPER_RADIUS, RobotObservation
 
 TOUCHING = 0.03  # m between surfaces that may touch

@@ -27,22 +27,16 @@ from palpate.models.planar.shapes import centred, even_gyration, rectangle
 from palpate.models.planar.system import GRAVITY
 from palpate.models.planar.wheels import turned_wheel
 from palpate.parameters import LogNormal, Normal, Prior
-from palpate.planning.movable_obstacles.motion.physics_manipulation import Drawn
-from palpate.planning.movable_obstacles.motion.primitives import (
-    AXIS,
-    FREE,
-    PIVOT,
-    STATIC,
-    Constraint,
-)
+from palpate.planning.movable_obstacles.motion.constrained import Drawn
+from palpate.planning.movable_obstacles.motion.primitives import Constraint, Kind
 
 # Hypotheses: the kind of constraint, where an axis rolls, and the prior probability.
-HYPOTHESES = (
-    (FREE, 0.0, 0.45),
-    (AXIS, 0.0, 0.075),
-    (AXIS, math.pi / 2, 0.075),
-    (PIVOT, 0.0, 0.2),
-    (STATIC, 0.0, 0.2),
+HYPOTHESES: tuple[tuple[Kind, float, float], ...] = (
+    ("free", 0.0, 0.45),
+    ("axis", 0.0, 0.075),
+    ("axis", math.pi / 2, 0.075),
+    ("pivot", 0.0, 0.2),
+    ("static", 0.0, 0.2),
 )
 PARTICLES = 96  # of each hypothesis
 LEAST_PROBABILITY = 0.005  # probability of a hypothesis, whatever was seen
@@ -163,7 +157,7 @@ class ObjectBelief:
         """The probability that a hand of that force (N) moves it at all."""
         weight = self.probabilities[:, None] * np.exp(self._log_weight)
         moves = self._values()["force"] <= force
-        loose = np.array([kind != STATIC for kind, *_ in HYPOTHESES])
+        loose = np.array([kind != "static" for kind, *_ in HYPOTHESES])
         return float((weight * (moves & loose[:, None])).sum())
 
     # --- below --------------------------------------------------------------------------------
@@ -175,7 +169,7 @@ class ObjectBelief:
             name: np.asarray(prior.to_value(position[..., k], position[..., k]))
             for k, (name, prior) in enumerate(PRIORS)
         }
-        rolls = np.array([kind == AXIS for kind, *_ in HYPOTHESES])[:, None]
+        rolls = np.array([kind == "axis" for kind, *_ in HYPOTHESES])[:, None]
         friction = GRAVITY * values["mass"] * values["floor_friction"]
         return values | {"force": friction + rolls * values["weak"]}
 
@@ -183,11 +177,11 @@ class ObjectBelief:
         self, values: Mapping[str, np.ndarray], hypothesis: int, particle: int
     ) -> Constraint:
         kind, direction, _ = HYPOTHESES[hypothesis]
-        if kind == STATIC:
-            return Constraint(STATIC)
+        if kind == "static":
+            return Constraint("static")
         one = {name: float(value[hypothesis, particle]) for name, value in values.items()}
-        if kind == FREE:
-            return Constraint(FREE, force=one["force"])
+        if kind == "free":
+            return Constraint("free", force=one["force"])
         x, y = np.array([one["wheel_x"], one["wheel_y"]]) * self.half_extent
         turned = direction + one["wheel_direction"]
         return Constraint(kind, (float(x), float(y)), turned, one["force"])
@@ -260,10 +254,10 @@ _REFERENCE: Planar = furniture([rectangle(1.0, 0.5)], control_period=PERIOD)
 _STRUCTURE = jnp.array(
     [
         [
-            float(kind in (AXIS, PIVOT)),
-            float(kind == STATIC),
-            float(kind == PIVOT or (kind == AXIS and direction > 0)),
-            float(kind == PIVOT or (kind == AXIS and direction == 0)),
+            float(kind in ("axis", "pivot")),
+            float(kind == "static"),
+            float(kind == "pivot" or (kind == "axis" and direction > 0)),
+            float(kind == "pivot" or (kind == "axis" and direction == 0)),
         ]
         for kind, direction, _ in HYPOTHESES
     ]

@@ -12,12 +12,13 @@ any face, as often only another one can be reached in a doorway.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from palpate.planning.movable_obstacles.motion.manipulation import Grasp, Primitive
 
-FREE, AXIS, PIVOT, STATIC = "free", "axis", "pivot", "static"
+Kind = Literal["free", "axis", "pivot", "static"]
 LEVER = 0.2  # m between hand and fixed point: nearer, the hand's own torque would have to turn it
 FACING = math.cos(math.radians(50))  # between a face's normal and the free axis
 ASIDE = 0.5  # m beside the wheels of an axis
@@ -32,7 +33,7 @@ class Constraint:
     the middle of its wheels, and where they roll. `force` in N is what it takes to move it.
     """
 
-    kind: str
+    kind: Kind
     anchor: tuple[float, float] = (0.0, 0.0)
     direction: float = 0.0
     force: float = 0.0
@@ -51,9 +52,9 @@ def turning_points(constraint: Constraint) -> list[tuple[float, float]]:
     What rolls along an axis turns about any point across it, beside the middle of its wheels.
     """
     x, y = constraint.anchor
-    if constraint.kind == STATIC:
+    if constraint.kind == "static":
         return []
-    if constraint.kind != AXIS:
+    if constraint.kind != "axis":
         return [(x, y)]
     across = -math.sin(constraint.direction), math.cos(constraint.direction)
     return [(x + aside * across[0], y + aside * across[1]) for aside in (0.0, ASIDE, -ASIDE)]
@@ -88,9 +89,9 @@ def turns(constraints: Sequence[Constraint]) -> list[Turn]:
 
 def grasp_share(constraint: Constraint, grasps: Sequence[Grasp]) -> np.ndarray:
     """The distribution (grasps,) of where to hold an object so constrained; 0 for a static one."""
-    if constraint.kind == STATIC:
+    if constraint.kind == "static":
         return np.zeros(len(grasps))
-    if constraint.kind == PIVOT:
+    if constraint.kind == "pivot":
         levers = np.array([math.dist(grasp.point, constraint.anchor) for grasp in grasps])
         weights = (levers >= LEVER).astype(float)
     else:
@@ -104,15 +105,15 @@ def twist(constraint: Constraint, wanted: np.ndarray, lever: float, yielding: fl
     Zero where the constraint holds it: where more than the share `yielding` of the hand's way,
     `lever` m per rad from the point turned about, would go against it.
     """
-    if constraint.kind == STATIC:
+    if constraint.kind == "static":
         return np.zeros(3)
-    if constraint.kind == FREE:
+    if constraint.kind == "free":
         return wanted
     x, y = constraint.anchor
     at_anchor = np.array([wanted[0] - wanted[2] * y, wanted[1] + wanted[2] * x])
     hand = max(float(np.hypot(*wanted[:2])) if not wanted[2] else abs(wanted[2]) * lever, 1e-9)
     off = at_anchor
-    if constraint.kind == AXIS:
+    if constraint.kind == "axis":
         along = np.array([math.cos(constraint.direction), math.sin(constraint.direction)])
         off = at_anchor - along * (along @ at_anchor)
     if np.hypot(*off) > yielding * hand:

@@ -57,8 +57,12 @@ class State:
     least: float = 0.0
     energy: float = 0.0
     parts: tuple[Carry, ...] = ()
-    opened: bool = False
-    exit_length: float = math.inf
+    exit_length: float = math.inf  # m from here to the aim, if the way is open
+
+    @property
+    def opened(self) -> bool:
+        """Whether the way is open."""
+        return self.exit_length < math.inf
 
 
 @dataclass(frozen=True)
@@ -335,7 +339,6 @@ class OpeningSearch:
             float(sweep.least[last]),
             state.energy + float(sweep.motion.energy[last]),
             (*state.parts, part),
-            left < math.inf,
             left,
         )
 

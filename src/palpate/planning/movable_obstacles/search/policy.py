@@ -51,7 +51,7 @@ class PolicyGraph:
         for index, border in enumerate(borders):
             leaving.setdefault(border.source, []).append(index)
         index_of = {name: index for index, name in enumerate(self.names)}
-        source, target, cost, group = [], [], [], []
+        found: list[tuple[int, int, float, int]] = []  # source, target, cost and group
         self.needed: list[tuple[str, ...]] = []  # objects to be moved for each action
         handling = HANDLING * space.map.robot.radius
         for state, node in enumerate(entered):
@@ -62,30 +62,23 @@ class PolicyGraph:
                 if state and borders[state - 1].source == border.target:
                     continue  # straight back
                 needed = tuple(sorted(self.regions.objects[border.target] - here))
-                source.append(state)
-                target.append(1 + index)
-                cost.append(np.linalg.norm(points[state] - border.point) + handling * len(needed))
-                group.append(index_of[needed[0]] if needed else -1)
+                cost = np.linalg.norm(points[state] - border.point) + handling * len(needed)
+                group = index_of[needed[0]] if needed else -1
+                found.append((state, 1 + index, float(cost), group))
                 self.needed.append(needed)
             if node == aim:
-                source.append(state)
-                target.append(self._states - 1)
-                cost.append(np.linalg.norm(points[state] - self._goal))
-                group.append(-1)
+                cost = float(np.linalg.norm(points[state] - self._goal))
+                found.append((state, self._states - 1, cost, -1))
                 self.needed.append(())
+        source, target, costs, groups = np.array(found, float).reshape(-1, 4).T
         self._points, self._cheapest = points, math.inf
-        self._known = np.zeros(len(source), bool)
+        self._known = np.zeros(len(found), bool)
         self._count = np.array([len(names) for names in self.needed], int)
-        self._straight = np.array(cost, float) - handling * self._count
+        self._straight = costs - handling * self._count
         kinds: dict[tuple[str, ...], int] = {}
         self._kind = np.array([kinds.setdefault(names, len(kinds)) for names in self.needed], int)
-        self.actions = Actions(
-            np.array(source, int),
-            np.array(target, int),
-            np.array(cost, float),
-            np.ones(len(source)),
-            np.array(group, int),
-        )
+        source, target, groups = (one.astype(int) for one in (source, target, groups))
+        self.actions = Actions(source, target, costs.copy(), np.ones(len(found)), groups)
         left, bottom, right, top = space.map.bounds
         self._dead_end = 100.0 * (right - left + top - bottom) + 10 * handling * len(self.names)
         self._taken: list[int] = []

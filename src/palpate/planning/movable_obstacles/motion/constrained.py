@@ -28,9 +28,7 @@ from palpate.planning.movable_obstacles.motion.manipulation import (
     outline_grasps,
 )
 from palpate.planning.movable_obstacles.motion.primitives import (
-    AXIS,
     FACING,
-    FREE,
     LEVER,
     Constraint,
     Turn,
@@ -80,10 +78,10 @@ class ConstrainedManipulation(ManipulationModel):
         key = movable.name, drawn.version
         if key not in self._turns:
             self._turns[key] = turns(drawn.constraints)
-        if any(one.kind == FREE for one in drawn.constraints):
+        if any(one.kind == "free" for one in drawn.constraints):
             return [BACKWARD, FORWARD, LEFT, RIGHT, *self._turns[key]]
         straight: list[Primitive] = []
-        axes = [one.direction for one in drawn.constraints if one.kind == AXIS]
+        axes = [one.direction for one in drawn.constraints if one.kind == "axis"]
         across = np.abs(np.cos(grasp.normal - np.array(axes)))
         if (across > FACING).any():
             straight += [BACKWARD, FORWARD]

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from palpate.numerics.pinhole import Frame, Pinhole
-from palpate.perception.image_folder import CAMERA, COLOUR, COLUMNS, DEPTH, TIMES
+from palpate.perception.image_folder import CAMERA, COLOUR, DEPTH, TIMES
 from palpate.runs.storage import write_bytes, write_json, write_text
 
 
@@ -28,7 +28,7 @@ def write_image_folder(
         (path / folder).mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow(["name", "time", "x", "y", "z"])
     for index, (frame, place) in enumerate(zip(frames, gripper, strict=True)):
         name = f"{index:06d}.png"
         write_bytes(path / COLOUR / name, _png(frame.colour))

@@ -100,9 +100,12 @@ def test_a_file_is_followed_through_its_points(tmp_path) -> None:
     [
         ("time,x,y\n0,0,0", "no column z: expected a header with time, x, y, z"),
         ("", "no column time, x, y, z"),
-        ("time,x,y,z\n0,0,0,0\n1,0,nan,0", "line 3: expected four finite numbers"),
-        ("time,x,y,z\n0,0,0,0\n1,0", "line 3: expected four finite numbers"),
-        ("time,x,y,z\n0,0,0,0\n0,1,0,0", "line 3: the time 0 s does not come after 0 s"),
+        ("time,x,y,z\n0,0,0,0\n1,0,nan,0", "line 3: expected finite numbers for time, x, y, z"),
+        ("time,x,y,z\n0,0,0,0\n1,0", "line 3: expected finite numbers for time, x, y, z"),
+        (
+            "time,x,y,z\n0,0,0,0\n0,1,0,0",
+            "line 3: the time 0 does not come after 0; sort the rows by time",
+        ),
         ("time,x,y,z\n0,0,0,0", "has 1 points: a path needs at least two"),
     ],
 )

@@ -11,8 +11,6 @@ The folder holds
     depth/NAME.png  16 bits, millimetres along the optical axis, 0 where unknown; optional
 """
 
-import csv
-import math
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +18,11 @@ from PIL import Image  # comes with matplotlib
 
 from palpate.errors import PalpateError
 from palpate.numerics.pinhole import Frame, Pinhole
+from palpate.recordings.columns import read_columns
 from palpate.runs.storage import read_json
 
 CAMERA, TIMES, COLOUR, DEPTH = "camera.json", "times.csv", "colour", "depth"
 FILMS = [f"{COLOUR}{suffix}" for suffix in (".mp4", ".mkv", ".avi", ".mov", ".webm")]
-COLUMNS = ["name", "time", "x", "y", "z"]
 
 
 def read_image_folder(path: str | Path) -> tuple[Pinhole, list[Frame], np.ndarray]:
@@ -34,12 +32,17 @@ def read_image_folder(path: str | Path) -> tuple[Pinhole, list[Frame], np.ndarra
     """
     path = Path(path)
     pinhole = _camera(path / CAMERA)
-    rows = _rows(path / TIMES)
+    rows, names = read_columns(path / TIMES, ("time", "x", "y", "z"), "name")
+    for line, name in enumerate(names, 2):
+        if not name or Path(name).name != name:
+            raise PalpateError(f"{path / TIMES}, line {line}: expected a file name, got {name!r}")
+    if not names:
+        raise PalpateError(f"{path / TIMES} names no frames")
     has_depth = (path / DEPTH).is_dir()
     film = next((file for file in map(path.joinpath, FILMS) if file.is_file()), None)
-    pictures = None if film is None else _film(film, len(rows))
+    pictures = None if film is None else _film(film, len(names))
     frames = []
-    for index, (name, moment, *_) in enumerate(rows):
+    for index, (name, moment) in enumerate(zip(names, rows[:, 0].tolist(), strict=True)):
         colour = _picture(path / COLOUR / name, "RGB") if pictures is None else pictures[index]
         if colour.shape[:2] != (pinhole.height, pinhole.width):
             raise PalpateError(
@@ -51,7 +54,7 @@ def read_image_folder(path: str | Path) -> tuple[Pinhole, list[Frame], np.ndarra
             millimetres = _picture(path / DEPTH / f"{Path(name).stem}.png", "I;16")
             depth = np.where(millimetres > 0, millimetres / 1e3, np.nan).astype(np.float32)
         frames.append(Frame(moment, colour, depth))
-    return pinhole, frames, np.array([place for *_, place in rows])
+    return pinhole, frames, rows[:, 1:]
 
 
 def _camera(path: Path) -> Pinhole:
@@ -66,35 +69,6 @@ def _camera(path: Path) -> Pinhole:
         raise PalpateError(
             f"{path} describes no camera: expected {', '.join(names)} ({error})"
         ) from error
-
-
-def _rows(path: Path) -> list[tuple[str, float, tuple[float, ...]]]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            lines = list(csv.reader(file))
-    except OSError as error:
-        raise PalpateError(f"cannot read {path}: {error.strerror or error}") from error
-    if not lines or lines[0] != COLUMNS:
-        raise PalpateError(f"{path} begins with the line {','.join(COLUMNS)}")
-    rows: list[tuple[str, float, tuple[float, ...]]] = []
-    for number, line in enumerate(lines[1:], 2):
-        try:
-            name, *numbers = line
-            moment, *place = map(float, numbers)
-            fits = len(place) == 3 and all(map(math.isfinite, (moment, *place)))
-        except ValueError:
-            fits = False
-        if not fits or Path(name).name != name:
-            raise PalpateError(
-                f"{path}, line {number}: expected a file name and four finite numbers, "
-                f"got {','.join(line)!r}"
-            )
-        if rows and moment <= rows[-1][1]:
-            raise PalpateError(f"{path}, line {number}: its time is not after the one before")
-        rows.append((name, moment, tuple(place)))
-    if not rows:
-        raise PalpateError(f"{path} names no frames")
-    return rows
 
 
 def _film(path: Path, count: int) -> list[np.ndarray]:

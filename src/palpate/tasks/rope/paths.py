@@ -10,7 +10,6 @@ path runs at the rate
 acceleration are continuous and the point starts from rest without acceleration.
 """
 
-import csv
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +22,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
 from palpate.errors import PalpateError
+from palpate.recordings.columns import read_columns
 
 RISE = 1.0  # s until a path is followed at its own speed
 
@@ -30,8 +30,6 @@ HARMONICS = 4  # sinusoids of a random path in each direction
 FREQUENCIES = 0.15, 1.0  # Hz, between which they lie
 # A random path keeps to these bounds or to a share of them down to LEAST_SHARE.
 FASTEST, SHARPEST, FARTHEST, LEAST_SHARE = 1.2, 6.0, 0.8, 0.3  # m/s, m/s^2, m
-
-_COLUMNS = ("time", "x", "y", "z")
 
 
 class DesiredPath(eqx.Module):
@@ -126,50 +124,14 @@ def read_path(file: str | Path, period: float, beyond: float = 0.0) -> np.ndarra
 
     Raises `PalpateError` that says what is wrong with the file, and in which line.
     """
-    table = _read_table(Path(file))
+    table, _ = read_columns(Path(file), ("time", "x", "y", "z"))
+    if len(table) < 2:
+        raise PalpateError(f"{file} has {len(table)} points: a path needs at least two")
     time = table[:, 0] - table[0, 0]
     spline = CubicSpline(time, table[:, 1:] - table[0, 1:], bc_type="natural")
     lasts = float(time[-1]) + 0.5 * RISE
     samples = np.arange(round((lasts + beyond) / period) + 1) * period
     return spline(np.minimum(soft_time(samples), time[-1]))
-
-
-def _read_table(file: Path) -> np.ndarray:
-    """The columns time, x, y, z: (rows, 4)."""
-    rows = []
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as text:
-            reader = csv.DictReader(text, skipinitialspace=True)
-            names = {(name or "").strip(): name for name in reader.fieldnames or []}
-            missing = [name for name in _COLUMNS if name not in names]
-            if missing:
-                raise PalpateError(
-                    f"{file} has no column {', '.join(missing)}: expected a header with "
-                    f"{', '.join(_COLUMNS)}, in s and m"
-                )
-            for row in reader:
-                try:
-                    values = [float(row[names[name]] or "") for name in _COLUMNS]
-                except ValueError:
-                    values = [math.nan]
-                if not all(map(math.isfinite, values)):
-                    raise PalpateError(
-                        f"{file}, line {reader.line_num}: expected four finite numbers under "
-                        f"{', '.join(_COLUMNS)}"
-                    )
-                if rows and values[0] <= rows[-1][0]:
-                    raise PalpateError(
-                        f"{file}, line {reader.line_num}: the time {values[0]:g} s does not come "
-                        f"after {rows[-1][0]:g} s; sort the rows by time"
-                    )
-                rows.append(values)
-    except OSError as error:
-        raise PalpateError(f"cannot read {file}: {error.strerror or error}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise PalpateError(f"{file} is not a CSV file in UTF-8: {error}") from error
-    if len(rows) < 2:
-        raise PalpateError(f"{file} has {len(rows)} points: a path needs at least two")
-    return np.array(rows)
 
 
 def random_paths(

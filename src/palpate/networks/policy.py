@@ -159,7 +159,7 @@ class CommandPolicy(DeclaredController):
             if channel.rate_limit is None:
                 return channel.bound * direction
             change = self.period * channel.rate_limit * direction
-            return _shorten(carry + change, channel.bound)
+            return shorten(carry + change, channel.bound)
 
         return self._each(move, carry, direction)
 
@@ -176,7 +176,7 @@ class CommandPolicy(DeclaredController):
         return jnp.concatenate(changed, axis=-1)
 
 
-def _shorten(vector: Array, limit: float) -> Array:
+def shorten(vector: Array, limit: float) -> Array:
     """The vector itself up to the length `limit`, else the one of that length beside it."""
     squared = jnp.sum(vector**2, axis=-1, keepdims=True)
     # The inner maximum keeps the root, and its derivative, finite where the vector vanishes.

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError, extra_module
+from palpate.networks.policy import shorten
 
 POPULATION = 40  # candidates of a generation
 LEAD = 5  # control periods by which a deadline lies before the best time so far
@@ -63,10 +64,10 @@ class CommandSequence:
         share = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(self.knots)))
         added = jnp.einsum("tk,pk...->pt...", jnp.asarray(share, knots.dtype), knots)
         wanted = _lasting(self.limit * added, self.steps) + _lasting(reference, self.steps)
-        wanted = _shorten(wanted, self.limit)
+        wanted = shorten(wanted, self.limit)
 
         def follow(command: Array, wanted: Array) -> tuple[Array, Array]:
-            command = command + _shorten(wanted - command, self.period * self.rate_limit)
+            command = command + shorten(wanted - command, self.period * self.rate_limit)
             return command, command
 
         in_time = jnp.moveaxis(wanted, 1, 0)
@@ -179,9 +180,3 @@ def _lasting(values: Array, steps: int) -> Array:
     values = values[:, :steps]
     rest = [(0, 0)] * (values.ndim - 2)
     return jnp.pad(values, [(0, 0), (0, steps - values.shape[1]), *rest])
-
-
-def _shorten(vector: Array, length: float) -> Array:
-    """The vector along the last axis itself up to that length, else the one of it beside it."""
-    squared = jnp.sum(vector**2, axis=-1, keepdims=True)
-    return vector * (length / jnp.sqrt(jnp.maximum(squared, length**2)))

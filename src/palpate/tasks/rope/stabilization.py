@@ -144,10 +144,7 @@ class RopeStabilization(HangingRopeTask):
         hanging = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (motions, *leaf.shape)), hanging)
         states = rollout(model, hanging, commands[:, :, None, :])
         times = jax.random.randint(for_time, (motions, STATES_PER_MOTION), steps // 6, steps)
-        pick = jax.vmap(lambda leaf, index: leaf[index])
-        state, command = jax.tree.map(
-            lambda leaf: pick(leaf, times).reshape(-1, *leaf.shape[2:])[:count], (states, commands)
-        )
+        state, command = picked((states, commands), times, count)
         return Start(state, command[:, None, :])
 
     def _random_commands(  # gripper velocities, m/s
@@ -268,6 +265,13 @@ class RopeStabilization(HangingRopeTask):
             "settling_periods": time / swing,
             "final_speed": speed,
         }
+
+
+def picked(motions: Any, times: Array, count: int) -> Any:
+    """The first `count` of all that (motions, time, ...) are at `times` (motions, picks, ...)."""
+    pick = jax.vmap(lambda leaf, index: leaf[index])
+    own = jax.tree.map(lambda leaf: pick(leaf, times), motions)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], own)
 
 
 def vertical_symmetry(

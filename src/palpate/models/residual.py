@@ -234,7 +234,6 @@ class Residual(Wrapper):
         return self.physics.step(self._kicked(state, action), action)
 
     def stepper(self) -> Callable[[Any, Array], Any]:
-        """See `Model.stepper`."""
         step = self.physics.stepper()
         return lambda state, action: step(self._kicked(state, action), action)
 

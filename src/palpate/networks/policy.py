@@ -93,7 +93,6 @@ class CommandPolicy(DeclaredController):
 
     @classmethod
     def from_settings(cls, folder: Path, **settings: Any) -> "CommandPolicy":
-        """See `DeclaredController.from_settings`."""
         features = count_of(settings["observations"])
         return cls.create(jax.random.key(0), jnp.zeros((2, features)), **settings)
 

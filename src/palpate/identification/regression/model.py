@@ -52,7 +52,6 @@ class RegressedModel(Wrapper):
     overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     def step(self, state: Any, action: Array) -> Any:
-        """See `Model.step`."""
         inputs = self.features.inputs(state, action)
         answer = eqx.filter_vmap(lambda part, x, c: part(x, c), in_axes=(0, -2, -2), out_axes=-2)
         change = answer(self.regression, inputs, _conditions(self.features, state, inputs))

@@ -88,7 +88,6 @@ class HangingRopeTask(Task):
         return seen.reshape(*seen.shape[:-2], -1)
 
     def feature_channels(self, model: Rope) -> tuple[Channel, ...]:
-        """See `Task.feature_channels`."""
         shape = (model.nodes - 1, 3)
         return (
             Channel("node position relative to the gripper", shape, "m"),

@@ -114,7 +114,6 @@ class RopeTracking(HangingRopeTask):
         return jnp.concatenate([seen, path.reshape(*path.shape[:-2], -1)], axis=-1)
 
     def feature_channels(self, model: Rope) -> tuple[Channel, ...]:
-        """See `Task.feature_channels`."""
         instants = ", ".join(f"{instant:g}" for instant in PREVIEW)
         ahead = f"desired tip position relative to the gripper, {instants} s ahead"
         return (*super().feature_channels(model), Channel(ahead, (len(PREVIEW), 3), "m"))

@@ -133,7 +133,6 @@ class IdentifyFurniture(Identify):
         return prune_contacts(model, *recordings)
 
     def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:
-        """See `Identify.meanings`."""
         from palpate.families.furniture.wheels import wheel_rows
         from palpate.models.planar import Planar
 

@@ -81,7 +81,6 @@ class RopeDeployment(Deployment):
         self.sensors = (Channel("gripper", (3,), "m"), Channel("markers", (self.markers, 3), "m"))
 
     def decision(self) -> RopeDecision:
-        """See `Deployment.decision`."""
         return RopeDecision(self.policy, self.markers)
 
     def check(self) -> ChainCheck:

@@ -98,7 +98,6 @@ class TrackRope(Track):
     """Of the rope, m."""
 
     def track(self, model: Model, run: Run) -> Tracked:
-        """See `palpate.families.rope.tracking.track`."""
         from palpate.families.rope.tracking import track
         from palpate.perception.rope.segmentation import Appearance
 
@@ -160,13 +159,11 @@ class IdentifyRope(Identify):
         return GRIP if GRIP in recording.trials[0].channels else GRIPPER
 
     def repair(self, recording: Recording) -> Recording:
-        """See `repair_markers`."""
         from palpate.recordings.markers import repair_markers
 
         return repair_markers(recording, self.observation)
 
     def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Rope:
-        """See `starting_rope`."""
         from palpate.families.rope.recording import starting_rope
         from palpate.recordings.recording import resolve_indices
 
@@ -295,7 +292,6 @@ class EvaluateRopeStabilization(EvaluateRope):
         return evaluation_trials(RopeConfiguration(), self.ropes, self.seed)
 
     def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
-        """See `Evaluate.controllers`."""
         from palpate.tasks.rope import RopeStabilization
         from palpate.trials.rope.baselines import baselines
         from palpate.trials.rope.learned import LearnedController
@@ -358,7 +354,6 @@ class EvaluateRopeTracking(EvaluateRope):
         return path_trials(RopeConfiguration(), self.ropes, self.seed, self.paths)
 
     def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
-        """See `Evaluate.controllers`."""
         from palpate.tasks.rope import RopeTracking
         from palpate.trials.rope.learned import LearnedController
         from palpate.trials.rope.tracking import blind_controllers

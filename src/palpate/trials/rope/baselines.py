@@ -55,14 +55,12 @@ class SwingDamper(FeedbackController):
         self._estimator = VelocityEstimator(base.control_period)
 
     def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
-        """See `FeedbackController.start`."""
         window = np.repeat(self._offset(observation)[None], self._estimator.frames, axis=0)
         return observation.gripper_position[:, :2], command[:, :2], window
 
     def decide(
         self, carry: Any, observation: RopeObservation, goal: None
     ) -> tuple[Any, np.ndarray]:
-        """See `FeedbackController.decide`."""
         home, command, window = carry
         gains, offset = self._gains, self._offset(observation)
         window = np.concatenate([window[1:], offset[None]])

@@ -76,12 +76,10 @@ class LearnedController(FeedbackController):
         self._act = act
 
     def start(self, command: Any, observation: RopeObservation, goal: Any) -> Any:
-        """See `FeedbackController.start`."""
         memory = self.policy.initial_carry(jnp.asarray(command, jnp.float32)[:, None])
         return self.observer.start(observation), memory, 0
 
     def decide(self, carry: Any, observation: RopeObservation, goal: Any) -> tuple[Any, np.ndarray]:
-        """See `FeedbackController.decide`."""
         window, memory, step = carry
         window, state = self.observer.update(window, observation)
         memory, action = self._act(self.policy, memory, state, goal, jnp.asarray(step))
@@ -117,7 +115,6 @@ class ObservedController(LearnedController):
         self._decide_alike = decide
 
     def start(self, command: np.ndarray, observation: RopeObservation, goal: None) -> Any:
-        """See `FeedbackController.start`."""
         positions = jnp.asarray(self.observer.positions(observation))
         length = jnp.sum(jnp.linalg.norm(jnp.diff(positions, axis=1), axis=-1), axis=1)
         size = length / jnp.sum(self._model.rest_length)
@@ -129,7 +126,6 @@ class ObservedController(LearnedController):
     def decide(
         self, carry: Any, observation: RopeObservation, goal: None
     ) -> tuple[Any, np.ndarray]:
-        """See `FeedbackController.decide`."""
         observer, size, command, memory = carry
         positions = jnp.asarray(self.observer.positions(observation))
         if command is None:

@@ -142,7 +142,6 @@ class PlannedController(FeedbackController):
         self.spent: list[float] = []
 
     def start(self, command: Any, observation: RopeObservation, goal: Any) -> Any:
-        """See `FeedbackController.start`."""
         window = self._observer.start(observation)
         window, states = self._observer.update(window, observation)  # at rest: the same window
         keys = jax.random.split(jax.random.key(self._seed), len(command))
@@ -150,7 +149,6 @@ class PlannedController(FeedbackController):
         return window, self.prepare(states), plans, 0
 
     def decide(self, carry: Any, observation: RopeObservation, goal: Any) -> tuple[Any, np.ndarray]:
-        """See `FeedbackController.decide`."""
         window, prepared, plans, step = carry
         window, states = self._observer.update(window, observation)
         planners, states, ahead = self.problems(prepared, states, goal, step)

@@ -56,12 +56,10 @@ class StabilizationTrial(RopeTrial[Episodes]):
     steps: int | None = None
 
     def measure(self, observation: RopeObservation, truth: RopeTruth) -> Mapping[str, Any]:
-        """See `Trial`."""
         return RopeStabilization.measure(observation, truth)
 
     @classmethod
     def record(cls, trials: Sequence["StabilizationTrial"], steps: int, drawn: int) -> Episodes:
-        """See `Trial`."""
         energy, speed = np.full((2, len(trials), steps + 1), np.nan, np.float32)
         markers = drawn, steps + 1, trials[0].configuration.markers, 3
         return Episodes(energy, speed, np.full(markers, np.nan, np.float32), {})
@@ -70,12 +68,10 @@ class StabilizationTrial(RopeTrial[Episodes]):
     def figures(
         cls, trials: Sequence["StabilizationTrial"], record: Episodes, suffix: str = ""
     ) -> list[Figure]:
-        """See `Summary.figures`."""
         return summarise(trials, record).figures(suffix)
 
     @classmethod
     def line(cls, name: str, trials: Sequence["StabilizationTrial"], record: Episodes) -> str:
-        """See `Summary.line`."""
         return summarise(trials, record).line(name)
 
 

@@ -74,7 +74,6 @@ class PathTrial(RopeTrial[Followed]):
         return self.name
 
     def measure(self, observation: RopeObservation, truth: RopeTruth) -> Mapping[str, Any]:
-        """See `Trial`."""
         return RopeTracking.measure(observation, truth)
 
     @classmethod
@@ -89,7 +88,6 @@ class PathTrial(RopeTrial[Followed]):
 
     @classmethod
     def record(cls, trials: Sequence["PathTrial"], steps: int, drawn: int) -> Followed:
-        """See `Trial`."""
         tips = np.full((len(trials), steps + 1, 3), np.nan, np.float32)
         markers = drawn, steps + 1, trials[0].configuration.markers, 3
         return Followed(tips, np.full(markers, np.nan, np.float32), {})
@@ -98,12 +96,10 @@ class PathTrial(RopeTrial[Followed]):
     def figures(
         cls, trials: Sequence["PathTrial"], record: Followed, suffix: str = ""
     ) -> list[Figure]:
-        """See `Summary.figures`."""
         return summarise(trials, record).figures(suffix)
 
     @classmethod
     def line(cls, name: str, trials: Sequence["PathTrial"], record: Followed) -> str:
-        """See `Summary.line`."""
         return summarise(trials, record).line(name)
 
 
@@ -120,7 +116,6 @@ class PathOpenLoop(OpenLoop):
     def start(
         self, command: np.ndarray, observation: RopeObservation, goal: DesiredPath
     ) -> tuple[np.ndarray, int]:
-        """See `OpenLoop.start`."""
         gripper = np.asarray(goal.position)
         if self._length is not None:
             away = jnp.asarray(gripper - gripper[:, :1], jnp.float32)

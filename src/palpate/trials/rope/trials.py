@@ -28,7 +28,6 @@ class RopeTrial(Trial[RecordType]):
 
     @property
     def control_period(self) -> float:
-        """See `Trial`."""
         return self.configuration.control_period
 
     @property
@@ -38,7 +37,6 @@ class RopeTrial(Trial[RecordType]):
 
     @property
     def reset_options(self) -> Mapping[str, Any]:
-        """See `Trial`."""
         return {"start": self.start}
 
     @property
@@ -47,5 +45,4 @@ class RopeTrial(Trial[RecordType]):
         return np.zeros(3)
 
     def world(self) -> RopeWorld:
-        """See `Trial`."""
         return RopeWorld(self.configuration)

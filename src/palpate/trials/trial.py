@@ -141,7 +141,8 @@ def run_trials(
     """
     for period in {trial.control_period for trial in trials}:
         check_period(controller, period)
-    steps = _longest(trials, steps)
+    if steps is None:
+        steps = max(trial.steps or 0 for trial in trials)
     loop = _Loop(trials, steps, drawn)
     carry = controller.initial_carry(np.stack([trial.command for trial in trials]))
     goals = type(trials[0]).goals(trials)
@@ -155,10 +156,6 @@ def run_trials(
             if watch is not None:
                 watch(step, loop.worlds)
     return loop.record
-
-
-def _longest(trials: Sequence[Trial], steps: int | None) -> int:
-    return max(trial.steps or 0 for trial in trials) if steps is None else steps
 
 
 class _Loop(Generic[RecordType]):
@@ -237,9 +234,8 @@ def evaluate_trials(
     controllers: Mapping[str, Controller],
     trials: Sequence[Trial[RecordType]],
     run: Run | None = None,
-    steps: int | None = None,
 ) -> dict[str, RecordType]:
-    """What each controller does in all trials; `steps` as in `run_trials`.
+    """What each controller does in all trials, for as long as each lasts.
 
     The first of each group is kept for drawing. With a `run`, finished trials are saved and logged
     there, and one that was cut off goes on. The caller opens the run and finishes it.
@@ -250,7 +246,7 @@ def evaluate_trials(
     for controller in controllers.values():
         for period in {trial.control_period for trial in trials}:
             check_period(controller, period)
-    longest = _longest(trials, steps)
+    longest = max(trial.steps or 0 for trial in trials)
     done = {name: kind.record(trials, longest, len(drawn)) for name in controllers}
     work = [
         (name, list(range(first, min(first + kind.side_by_side, len(trials)))))
@@ -261,7 +257,7 @@ def evaluate_trials(
     for (name, chosen), note in resumable(run, work, arrays, "trials"):
         some = [trials[index] for index in chosen]
         places = [place for place, index in enumerate(chosen) if index in drawn]
-        part = run_trials(some, controllers[name], steps, places)
+        part = run_trials(some, controllers[name], None, places)
         rows = [drawn.index(chosen[place]) for place in places]
         for field, values in part.arrays().items():
             whole = arrays[name][field]

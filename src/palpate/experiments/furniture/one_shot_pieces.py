@@ -11,12 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from palpate.commands.identify_report import LEVEL
-from palpate.families.furniture.recording import (
-    POSE,
-    WRENCH,
-    prune_contacts,
-    starting_furniture,
-)
+from palpate.families.furniture.recording import POSE, WRENCH, prune_contacts, starting_furniture
 from palpate.families.furniture.structures import structures
 from palpate.identification.data.segments import Segments, cut, difference
 from palpate.identification.posterior.comparison import PIECE, Comparison, compare, posterior_of

@@ -12,11 +12,7 @@ from palpate.errors import PalpateError
 from palpate.recordings import Channel, Labels, Polygons, Recording, Role, Trial
 from palpate.recordings.facts import Fact
 from palpate.worlds.excitation import smooth_step
-from palpate.worlds.furniture.furniture import (
-    CONTROL_PERIOD,
-    FurnitureTruth,
-    FurnitureWorld,
-)
+from palpate.worlds.furniture.furniture import CONTROL_PERIOD, FurnitureTruth, FurnitureWorld
 from palpate.worlds.furniture.scene import GRAVITY, SWIVEL_FRICTION
 
 REACH = 0.35  # m, and

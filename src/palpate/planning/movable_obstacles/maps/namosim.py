@@ -14,12 +14,7 @@ import shapely
 
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import checked_pose, circumscribed_radius, shown
-from palpate.planning.movable_obstacles.maps.description import (
-    keys_of,
-    number,
-    truth,
-    with_hints,
-)
+from palpate.planning.movable_obstacles.maps.description import keys_of, number, truth, with_hints
 from palpate.planning.movable_obstacles.maps.map import Map, Pose, Robot, map_of
 from palpate.planning.movable_obstacles.maps.ros import described, read_grid
 from palpate.planning.movable_obstacles.maps.svg import (

@@ -123,8 +123,8 @@ def test_slivers_of_walls_do_not_keep_a_map_from_being_read_back(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "says"),
     [
-        ({"walls": [{"outline": CORNERS, "holes": 3}]}, "holes that are no list"),
-        ({"walls": 3}, "no list of outlines"),
+        ({"walls": [{"outline": CORNERS, "holes": 3}]}, "holes of wall 0: expected a list"),
+        ({"walls": 3}, "walls of .*: expected a list of outlines"),
         ({"walls": [[[0, 0], [1e-4, 0], [0, 1e-4]]]}, "area of 5e-09 .* 1 square mm"),
         ({"movables": {"a": {"hints": {}}}}, "lacks its polygon"),
         ({"movables": []}, "movables of .* of type list"),

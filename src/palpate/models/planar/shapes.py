@@ -81,9 +81,9 @@ def furniture(
         "pairs": _pairs([len(pieces) for pieces in parts], len(wall_parts), pivots or {}),
     }
     sizes = {"bodies": count, "wheels": wheels, "links": fields["pivot"].shape[1]}
-    declared = parameters_of(Planar)
-    for name, shape in _parameter_shapes(sizes).items():
-        centre = declared[name].prior.centre
+    axes = axes_of(Planar)
+    for name, declared in parameters_of(Planar).items():
+        centre, shape = declared.prior.centre, tuple(sizes.get(axis, 2) for axis in axes[name])
         value = fields.get(name, 0.0 if centre is None else centre)
         try:
             fields[name] = np.broadcast_to(np.asarray(value, dtype=float), shape).copy()
@@ -224,9 +224,3 @@ def _links(
             taken[body] += 1
     pose = np.zeros((count, size, 3))
     return {"pivot": pivot, "distance": distance, "link_to": link_to, "link_pose": pose}
-
-
-def _parameter_shapes(sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-    """Shape of every parameter of a planar model of these sizes."""
-    declared, axes = parameters_of(Planar), axes_of(Planar)
-    return {name: tuple(sizes.get(axis, 2) for axis in axes[name]) for name in declared}

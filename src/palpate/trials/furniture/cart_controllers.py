@@ -215,7 +215,12 @@ class CartController(FeedbackController):
         held = self._turns.held(self._frames[-1])
         before = self._state()
         model = self.believed(held)
-        handled = self._handled(self._tracker if model is None else model, held)
+        handled = Handled(
+            inner=self._tracker if model is None else model,
+            held=jnp.asarray(held),
+            strength=as_floating(self._task.strength),
+            handle=as_floating(self._task.handles),
+        )
         action = self._unplanned() if model is None else self._planned(handled, before)
         wrench = _wrench(handled, before.pose, jnp.asarray(action))
         return _Holding(held, before, np.asarray(wrench), [])
@@ -257,10 +262,6 @@ class CartController(FeedbackController):
         goals = jnp.broadcast_to(goals, (planner.horizon, *goals.shape))
         self._plan, action = planner(self._plan, state, goals)
         return np.asarray(action)
-
-    def _handled(self, model: Model, held: int) -> Handled:
-        strength, handles = as_floating(self._task.strength), as_floating(self._task.handles)
-        return Handled(inner=model, held=jnp.asarray(held), strength=strength, handle=handles)
 
     def _touching(self, poses: np.ndarray) -> np.ndarray:
         """Which pieces (bodies,) are near another or a wall."""
@@ -409,11 +410,4 @@ def _datum(features: Features, before: PlanarState, wrench: Array, after: Planar
     return inputs, features.change(before, after), condition
 
 
-@jax.jit
-def _estimated(tracker: Planar, frames: Array) -> PlanarState:
-    return tracker.initial_state(frames)
-
-
-@jax.jit
-def _wrench(handled: Handled, pose: Array, action: Array) -> Array:
-    return handled.wrench(pose, action)
+_estimated, _wrench = jax.jit(Planar.initial_state), jax.jit(Handled.wrench)

@@ -69,14 +69,14 @@ def read_described(path: str | Path) -> Map:
     for key in ("robot", "start", "bounds", "cell_size"):
         if key not in content:
             raise PalpateError(f"{path} lacks {key}")
-    walls = content.get("walls", [])
-    if not isinstance(walls, list):
-        raise PalpateError(f"{path} has walls that are no list of outlines")
+    walls = list_of(content.get("walls", []), f"walls of {path}", "a list of outlines")
     name = content.get("name", path.stem)
     if not isinstance(name, str):
         raise PalpateError(f"{path} has the name {shown(name)}: expected a text")
     solid = shapely.union_all([_wall(wall, f"wall {k}") for k, wall in enumerate(walls)])
-    bounds = _bounds(content["bounds"], str(path))
+    what = f"bounds of {path}"
+    sides = list_of(content["bounds"], what, "[left, bottom, right, top] in m", lengths=(4,))
+    bounds = tuple(number(side, what) for side in sides)
     return described_map(name, str(path), content, solid, bounds, content["cell_size"])
 
 
@@ -93,7 +93,7 @@ def described_map(
         movables=movables_from(content.get("movables", {}), what),
         robot=robot_from(content["robot"], what),
         start=content["start"],
-        goals=goals_from(content.get("goals", []), what),
+        goals=list_of(content.get("goals", []), f"goals of {what}", "a list of [x, y, theta]"),
         bounds=bounds,
         cell_size=number(content.get("cell_size", cell), f"cell_size of {what}"),
         margin=number(content["margin"], f"margin of {what}") if "margin" in content else None,
@@ -204,6 +204,13 @@ def keys_of(content: Any, what: str, meant: str = "keys and values") -> dict[str
     return dict(content)
 
 
+def list_of(value: Any, what: str, meant: str, lengths: tuple[int, ...] = ()) -> list[Any]:
+    """A list, of one of the `lengths` if there are any; raises `PalpateError` for anything else."""
+    if not isinstance(value, list) or (lengths and len(value) not in lengths):
+        raise PalpateError(f"{what}: expected {meant}, not {shown(value)}")
+    return value
+
+
 def robot_from(content: Any, what: str) -> Robot:
     """The robot that `content` describes; see the head of this file."""
     item = checked_keys(content, f"robot of {what}", _ROBOT_KEYS)
@@ -249,13 +256,6 @@ def _at(name: str, corners: Any, pose: Pose, hints: dict[str, Any], what: str) -
     return Movable(name, outline, (float(x), float(y), pose[2]), hints)
 
 
-def goals_from(content: Any, what: str) -> list[Any]:
-    """A list of goal poses; raises `PalpateError` for anything else."""
-    if not isinstance(content, list):
-        raise PalpateError(f"goals of {what}: expected a list of [x, y, theta]")
-    return content
-
-
 def number(value: Any, what: str) -> float:
     """A finite number; raises `PalpateError` for anything else."""
     found = math.nan
@@ -276,19 +276,10 @@ def truth(value: Any, what: str) -> bool:
     raise PalpateError(f"{what} is {shown(value)}: expected 0, 1, true or false")
 
 
-def _bounds(value: Any, what: str) -> tuple[float, float, float, float]:
-    if not isinstance(value, list) or len(value) != 4:
-        raise PalpateError(f"bounds of {what}: expected [left, bottom, right, top] in m")
-    left, bottom, right, top = (number(side, f"bounds of {what}") for side in value)
-    return left, bottom, right, top
-
-
 def _wall(value: Any, what: str) -> BaseGeometry:
     item = value if isinstance(value, Mapping) else {"outline": value}
     item = checked_keys(item, what, {"outline", "holes"})
     outline = checked_polygon(item.get("outline", []), what)
-    holes = item.get("holes", [])
-    if not isinstance(holes, list):
-        raise PalpateError(f"{what} has holes that are no list of outlines")
+    holes = list_of(item.get("holes", []), f"holes of {what}", "a list of outlines")
     every = [checked_polygon(hole, f"a hole of {what}") for hole in holes]
     return outline.difference(shapely.union_all(every)) if every else outline

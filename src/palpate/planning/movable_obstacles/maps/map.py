@@ -63,16 +63,12 @@ class Movable:
     @cached_property
     def polygon(self) -> Polygon:
         """Where it stands."""
-        return self.polygon_at(self.pose)
+        return Polygon(placed(self.outline, self.pose))
 
     @cached_property
     def radius(self) -> float:
         """Of the disc about its centroid that holds it, m."""
         return circumscribed_radius(self.outline)
-
-    def polygon_at(self, pose: Pose | np.ndarray) -> Polygon:
-        """Where it would stand."""
-        return Polygon(placed(self.outline, np.asarray(pose)))
 
     def moved(self, pose: Pose | np.ndarray) -> "Movable":
         """The same at another pose."""

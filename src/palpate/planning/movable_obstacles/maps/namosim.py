@@ -14,7 +14,13 @@ import shapely
 
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import checked_pose, circumscribed_radius, shown
-from palpate.planning.movable_obstacles.maps.description import keys_of, number, truth, with_hints
+from palpate.planning.movable_obstacles.maps.description import (
+    keys_of,
+    list_of,
+    number,
+    truth,
+    with_hints,
+)
 from palpate.planning.movable_obstacles.maps.map import Map, Pose, Robot, map_of
 from palpate.planning.movable_obstacles.maps.ros import described, read_grid
 from palpate.planning.movable_obstacles.maps.svg import (
@@ -95,10 +101,8 @@ def _agent(content: Any, drawing: Drawing | None, what: str) -> tuple[Robot, Pos
             )
         outline, place = drawn
         return replace(robot, radius=circumscribed_radius(outline), outline=outline), place
-    if not isinstance(pose, list) or len(pose) not in (2, 3):
-        raise PalpateError(
-            f"{what} has the initial_pose {shown(pose)}: expected [x, y, angle] in m and degrees"
-        )
-    x, y, *degrees = (number(value, f"initial_pose in {what}") for value in pose)
+    called = f"initial_pose in {what}"
+    pose = list_of(pose, called, "[x, y, angle] in m and degrees", lengths=(2, 3))
+    x, y, *degrees = (number(value, called) for value in pose)
     theta = math.radians(degrees[0]) if degrees else 0.0
-    return robot, checked_pose((x, y, theta), f"initial_pose in {what}")
+    return robot, checked_pose((x, y, theta), called)

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from palpate.numerics.polygons import lines, placed
+from palpate.numerics.polygons import edges_of
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose
 
 _ARC = 8  # chords of a buffer's quarter circle
@@ -52,7 +52,7 @@ class Space:
         fixed, self.movables = set(fixed), dict(world.movables)
         self.fixed = {name: self.movables.pop(name) for name in world.movables if name in fixed}
         walls = [world.walls, *(movable.polygon for movable in self.fixed.values())]
-        edges = [edge for movable in self.fixed.values() for edge in _edges(movable)]
+        edges = [edge for movable in self.fixed.values() for edge in edges_of(movable.polygon)]
         self.wall_tree = shapely.STRtree([*world.wall_edges, *edges])
         self.static = self._blocked_by(walls)
         self.count = np.zeros(self.shape, np.int16)
@@ -204,8 +204,3 @@ def inside(geometry: BaseGeometry, xs: np.ndarray, ys: np.ndarray) -> np.ndarray
     flips = np.zeros((len(ys), len(xs) + 1), np.int32)
     np.add.at(flips, (row, np.searchsorted(xs, crossing)), 1)
     return np.cumsum(flips[:, :-1], axis=1) % 2 == 1
-
-
-def _edges(movable: Movable) -> np.ndarray:
-    corners = placed(movable.outline, np.asarray(movable.pose))
-    return lines(np.stack([corners, np.roll(corners, -1, 0)], axis=1))

@@ -20,6 +20,7 @@ from palpate.planning.movable_obstacles.maps.description import (
     GRID_KEYS,
     described_map,
     keys_of,
+    list_of,
     number,
     read_yaml,
     side_car,
@@ -72,9 +73,7 @@ def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds
     resolution = number(content["resolution"], f"resolution of {path}")
     if not 1e-4 <= resolution <= 100:
         raise PalpateError(f"{path} has the resolution {resolution}: expected m per pixel")
-    origin = content["origin"]
-    if not isinstance(origin, list) or len(origin) not in (2, 3):
-        raise PalpateError(f"{path} has the origin {shown(origin)}: expected [x, y, yaw]")
+    origin = list_of(content["origin"], f"origin of {path}", "[x, y, yaw]", lengths=(2, 3))
     left, bottom, *yaw = (number(value, f"origin of {path}") for value in origin)
     if yaw and abs(yaw[0]) > _LEAST_YAW:
         raise PalpateError(

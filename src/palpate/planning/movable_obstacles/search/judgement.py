@@ -15,8 +15,13 @@ def open_way(search_of: OpeningSearch, settings: Settings, seed: int) -> Opening
     judged = [_ends(search_of, candidate) for candidate in found[:_JUDGED]]
     judged = [ends for ends in judged if ends]
     judged.sort(key=lambda ends: _cost(ends) * search_of.draws / len(ends))
-    openings = (_opening(search_of, ends) for ends in judged)
-    return next((opening for opening in openings if opening is not None), None)
+    for ends in judged:
+        probability = len(ends) / search_of.draws
+        energy = float(np.mean([end.energy for end in ends]))
+        opening = search_of.opening(ends[0], _cost(ends), probability, energy)
+        if opening is not None:  # else there is no way to the grasp
+            return opening
+    return None
 
 
 def _cost(ends: list[State]) -> float:
@@ -36,10 +41,3 @@ def _ends(search_of: OpeningSearch, candidate: Found) -> list[State]:
         if state.opened:
             ends.append(state)
     return ends
-
-
-def _opening(search_of: OpeningSearch, ends: list[State]) -> Opening | None:
-    """What succeeds in the draws of `ends`; None if there is no way to the grasp."""
-    probability = len(ends) / search_of.draws
-    energy = float(np.mean([end.energy for end in ends]))
-    return search_of.opening(ends[0], _cost(ends), probability, energy)

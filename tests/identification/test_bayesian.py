@@ -14,7 +14,7 @@ from palpate.identification.data.segments import cut
 from palpate.identification.posterior.comparison import posterior_of
 from palpate.identification.posterior.laplace import Modes
 from palpate.identification.posterior.likelihood import known_scales, motion_posterior
-from palpate.identification.posterior.posterior import SAMPLERS, Sampler, draw, preparing, sample
+from palpate.identification.posterior.posterior import SAMPLERS, Sampler, preparing, sample
 from palpate.identification.posterior.settled import Part, Settled, settle_each
 
 TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
@@ -110,7 +110,7 @@ def test_a_sampler_that_was_compiled_during_the_search_is_not_compiled_again():
         settled = settle_each(target, jax.random.key(0))
     assert "_walked" in names
     with compiled() as names:
-        draw(settled, chains=6, draws=4)
+        sample(settled, chains=6, draws=4)
     assert not names
 
 
@@ -141,7 +141,7 @@ def test_fewer_draws_than_can_be_judged_are_refused_at_once(monkeypatch):
         with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
             sample(target, **few)
         with pytest.raises(PalpateError, match="expected at least 1 chain of 4 draws"):
-            draw(Settled(target, (part,)), **few)
+            sample(Settled(target, (part,)), **few)
 
 
 def test_a_posterior_of_too_many_coordinates_is_for_the_no_u_turn_sampler(posterior, monkeypatch):
@@ -149,7 +149,7 @@ def test_a_posterior_of_too_many_coordinates_is_for_the_no_u_turn_sampler(poster
         "palpate.identification.posterior.posterior.WIDEST", posterior.target.dimension - 1
     )
     with compiled({"_block", "_walked"}) as names:
-        found = draw(posterior.settled, chains=4, draws=150)
+        found = sample(posterior.settled, chains=4, draws=150)
     assert names == {"_block"}
     assert found.draws.position.shape == (4, 150, posterior.target.dimension)
     np.testing.assert_allclose(

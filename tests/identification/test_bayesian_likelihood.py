@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+import hinge
 from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import residuals
@@ -294,3 +295,33 @@ def test_a_draw_without_a_finite_motion_is_named():
     draws[3] = np.nan
     with pytest.raises(PalpateError, match="draw 3 of the posterior predicts no finite motion"):
         predict(target, draws, pieces, 0)
+
+
+@pytest.mark.usefixtures("float64")
+def test_the_most_probable_error_of_a_start_is_found_where_the_model_is_not_linear_in_it():
+    """A start that is far off: rounds about it find it, and the likelihood is that of a good one.
+
+    The hinge begins near the top, so that its motion is not linear in where it begins.
+    """
+    recording = hinge.recorded(0, trials=2, seconds=1.0)
+    good = cut(recording, hinge.TRUE, 1.0)
+    off = jnp.asarray([[[1.5], [-1.0]], [[-1.0], [1.5]]])  # pose and rate, in vague deviations
+    wide = eqx.tree_at(
+        lambda s: (s.pose_deviation, s.rate_deviation),
+        good,
+        (0.05 + 0.0 * good.pose, 0.3 + 0.0 * good.rate),
+    )
+    bad = wide.moved(off)
+    scales = known_scales(hinge.TRUE, np.array([hinge.NOISE]))
+    found = {}
+    for name, pieces, rounds in (("good", wide, 3), ("bad", bad, 3), ("linear", bad, 0)):
+        target = motion_posterior(hinge.TRUE, pieces, scales, ringing=True)
+        position = initial_position(target)
+        found[name] = target.linearised(position, rounds)
+    start = found["good"].error - off.reshape(2, 2)
+    assert np.allclose(found["bad"].error, start, atol=0.01)
+    densities = {name: float(t.log_likelihood(position)) for name, t in found.items()}
+    # The two differ by the prior of the starts' errors, half a square each.
+    prior = 0.5 * float(jnp.sum(jnp.square(start)) - jnp.sum(jnp.square(found["good"].error)))
+    assert densities["bad"] == pytest.approx(densities["good"] - prior, abs=0.5)
+    assert densities["linear"] < densities["good"] - 50.0

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import hinge
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import observation_scale, predict, prediction_error
 from palpate.identification.data.segments import SegmentSource
@@ -322,34 +321,3 @@ def test_an_infinite_gradient_shortens_the_horizon_for_a_while(monkeypatch, tmp_
     jax.clear_caches()
     with pytest.raises(PalpateError, match="however short the horizon"):
         identify(Cart(mass=1.0, friction=0.5), aligned, settings)
-
-
-FRICTION = ("inertia", "damping", "friction")
-
-
-def covered(method, seeds, iterations):
-    """How often the 90 % interval of each parameter of a hinge holds its true value."""
-    inside = dict.fromkeys(FRICTION, 0)
-    for seed in range(seeds):
-        aligned = hinge.recorded(seed)
-        found = identify(hinge.START, aligned, Settings(method=method, iterations=iterations))
-        coordinates = FreeParameters(found)
-        bounds = intervals(coordinates, coordinates.initial, aligned)
-        for name in FRICTION:
-            true = getattr(hinge.TRUE, name)
-            assert float(getattr(found, name)) == pytest.approx(float(true), rel=0.1)
-            inside[name] += bool(bounds.lower[name] <= true <= bounds.upper[name])
-    return inside
-
-
-def test_a_hinge_is_told_by_noisy_angles_that_wrap():
-    """A start from two frames alone made its damping .05 for a true .3, and unwrapped angles 52."""
-    assert min(covered("levenberg-marquardt", 4, (3, 3, 8)).values()) >= 3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "iterations"), [("levenberg-marquardt", (3, 3, 10)), ("adam", (60, 60, 240))]
-)
-def test_intervals_of_a_hinge_hold_the_truth(method, iterations):
-    assert min(covered(method, 20, iterations).values()) >= 16

@@ -54,8 +54,8 @@ def run(options: Identify) -> Path:
     if options.residual:  # now, and not after the physics was fitted
         check_correctable(reference, data.fitted_aligned)
     if not options.fits:
-        cut_pieces(data.fitted_aligned, reference)
-        check_seen(cut_pieces(data.validation_aligned, reference))
+        cut_pieces(data.fitted_aligned, reference, options.piece)
+        check_seen(cut_pieces(data.validation_aligned, reference, options.piece))
     product = folders.MODEL if options.fits else DRAWS
     inputs = {"recordings": options.recordings, "validate": options.validate}
     if options.init is not None:
@@ -75,6 +75,7 @@ def run(options: Identify) -> Path:
                 draws=options.draws,
                 seed=options.seed,
                 one_object=options.one_object,
+                piece=options.piece,
                 run=run,
             )
             hypotheses = dataclasses.replace(hypotheses, models=models)
@@ -193,7 +194,7 @@ def _write_draws(
     if options.arviz is not None:
         write_netcdf(run.path / NETCDF, posterior)
     model = posterior.target.coordinates.reference
-    pieces = cut_pieces(data.validation_aligned, model)
+    pieces = cut_pieces(data.validation_aligned, model, options.piece)
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
     write_evidence(run.path, identify_report.expected_errors(predicted, pieces, model))
     settings = {

@@ -141,6 +141,7 @@ class Identify(Reading, ABC):
     observation: ClassVar[str]  # the channel that is predicted
     held_out: ClassVar[float] = 0.25  # of the trials, where no recording for validation is given
     one_object: ClassVar[bool] = False  # points of one thing are observed, with one noise
+    piece: ClassVar[float] = 2.0  # s of motion that draws predict open loop
 
     recordings: Positional[
         Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]

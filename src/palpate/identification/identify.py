@@ -9,6 +9,7 @@ which draws compare and a fit cannot.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -19,13 +20,14 @@ from palpate.family import check_name
 from palpate.identification.gradient import descent
 from palpate.identification.gradient.descent import Settings
 from palpate.identification.gradient.least_squares import Intervals, intervals
-from palpate.identification.posterior.comparison import Comparison, compare, posterior_of
+from palpate.identification.posterior.comparison import PIECE, Comparison, compare, posterior_of
 from palpate.identification.posterior.posterior import SAMPLERS, Posterior
 from palpate.identification.verdicts import verdict
 from palpate.models.model import Model
 from palpate.parameters import FreeParameters
 from palpate.recordings import Aligned
 from palpate.runs import Run
+from palpate.runs.progress import progress
 
 FITS = {"gradient": "adam", "levenberg-marquardt": "levenberg-marquardt"}  # how each descends
 METHODS = (*FITS, *SAMPLERS)
@@ -59,13 +61,15 @@ def identify(
     draws: int | None = None,
     seed: int = 0,
     one_object: bool = False,
+    piece: float = PIECE,
     run: Run | None = None,
 ) -> Identified:
     """Identify the free parameters of a model from aligned trials by one of `METHODS`.
 
     `model` is where it starts, and says what is free, shared or fixed; or hypotheses by name.
     `settings` and `run` are those of a fit (`descent.identify`; its method and seed are taken from
-    here); `chains`, `draws` and `one_object` those of draws (`posterior.sample`, `posterior_of`).
+    here); `chains` and `draws` those of draws (`posterior.sample`), as are `one_object` and the
+    seconds of a `piece` (`posterior_of`).
 
     Raises `PalpateError` for an unknown method, several hypotheses to a fit, and as those do.
     """
@@ -81,9 +85,10 @@ def identify(
         (start,) = hypotheses.values()
         return fitted(start, aligned, settings, run)
     targets = {
-        name: posterior_of(one, aligned, one_object=one_object) for name, one in hypotheses.items()
+        name: posterior_of(one, aligned, one_object, piece) for name, one in hypotheses.items()
     }
-    return drawn(compare(targets, draws, chains, seed, method))
+    watch = functools.partial(progress, description="a posterior")
+    return drawn(compare(targets, draws, chains, seed, method, watch))
 
 
 def fitted(start: Model, aligned: Aligned, settings: Settings, run: Run | None) -> Identified:

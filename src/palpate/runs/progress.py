@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import Any
 
 
@@ -123,3 +123,12 @@ def progress(steps: Iterable[Any] | int, description: str, done: int = 0) -> Pro
     before, in the work that is now resumed.
     """
     return Progress(steps, description, done)
+
+
+# Goes through the rounds of a search or a sampler as they are done, and may show how far it is.
+Watch = Callable[[Sequence[Any]], Iterable[Any]]
+
+
+def unwatched(rounds: Sequence[Any]) -> Sequence[Any]:
+    """The rounds as they are: nobody is shown how far it is."""
+    return rounds

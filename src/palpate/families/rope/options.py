@@ -125,6 +125,7 @@ class IdentifyRope(Identify):
     family: ClassVar[str] = "rope"
     observation: ClassVar[str] = "markers"
     one_object: ClassVar[bool] = True
+    piece: ClassVar[float] = 5.0  # a rope forgets where it began, and the fewer starts the better
 
     driven: Annotated[
         tuple[int, ...],

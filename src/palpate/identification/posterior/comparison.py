@@ -19,12 +19,13 @@ from palpate.identification.posterior.posterior import (
     LOCAL_GLOBAL,
     Posterior,
     check_numbers,
-    draw,
     preparing,
+    sample,
 )
 from palpate.identification.posterior.settled import Settled, settle_each
 from palpate.models.model import Model
 from palpate.recordings import Aligned
+from palpate.runs.progress import Watch, unwatched
 
 PIECE = 2.0  # s, of what is fitted, and of what is predicted open loop
 STILL = 0.1  # s
@@ -45,26 +46,31 @@ def compare(
     chains: int | None = None,
     seed: int = 0,
     method: str = LOCAL_GLOBAL,
+    watch: Watch = unwatched,
 ) -> Comparison:
     """Compare hypotheses by their evidence and sample the posterior of the most probable.
 
     The evidence is Laplace's at the best mode of each: tempered particles (`tempered.temper`) give
     it without the assumption of a normal posterior, and take many times as long. Raises as
-    `posterior.draw`.
+    `posterior.sample`.
     """
     check_numbers(chains, draws)
     with preparing(next(iter(targets.values())), chains, method):
-        explored = explore(targets, seed)
+        explored = explore(targets, seed, watch)
     probability = shares({name: settled.evidence for name, settled in explored.items()})
     structure = max(probability, key=probability.__getitem__)
-    posterior = draw(explored[structure], method, chains=chains, draws=draws, seed=seed)
+    posterior = sample(
+        explored[structure], method, chains=chains, draws=draws, seed=seed, watch=watch
+    )
     return Comparison(posterior, structure, probability)
 
 
-def explore(targets: Mapping[str, MotionPosterior], seed: int = 0) -> dict[str, Settled]:
+def explore(
+    targets: Mapping[str, MotionPosterior], seed: int = 0, watch: Watch = unwatched
+) -> dict[str, Settled]:
     """The modes of each."""
     key = jax.random.fold_in(jax.random.key(seed), 1)
-    return {name: settle_each(target, key) for name, target in targets.items()}
+    return {name: settle_each(target, key, watch) for name, target in targets.items()}
 
 
 def shares(logarithms: Mapping[str, float]) -> dict[str, float]:
@@ -79,11 +85,12 @@ def posterior_of(
 ) -> MotionPosterior:
     """What is to be sampled: of pieces of the trials, the first of each from rest if it is so.
 
-    `one_object`: see `inferred_scales`.
+    With `one_object` the leading entries of an observation are points of one thing: they share
+    noise scales (`inferred_scales`), and ring where their start is off (`motion_posterior`).
     """
     scales = inferred_scales(model, noise_scale(aligned, model), one_object)
     pieces = cut_pieces(aligned, model, seconds)
-    return motion_posterior(model, pieces, scales).with_one_rotation()
+    return motion_posterior(model, pieces, scales, ringing=one_object).with_one_rotation()
 
 
 def cut_pieces(aligned: Aligned, model: Model, seconds: float = PIECE) -> Segments:

@@ -17,6 +17,7 @@ from palpate.errors import PalpateError
 from palpate.identification.posterior.likelihood import MotionPosterior, initial_position
 from palpate.identification.samplers.target import Target
 from palpate.numerics.devices import compiled_at_once, over_devices
+from palpate.runs.progress import Watch, unwatched
 
 LONGEST = 1.5  # prior standard deviations that a step may have
 DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
@@ -25,6 +26,8 @@ HOPED = 1e3  # gain before the first step: nine refusals in a row do not end a c
 MOST = 1e13  # information in one direction; the prior's is one
 ROUNDING = 1e-14  # of an eigenvalue by the size of the greatest
 ROUNDS = 3  # in which the start's errors are propagated anew
+MENDING = 2  # rounds of Gauss and Newton, each time, that find the most probable errors
+MENDED = 6  # rounds in which they are propagated where those are found as well
 WIDE = 2.0  # prior standard deviations: scales while starts are screened
 STARTS, SCREENING = 24, 25  # of a search, and the steps of each
 FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on for
@@ -82,6 +85,7 @@ def climb_each(
     position: Float[np.ndarray, "starts free"],
     steps: int = 40,
     moving: Bool[np.ndarray, " free"] | None = None,
+    watch: Watch = unwatched,
 ) -> Modes:
     """Climb side by side, with density, slope and `curvature` at positions shaped like these.
 
@@ -92,7 +96,7 @@ def climb_each(
     value, slope, information = _finite(curvature, here)
     damping = np.full(value.shape, DAMPING[0])
     gained = np.full(value.shape, HOPED)
-    for _ in range(steps):
+    for _ in watch(range(steps)):
         if np.all(gained < SETTLED):
             break
         diagonal = np.einsum("...ii->...i", information)
@@ -137,6 +141,7 @@ def search(
     curvature: Callable[[Array], tuple[ArrayLike, ...]],
     position: Float[np.ndarray, "starts free"],
     moving: Bool[np.ndarray, " free"],
+    watch: Watch = unwatched,
 ) -> Modes:
     """Climb from many starts for a few steps, and from where the best of them are to the top.
 
@@ -144,8 +149,8 @@ def search(
     `moving` coordinates climb at first: scales that are free as well would grow until all that
     happened is the model's discrepancy, and leave most climbs there.
     """
-    screened = climb_each(curvature, position, SCREENING, moving)
-    return climb_each(curvature, np.asarray(screened.position[:FOLLOWED]), CLIMBING)
+    screened = climb_each(curvature, position, SCREENING, moving, watch)
+    return climb_each(curvature, np.asarray(screened.position[:FOLLOWED]), CLIMBING, None, watch)
 
 
 def look(
@@ -190,7 +195,9 @@ def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
     return over_devices(lambda target, part: target.curvatures(part))(target, position)
 
 
-def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior, Modes]:
+def settle(
+    target: MotionPosterior, key: PRNGKeyArray, watch: Watch = unwatched
+) -> tuple[MotionPosterior, Modes]:
     """Modes, and the target linearised about the best of them, by turns.
 
     The reference model is among the starts. Raises `PalpateError` when the density is finite at
@@ -200,10 +207,10 @@ def settle(target: MotionPosterior, key: PRNGKeyArray) -> tuple[MotionPosterior,
     position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
     parameters = np.arange(target.dimension) < target.parameters
     position = np.where(parameters, position, WIDE)
-    modes = _found(target, search(functools.partial(_each, target), position, parameters))
+    modes = _found(target, search(functools.partial(_each, target), position, parameters, watch))
     if target.sensitivity is None:
         return target, modes
-    for _ in range(ROUNDS - 1):
-        target = target.linearised(modes.position[0])
+    for _ in range((ROUNDS if target.error is None else MENDED) - 1):
+        target = target.linearised(modes.position[0], MENDING)
         modes = climb(target, modes.position, CLIMBING)
     return target, modes

@@ -9,7 +9,8 @@ piece, plus
   An s and a w for each unit of each body;
 - what errors of the initial pose and rate become: linear in them, with the derivatives of a model
   nearby (`linearised`), and marginalised in closed form. The smoothed start has seen the piece's
-  own frames, so its deviation is widened (`Segments.moved`), and the piece decides.
+  own frames, so its deviation is widened (`Segments.moved`), and the piece decides. Where a start
+  that is off makes the model ring, the derivatives are those at the most probable errors.
 
 The scales s and w are inferred beside the parameters. The covariance of the discrepancy has the
 same eigenvectors whatever its scale, so that all but the rollout is elementwise.
@@ -29,9 +30,10 @@ from palpate.identification.posterior.discrepancy import eigenvectors
 from palpate.identification.samplers.target import Target
 from palpate.models.model import Model
 from palpate.numerics.devices import compiled_at_once
-from palpate.numerics.small_systems import cholesky, solve_lower
+from palpate.numerics.small_systems import cholesky, solve, solve_lower
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
 
+FARTHEST = 4.0  # vague standard deviations that an error of a start may be found to have
 NOISE_SPREAD = 0.7  # standard deviation of the logarithm of s about what the sensor seems to have
 GROWTH_RATIO, GROWTH_SPREAD = 3.0, 1.5  # median of w over that of s (after 1 s), and its spread
 
@@ -109,6 +111,8 @@ class MotionPosterior(Target):
     sensitivity: Float[Array, "segments starts channels time"] | None  # of rotated residuals
     # Sums over channels of products of sensitivities, where one variance is that of all channels.
     products: Float[Array, "segments starts starts time"] | None = None
+    # Errors of the starts, in vague standard deviations, at which the sensitivity is taken.
+    error: Float[Array, "segments starts"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -218,15 +222,22 @@ class MotionPosterior(Target):
             matrix -= jnp.einsum("wqi,wqj->ij", half, half)
         return matrix + jnp.eye(len(slope))
 
-    def linearised(self, position: Float[Array, " free"]) -> "MotionPosterior":
-        """The same with start errors propagated by the derivatives of the model at `position`."""
+    def linearised(self, position: Float[Array, " free"], rounds: int = 0) -> "MotionPosterior":
+        """The same with start errors propagated by the derivatives of the model at `position`.
+
+        `rounds` of Gauss and Newton find the most probable errors there, to take the derivatives
+        at, if the target has any `error`.
+        """
         if self.sensitivity is None:
             return self
         found = _sensitivity(self, position)
         target = eqx.tree_at(lambda t: t.sensitivity, self, found)
-        if self.products is None:
+        if self.products is not None:
+            target = eqx.tree_at(lambda t: t.products, target, _products(found))
+        if self.error is None or not rounds:
             return target
-        return eqx.tree_at(lambda t: t.products, target, _products(found))
+        likely = eqx.tree_at(lambda t: t.error, target, _likely_error(target, position))
+        return likely.linearised(position, rounds - 1)
 
     def with_one_rotation(self) -> "MotionPosterior":
         """The same where something is not seen; else with the eigenvectors that all pieces share.
@@ -240,15 +251,23 @@ class MotionPosterior(Target):
 
     def _rotated(self, positions: Array) -> tuple[Array, Array]:
         """Residuals (batch, segments, channels, time) along the eigenvectors, and variances."""
-        predicted = self.predicted(positions, self.segments)
+        predicted = self.predicted(positions, self._begun())
 
         def one(position: Array, predicted: Array) -> tuple[Array, Array]:
-            off = residuals(self.coordinates.reference, predicted, self.segments)
+            off = self._rotate(residuals(self.coordinates.reference, predicted, self.segments))
+            if self.error is not None:  # back to what the smoothed starts would give, linearly
+                off -= jnp.einsum("wqct,wq->wct", self.sensitivity, self.error)
             noise = jnp.square(self.noise(position))[:, None]
             growth = jnp.square(self.growth(position))[:, None]
-            return self._rotate(off), noise + growth * self.spectrum
+            return off, noise + growth * self.spectrum
 
         return jax.vmap(one)(positions, predicted)
+
+    def _begun(self) -> Segments:
+        """The pieces, begun where the most probable errors of their starts are mended."""
+        if self.error is None:
+            return self.segments
+        return self.segments.moved(self.error.reshape(-1, 2, *self.segments.pose.shape[1:]))
 
     def _rotate(self, residual: Array) -> Array:
         """From (segments, time, *observation) to (segments, channels, eigenvectors)."""
@@ -282,11 +301,15 @@ class MotionPosterior(Target):
         return solve_lower(self._root(variance), explained)
 
 
-def motion_posterior(model: Model, segments: Segments, scales: Scales) -> MotionPosterior:
+def motion_posterior(
+    model: Model, segments: Segments, scales: Scales, ringing: bool = False
+) -> MotionPosterior:
     """The posterior of a model's free parameters, its prior the declared one.
 
     Errors of the start are propagated by the derivatives of `model` itself until `linearised`
-    about a better one. Raises `PalpateError` for pieces of another observation or action.
+    about a better one; `ringing` says that these are to be taken at the most probable errors, as
+    smoothed ones are too far off. Raises `PalpateError` for pieces of another observation or
+    action.
     """
     expected = (*model.observation_shape,), (*model.action_shape,)
     found = tuple(segments.target.shape[2:]), tuple(segments.action.shape[2:])
@@ -312,6 +335,7 @@ def motion_posterior(model: Model, segments: Segments, scales: Scales) -> Motion
         jnp.asarray(counted, dtype),
         empty if uncertain else None,
         jnp.zeros((segments.count, starts, starts, horizon), dtype) if one_variance else None,
+        jnp.zeros((segments.count, starts), dtype) if uncertain and ringing else None,
     )
     return target.linearised(initial_position(target))
 
@@ -364,7 +388,7 @@ def _legal_values(target: MotionPosterior, position: Array) -> dict[str, Array]:
 @compiled_at_once
 def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     """Derivatives of rotated residuals by the start's errors in vague standard deviations."""
-    segments, model = target.segments, target.model(position)
+    segments, model = target._begun(), target.model(position)
 
     def moved(error: Array) -> Array:
         begun = segments.moved(error.reshape(2, *segments.pose.shape[1:]))
@@ -374,6 +398,16 @@ def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     slope = jax.jacfwd(moved)(jnp.zeros(size, position.dtype))
     columns = jnp.moveaxis(slope, -1, 0)  # (starts, segments, time, *observation)
     return jnp.moveaxis(jax.vmap(target._rotate)(columns), 0, 1)
+
+
+@compiled_at_once
+def _likely_error(target: MotionPosterior, position: Array) -> Array:
+    """The most probable errors of the starts, by the sensitivity that the target has."""
+    residual, variance = (moments[0] for moments in target._rotated(position[None]))
+    weighted = residual * target.counted / variance
+    explained = jnp.einsum("wqct,wct->wq", target.sensitivity, weighted)
+    found = -solve(target._root(variance), explained)
+    return jnp.where(jnp.isfinite(found), jnp.clip(found, -FARTHEST, FARTHEST), 0.0)
 
 
 @eqx.filter_jit

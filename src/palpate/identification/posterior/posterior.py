@@ -10,7 +10,6 @@ what samples it is one of `SAMPLERS`.
 
 import contextlib
 import dataclasses
-import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import cached_property
@@ -38,6 +37,7 @@ from palpate.identification.samplers.tempered import populations
 from palpate.identification.verdicts import undecided
 from palpate.models.model import Model
 from palpate.parameters import value_of
+from palpate.runs.progress import Watch, unwatched
 
 MIXED, EFFECTIVE = 1.01, 400.0  # R-hat and effective sizes to reach (Vehtari et al.)
 WIDEST = 40  # coordinates among which a mixture that proposes can be learnt
@@ -50,7 +50,7 @@ LOCAL_GLOBAL = "local-global"
 class Sampler:
     """What draws from a posterior whose modes are known, and how many chains and draws it wants.
 
-    `run(target, modes, key, chains, draws, tell)` gives `Draws`.
+    `run(target, modes, key, chains, draws, watch)` gives `Draws`.
     """
 
     run: Callable[..., Draws]
@@ -275,27 +275,44 @@ def spread_out(size: int, count: int | None = None) -> Int[np.ndarray, " count"]
 
 
 def sample(
-    target: MotionPosterior,
+    target: MotionPosterior | Settled,
     method: str = LOCAL_GLOBAL,
     *,
     chains: int | None = None,
     draws: int | None = None,
     seed: int = 0,
     probes: Segments | None = None,
-    tell: Callable[[int, int], None] = lambda done, blocks: None,
+    watch: Watch = unwatched,
 ) -> Posterior:
     """Draws of a posterior by one of the `SAMPLERS`, as many as it wants where no number is given.
 
-    Chains are compared by what they predict at the ends of `probes`, by default the pieces that
-    were fitted. `tell(done, blocks)` is called as the sampling goes on. The same seed gives the
-    same draws. Raises `PalpateError` when the likelihood is not finite anywhere, or so few chains
-    or draws are asked for that they cannot be judged.
+    Its modes are searched for unless it is `Settled`. Chains are compared by what they predict at
+    the ends of `probes`, by default the pieces that were fitted. `watch` goes through the rounds of
+    the search and of the sampling. The same seed gives the same draws.
+
+    A factor of too many coordinates for a mixture to be learnt in is for the no-U-turn sampler even
+    where "local-global" is asked for; `Posterior.sampler` then says so. Raises `PalpateError` when
+    the likelihood is not finite anywhere, or so few chains or draws are asked for that they cannot
+    be judged.
     """
     check_numbers(chains, draws)
-    climbing, _ = jax.random.split(jax.random.key(seed))
-    with preparing(target, chains, method):
-        settled = settle_each(target, climbing)
-    return draw(settled, method, chains=chains, draws=draws, seed=seed, probes=probes, tell=tell)
+    check_name("sampler", method, SAMPLERS)
+    climbing, sampling = jax.random.split(jax.random.key(seed))
+    if isinstance(target, MotionPosterior):
+        with preparing(target, chains, method):
+            target = settle_each(target, climbing, watch)
+    chosen = [
+        "nuts" if method == LOCAL_GLOBAL and part.target.dimension > WIDEST else method
+        for part in target.parts
+    ]
+    fewest = min((SAMPLERS[name] for name in chosen), key=lambda sampler: sampler.chains)
+    numbers, found = (chains or fewest.chains, draws or fewest.draws), []
+    for number, (name, part) in enumerate(zip(chosen, target.parts, strict=True)):
+        key = jax.random.fold_in(sampling, number) if number else sampling
+        found.append(SAMPLERS[name].run(part.target, part.modes, key, *numbers, watch))
+    every = joined(target, found, jax.random.fold_in(sampling, len(found)))
+    probes = target.target.segments if probes is None else probes
+    return Posterior(target, every, probes, " and ".join(dict.fromkeys(chosen)))
 
 
 def preparing(
@@ -306,44 +323,6 @@ def preparing(
     if method != LOCAL_GLOBAL or first.dimension > WIDEST:
         return contextlib.nullcontext()
     return compiled_meanwhile(first, chains or CHAINS)
-
-
-def draw(
-    settled: Settled,
-    method: str = LOCAL_GLOBAL,
-    *,
-    chains: int | None = None,
-    draws: int | None = None,
-    seed: int = 0,
-    probes: Segments | None = None,
-    tell: Callable[[int, int], None] = lambda done, blocks: None,
-) -> Posterior:
-    """As `sample`, for a target whose modes are known.
-
-    A factor of too many coordinates for a mixture to be learnt in is for the no-U-turn sampler even
-    where "local-global" is asked for; `Posterior.sampler` then says so.
-    """
-    check_numbers(chains, draws)
-    _, sampling = jax.random.split(jax.random.key(seed))
-    check_name("sampler", method, SAMPLERS)
-    chosen = [
-        "nuts" if method == LOCAL_GLOBAL and part.target.dimension > WIDEST else method
-        for part in settled.parts
-    ]
-    fewest = min((SAMPLERS[name] for name in chosen), key=lambda sampler: sampler.chains)
-    numbers, found = (chains or fewest.chains, draws or fewest.draws), []
-    for number, (name, part) in enumerate(zip(chosen, settled.parts, strict=True)):
-        key = jax.random.fold_in(sampling, number) if number else sampling
-        told = functools.partial(_told, tell, number, len(settled.parts))
-        found.append(SAMPLERS[name].run(part.target, part.modes, key, *numbers, told))
-    every = joined(settled, found, jax.random.fold_in(sampling, len(found)))
-    probes = settled.target.segments if probes is None else probes
-    return Posterior(settled, every, probes, " and ".join(dict.fromkeys(chosen)))
-
-
-def _told(tell: Callable[[int, int], None], part: int, parts: int, done: int, rounds: int) -> None:
-    """Tell how much is done of all parts, when so much is of one."""
-    tell(part * rounds + done, parts * rounds)
 
 
 def check_numbers(chains: int | None, draws: int | None) -> None:

@@ -21,6 +21,7 @@ from palpate.identification.samplers.draws import Draws
 from palpate.identification.samplers.target import log_prior
 from palpate.models.model import Model
 from palpate.parameters import value_of, with_values
+from palpate.runs.progress import Watch, unwatched
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,17 +59,17 @@ class Settled:
         return self.target.model(jnp.asarray(self.position))
 
 
-def settle_each(target: MotionPosterior, key: PRNGKeyArray) -> Settled:
+def settle_each(target: MotionPosterior, key: PRNGKeyArray, watch: Watch = unwatched) -> Settled:
     """Settle what is independent of the rest by itself; raises as `settle`.
 
     What several bodies need is then not to be met with by luck in one of the starts of a search.
     """
     factors = factors_of(target)
     if len(factors) == 1:
-        target, modes = settle(target, key)
+        target, modes = settle(target, key, watch)
         return Settled(target, (Part(target, modes, factors[0][1]),))
     keys = jax.random.split(key, len(factors))
-    settled = [settle(of, k) for (of, _), k in zip(factors, keys, strict=True)]
+    settled = [settle(of, k, watch) for (of, _), k in zip(factors, keys, strict=True)]
     pairs = zip(settled, factors, strict=True)
     return Settled(target, tuple(Part(*found, where) for found, (_, where) in pairs))
 

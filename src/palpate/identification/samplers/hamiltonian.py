@@ -7,7 +7,6 @@ to its acceptance; then both are kept.
 """
 
 import time
-from collections.abc import Callable
 
 import blackjax
 import equinox as eqx
@@ -22,6 +21,7 @@ from palpate.identification.samplers.draws import Draws, begun, pooled, time_to_
 from palpate.identification.samplers.target import Target
 from palpate.numerics.devices import compiled_sooner, over_devices
 from palpate.numerics.small_systems import solve_lower, solve_upper
+from palpate.runs.progress import Watch, unwatched
 
 BLOCK = 50  # draws between two looks at the chains: one compiled piece of work
 WARM_UP = 4  # blocks
@@ -50,11 +50,11 @@ def no_u_turn(
     key: PRNGKeyArray,
     chains: int = 4,
     draws: int = 300,
-    tell: Callable[[int, int], None] = lambda done, blocks: None,
+    watch: Watch = unwatched,
 ) -> Draws:
     """Sample `draws` of each of `chains`, rounded up to whole blocks, after the warm-up.
 
-    Chains begin at draws of the modes' mixture. `tell(done, blocks)` is called after every block.
+    Chains begin at draws of the modes' mixture.  `watch` goes through the blocks.
     Raises `PalpateError` when the density is not finite where a chain begins.
     """
     began = time.monotonic()
@@ -64,7 +64,7 @@ def no_u_turn(
     covariance = np.asarray(modes.covariance[0], np.float64)
     step = np.full(chains, np.log(1.2 * target.dimension**-0.25))
     blocks, leaps, spent = [], [], []
-    for index, block_key in enumerate(keys):
+    for index, block_key in enumerate(watch(keys)):
         gain = GAIN if index < WARM_UP else 0.0
         root, now = jnp.asarray(np.linalg.cholesky(covariance), position.dtype), time.monotonic()
         # From the host each time: placed otherwise than before, it would be compiled anew.
@@ -83,7 +83,6 @@ def no_u_turn(
                 covariance = pooled(block.position, covariance)
         else:
             blocks.append(block)
-        tell(index + 1, len(keys))
     return Draws(
         position=np.concatenate([b.position for b in blocks], axis=1)[:, :draws],
         density=np.concatenate([b.density for b in blocks], axis=1)[:, :draws],

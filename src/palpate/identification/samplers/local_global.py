@@ -17,7 +17,7 @@ All chains step at once, so that their densities are computed side by side.
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -30,6 +30,7 @@ from palpate.identification.samplers.draws import Draws, begun, pooled, time_to_
 from palpate.identification.samplers.mixture import DEGREES, Mixture, fit_mixture, one_of
 from palpate.identification.samplers.target import Target, log_prior
 from palpate.numerics.devices import compiled_sooner, over_devices, own_device
+from palpate.runs.progress import Watch, unwatched
 
 CHAINS = 32  # 16 a core: a vector of as many numbers is computed as soon as one of fewer
 STEPS = 3  # between two draws, for each coordinate
@@ -50,11 +51,11 @@ def local_global(
     key: PRNGKeyArray,
     chains: int = CHAINS,
     draws: int = 100,
-    tell: Callable[[int, int], None] = lambda done, rounds: None,
+    watch: Watch = unwatched,
 ) -> Draws:
     """Sample `draws` of each of `chains` after the warm-up.
 
-    Chains begin at draws of the modes' mixture. `tell(done, rounds)` is called after every round.
+    Chains begin at draws of the modes' mixture. `watch` goes through the rounds.
     In the warm-up the mixture, the covariance and the length of steps are learnt from all chains;
     then they are kept. Raises `PalpateError` when the density is not finite where a chain begins.
     """
@@ -70,7 +71,7 @@ def local_global(
     flat[:flattened] = np.linspace(FLATTEST, 1.0, flattened, endpoint=False)
     looks = [ROUND] * ROUNDS + [ROUND] * (draws // ROUND) + [draws % ROUND] * (draws % ROUND > 0)
     positions, values, accepted, spent, evaluations, learnt = [], [], [], [], [], 0
-    for index, count in enumerate(looks):
+    for index, count in enumerate(watch(looks)):
         now, learning = time.monotonic(), index < ROUNDS
         power = flat if index < ROUNDS - STRAIGHT else np.ones_like(flat)
         steps = -(-size // LOOKS) if learning else STEPS * size
@@ -96,7 +97,6 @@ def local_global(
                 known = np.concatenate(positions[-int(np.ceil(REMEMBERED * learnt)) :], axis=1)
                 known = known.reshape(-1, size)
                 mixture, covariance = fit_mixture(known, covariance), pooled(known, covariance)
-        tell(index + 1, len(looks))
     return Draws(
         position=np.concatenate(positions[ROUNDS:], axis=1),
         density=np.concatenate(values[ROUNDS:], axis=1),

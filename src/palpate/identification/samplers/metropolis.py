@@ -10,7 +10,6 @@ Yang, J. Am. Stat. Assoc. 104, 2009). In both the length of the steps is steered
 """
 
 import time
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -22,6 +21,7 @@ from palpate.identification.posterior.laplace import Modes
 from palpate.identification.samplers.draws import Draws, begun, check_start, time_to_compile
 from palpate.identification.samplers.target import Target
 from palpate.numerics.devices import over_devices
+from palpate.runs.progress import Watch, unwatched
 
 ACCEPTANCE = 0.234
 LOOKS = 20  # at the chains during the warm-up
@@ -40,22 +40,20 @@ def metropolis(
     key: PRNGKeyArray,
     chains: int,
     draws: int,
-    tell: Callable[[int, int], None] = lambda done, rounds: None,
+    watch: Watch = unwatched,
 ) -> Draws:
     """Sample `draws` of each of `chains` as `covariance_adapted`.
 
     Chains begin at draws of the modes' mixture, with the covariance at the best mode until there
-    are draws to learn it from.
+    are draws to learn it from. `watch` goes through the looks of the warm-up.
     """
     begin, walking = jax.random.split(key)
     start, *_ = begun(target, modes, begin, chains)
     size = target.dimension
-    found = _sampled(
+    return _sampled(
         target, jnp.asarray(start), walking, draws, WARM_UP * size, STEPS * size, adapted=True,
-        covariance=np.asarray(modes.covariance[0], np.float64),
+        covariance=np.asarray(modes.covariance[0], np.float64), watch=watch,
     )  # fmt: skip
-    tell(1, 1)
-    return found
 
 
 def prior_scaled(
@@ -87,7 +85,15 @@ def covariance_adapted(
 
 
 def _sampled(
-    target, start, key, draws: int, warm_up: int, thin: int, adapted: bool, covariance=None
+    target,
+    start,
+    key,
+    draws: int,
+    warm_up: int,
+    thin: int,
+    adapted: bool,
+    covariance=None,
+    watch: Watch = unwatched,
 ) -> Draws:
     began = time.monotonic()
     check_start(target, np.asarray(start), np.asarray(_densities(target, start)))
@@ -105,7 +111,7 @@ def _sampled(
         spent.append(time.monotonic() - now)
         return walk
 
-    for index, look in enumerate(jax.random.split(key, LOOKS)):
+    for index, look in enumerate(watch(list(jax.random.split(key, LOOKS)))):
         walk = walked(look, length, 1)
         position = walk.position[:, -1]
         scale *= np.exp((walk.accepted.mean() - ACCEPTANCE) * 4.0 / np.sqrt(index + 1.0))

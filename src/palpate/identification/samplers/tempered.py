@@ -9,7 +9,6 @@ Stat. Soc. B 68, 2006).
 """
 
 import time
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -21,6 +20,7 @@ from palpate.errors import PalpateError
 from palpate.identification.posterior.laplace import Modes
 from palpate.identification.samplers.draws import Draws
 from palpate.identification.samplers.target import Target, log_prior
+from palpate.runs.progress import Watch, unwatched
 
 KEPT = 0.5  # share of the particles that one change of temperature may leave effective
 LONGEST = 200  # temperatures
@@ -62,18 +62,18 @@ def populations(
     key: PRNGKeyArray,
     chains: int,
     draws: int,
-    tell: Callable[[int, int], None] = lambda done, rounds: None,
+    watch: Watch = unwatched,
 ) -> Draws:
     """As many independent populations as `chains`, of as many particles each as `draws`.
 
-    They begin at draws of the prior and know nothing of the `modes`. Raises as `temper`.
+    They begin at draws of the prior and know nothing of the `modes`. `watch` goes through them.
+    Raises as `temper`.
     """
     began, spent, found = time.monotonic(), [], []
-    for number, one in enumerate(jax.random.split(key, chains)):
+    for one in watch(list(jax.random.split(key, chains))):
         now = time.monotonic()
         found.append(jax.device_get(temper(target, one, draws)))
         spent.append(time.monotonic() - now)
-        tell(number + 1, chains)
     position = np.stack([of.position for of in found])
     prior = np.asarray(log_prior(jnp.asarray(position)))
     return Draws(

@@ -12,6 +12,11 @@ from palpate.worlds.furniture.pieces import KINDS
 from trolley import EXACT, LENGTH, MASS, OUTLINE, PLACES, WIDTH, sledge, trolley
 
 
+def point_at(point: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Where a point (2,) of a body at that pose is."""
+    return placed(point[None], pose)[0]
+
+
 def pushed(world: FurnitureWorld, wrench, steps: int = 100, seed: int = 3) -> np.ndarray:
     """How far (bodies, 3) the pieces go from rest under a constant wrench on the first."""
     world.reset(seed)
@@ -43,17 +48,17 @@ def test_a_body_without_friction_obeys_newton_about_its_centre_of_mass(load_plac
         world.step(wrench[None])
     # The same by small steps: the force acts at the origin, which turns about the centre.
     time_step = 1e-4
-    position, velocity = placed(centre, truth.poses[0]), np.zeros(2)
+    position, velocity = point_at(centre, truth.poses[0]), np.zeros(2)
     yaw, rate = 0.7, 0.0
     for _ in range(round(steps * world.control_period / time_step)):
-        lever = -placed(centre, np.array([0, 0, yaw]))
+        lever = -point_at(centre, np.array([0, 0, yaw]))
         torque = wrench[2] + lever[0] * wrench[1] - lever[1] * wrench[0]
         velocity = velocity + wrench[:2] / MASS * time_step
         rate += torque / truth.inertias[0] * time_step
         position, yaw = position + velocity * time_step, yaw + rate * time_step
     moved = world.truth()
     assert moved.poses[0, 2] == pytest.approx(yaw, abs=2e-3)
-    assert placed(centre, moved.poses[0]) == pytest.approx(position, abs=1e-3)
+    assert point_at(centre, moved.poses[0]) == pytest.approx(position, abs=1e-3)
     assert moved.energy == pytest.approx(
         0.5 * MASS * velocity @ velocity + 0.5 * truth.inertias[0] * rate**2, rel=1e-2
     )
@@ -85,7 +90,7 @@ def test_momentum_is_kept_and_energy_is_not_gained_when_pieces_collide():
     mass = np.array([MASS, 12])
 
     def momenta(truth):
-        centre = np.stack([placed(c, p) for c, p in zip(truth.centres, truth.poses, strict=True)])
+        centre = np.stack([point_at(c, p) for c, p in zip(truth.centres, truth.poses, strict=True)])
         momentum = mass[:, None] * truth.velocities[:, :2]  # its load stands in the middle
         angular = centre[:, 0] * momentum[:, 1] - centre[:, 1] * momentum[:, 0]
         return [*momentum.sum(0), (angular + truth.inertias * truth.velocities[:, 2]).sum()]
@@ -147,7 +152,7 @@ def test_two_fixed_wheels_turn_the_trolley_about_their_axle():
     assert along[0] == pytest.approx(1.6, abs=0.05)
     moved = pushed(mixed, (0, 0, 5), 25)[0]
     assert moved[2] > 0.05
-    axle = placed(np.array([-0.4, 0]), moved)
+    axle = point_at(np.array([-0.4, 0]), moved)
     # A wheel's contact slips a little sideways as a caster swings round.
     assert np.linalg.norm(axle - [-0.4, 0]) < 0.15 * 0.4 * moved[2] + 2e-3
 
@@ -162,7 +167,7 @@ def test_one_locked_caster_is_a_pivot(wrench):
     )
     moved = pushed(world, wrench)[0]
     assert abs(moved[2]) > 1
-    assert placed(pivot, moved) == pytest.approx(pivot, abs=0.02)
+    assert point_at(pivot, moved) == pytest.approx(pivot, abs=0.02)
 
 
 def test_locked_casters_hold_and_hardly_creep():
@@ -197,10 +202,10 @@ def test_a_hinged_table_turns_about_its_anchor():
     truth = world.truth()
     anchor = np.array(truth.parameters[0].anchor)
     assert anchor[0] == -0.5
-    assert placed(anchor, truth.poses[0]) == pytest.approx(truth.anchors[0], abs=2e-3)
+    assert point_at(anchor, truth.poses[0]) == pytest.approx(truth.anchors[0], abs=2e-3)
     for angle in np.linspace(0, 6, 100):
         world.step(np.array([[40 * math.cos(angle), 40 * math.sin(angle), 5.0]]))
-        assert placed(anchor, world.truth().poses[0]) == pytest.approx(truth.anchors[0], abs=3e-3)
+        assert point_at(anchor, world.truth().poses[0]) == pytest.approx(truth.anchors[0], abs=3e-3)
     assert abs(world.truth().poses[0, 2] - 0.5) > 0.5
 
 

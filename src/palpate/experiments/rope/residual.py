@@ -11,21 +11,18 @@ import functools
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from palpate.commands import identify
 from palpate.experiments.experiment import Experiment
 from palpate.experiments.rope.model import GRIPPED, RATE, captures, seen_capture
+from palpate.experiments.rope.simulated import simulated
 from palpate.families.rope.options import NOISE, IdentifyRope
-from palpate.families.rope.recording import GRIPPER, MARKERS
 from palpate.identification.data.prediction import prediction_error
 from palpate.models.files import load_model
-from palpate.models.model import rollout
 from palpate.models.residual import Residual
 from palpate.models.rope import Rope
-from palpate.recordings import Channel, Recording, Role, Trial
+from palpate.recordings import Recording
 from palpate.recordings.files import write_recording
 from palpate.runs import Figure, Result
 from palpate.runs.result import read_result
@@ -57,7 +54,7 @@ def reproduce(
         IdentifyRope, residual=True, iterations=QUICK if quick else (), seed=seed
     )
     recording = out / "simulated.npz"
-    write_recording(recording, simulated(experiment.uses(0, TRIALS)))
+    write_recording(recording, recorded(experiment.uses(0, TRIALS)))
     simulated_rope = options(recordings=(recording,), mass=MASS, out=out / "simulated")
     results = {"simulated": _identified(experiment, simulated_rope)}
     figures: list[Figure] = []
@@ -90,36 +87,20 @@ def constants() -> dict[str, float]:
     return size | STIFFNESS | {"noise": NOISE, "trials": TRIALS, "duration": DURATION}
 
 
-def simulated(seed: int) -> Recording:
-    """Trials of a rope that is the model itself, its markers seen with noise: nothing is left over.
+def recorded(seed: int) -> Recording:
+    """Trials of a rope that is the model itself: nothing is left over.
 
     The gripper moves at random and then holds still, from hanging.
     """
     rope = Rope.uniform(LENGTH, MASS, NODES, **STIFFNESS, drive="velocity")
-    steps = round(DURATION / rope.control_period)
-    commands = np.stack(
-        [
-            excitation(
-                first, DURATION, rope.control_period, SPEED_LIMIT, ACCELERATION_LIMIT
-            )
-            for first in range(seed, seed + TRIALS)
-        ]
-    )  # fmt: skip
-    hanging = np.zeros((TRIALS, 1, rope.nodes, 3), np.float32)
-    hanging[..., 2] = -np.linspace(0.0, LENGTH, NODES)
-    start = rope.initial_state(jnp.asarray(hanging))
-    states = jax.jit(rollout)(rope, start, jnp.asarray(commands[:, :, None], jnp.float32))
-    position = np.concatenate([hanging, np.asarray(states.position)], axis=1)
-    seen = position + NOISE * np.random.default_rng(seed).standard_normal(position.shape)
-    frames = np.arange(steps + 1) * rope.control_period
-    trials = []
-    for index in range(TRIALS):
-        channels = (
-            Channel(MARKERS, Role.OBSERVATION, frames, seen[index], "m"),
-            Channel(GRIPPER, Role.DRIVEN, frames, position[index, :, :1], "m"),
-        )
-        trials.append(Trial(f"seed {seed + index}", {c.name: c for c in channels}))
-    return Recording(tuple(trials), {"source": "the rope model itself"})
+    period = rope.control_period
+    commands = [
+        excitation(first, DURATION, period, SPEED_LIMIT, ACCELERATION_LIMIT)
+        for first in range(seed, seed + TRIALS)
+    ]
+    hanging = np.zeros((rope.nodes, 3))
+    hanging[:, 2] = -np.linspace(0.0, LENGTH, NODES)
+    return simulated(rope, hanging, np.stack(commands), NOISE, seed)
 
 
 def _identified(experiment: Experiment, options: IdentifyRope) -> Result:

@@ -37,6 +37,7 @@ FAMILY = Family(
         "rope-generalization": f"{_EXPERIMENTS}.generalization:reproduce",
         "rope-tracking": f"{_EXPERIMENTS}.tracking:reproduce",
         "rope-dagger": f"{_EXPERIMENTS}.dagger:reproduce",
+        "rope-posterior": f"{_EXPERIMENTS}.posterior:reproduce",
         "rope-residual": f"{_EXPERIMENTS}.residual:reproduce",
         "rope-markerless": f"{_EXPERIMENTS}.markerless:reproduce",
     },

@@ -169,7 +169,8 @@ class IdentifyRope(Identify):
         from palpate.recordings.recording import resolve_indices
 
         driven = resolve_indices(self.driven or (0,), aligned.observation.shape[2], "marker")
-        rope = starting_rope(aligned, driven, self.mass)
+        one_length = "rest_length" in self.shared
+        rope = starting_rope(aligned, driven, self.mass, one_length=one_length)
         if self.substeps is not None:
             rope = dataclasses.replace(rope, substeps=self.substeps).constrain()
         return rope

@@ -15,6 +15,7 @@ from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 MARKERS, GRIPPER, COMMAND = "markers", "gripper", "command"
 NODE_MASS = 4e-3  # kg, where nothing was weighed: the motion tells stiffness per mass and no more
 TIME_STEP = 1e-3  # s, about, of the model's integration
+STRETCHED, UNEVEN = 0.15, 0.03  # of a length: by which equal segments differ along a line, off it
 
 
 def record_rope(
@@ -53,12 +54,18 @@ def constants(configuration: RopeConfiguration) -> dict[str, str | float | int]:
 
 
 def starting_rope(
-    aligned: Aligned, driven: Sequence[int] = (0,), mass: float | None = None
+    aligned: Aligned,
+    driven: Sequence[int] = (0,),
+    mass: float | None = None,
+    *,
+    one_length: bool = False,
 ) -> Rope:
     """The rope an identification starts from: as many nodes as markers, segments as long as seen.
 
-    `mass` (kg) is the whole rope's. Raises `PalpateError` for too few markers, or neighbouring ones
-    that coincide.
+    `mass` (kg) is the whole rope's. With `one_length` its segments are equal at rest where their
+    seen lengths follow a straight line, as those of a rope stretched by its own weight do: what
+    stretch there is would else stay in the pattern that one shared rest length scales. Raises
+    `PalpateError` for too few markers, or neighbouring ones that coincide.
     """
     nodes = aligned.observation.shape[2]
     if nodes < 4:
@@ -71,6 +78,11 @@ def starting_rope(
             f"markers {first} and {first + 1} are never seen apart: give the markers in order "
             "along the rope"
         )
+    if one_length:
+        index, mean = np.arange(nodes - 1), np.mean(rest_length)
+        line = np.polynomial.Polynomial.fit(index, rest_length, 1)(index)
+        if np.ptp(line) < STRETCHED * mean and np.ptp(rest_length - line) < UNEVEN * mean:
+            rest_length = np.full_like(rest_length, mean)
     rope = Rope.from_rest_lengths(
         rest_length,
         NODE_MASS * nodes if mass is None else mass,

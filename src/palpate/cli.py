@@ -3,13 +3,17 @@
 What computes is imported when a command runs, never before, so that help is instant.
 """
 
+import functools
+import re
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from palpate import __version__
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, PalpateWarning
 from palpate.family import check_name, families, options_of, places, resolve
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
@@ -23,13 +27,15 @@ class Command:
     Where it works on one of several things, `subject` says what they are, and the families' tables
     give the options of each; `options`, of `palpate.commands.options`, then serve those that come
     without (experiments). With `optional` the subject may be left out: the first that there is
-    stands for it.
+    stands for it. `own` is what gives the options for a subject of somebody's own, a class in a
+    Python file: "file.py:Class".
     """
 
     about: str
     options: str = ""
     subject: str = ""
     optional: bool = False
+    own: str = ""
 
     def kinds(self, name: str) -> dict[str, str]:
         """Where the options of each thing that the command `name` works on are: "module:name"."""
@@ -49,10 +55,16 @@ COMMANDS = {
     "convert": Command("turn a robot's log or any recording into another format", "Convert"),
     "track": Command("follow an object through a camera's pictures", subject="family"),
     "identify": Command(
-        "find an object's physical parameters from recordings of it", subject="family"
+        "find an object's physical parameters from recordings of it",
+        subject="family",
+        own="palpate.families.own_model:identify_options",
     ),
     "plan": Command("plan a robot's way, moving what stands in it", subject="problem"),
-    "train": Command("train a controller through an identified model", subject="task"),
+    "train": Command(
+        "train a controller through an identified model",
+        subject="task",
+        own="palpate.families.own_model:train_options",
+    ),
     "evaluate": Command("try a controller in a world the model cannot see into", subject="task"),
     "export": Command(
         "write a policy as ONNX, with a contract that says how to connect it", "Export"
@@ -74,7 +86,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        return _run(words)
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", PalpateWarning)
+            warnings.showwarning = functools.partial(_note, warnings.showwarning)
+            return _run(words)
     except PalpateError as error:
         return _refuse(str(error))
     except KeyboardInterrupt:
@@ -112,13 +127,23 @@ def _run(words: list[str]) -> int:
             known = ", ".join(kinds)
             raise PalpateError(f"{program} needs a {command.subject} first; there are: {known}")
         kind, *rest = rest
-        check_name(command.subject, kind, kinds)
         program = f"{program} {kind}"
-    options = parse(resolve(kinds[kind]), program, rest)
+    if command.own and re.search(r"\.py(:|$)", kind):
+        of = resolve(command.own)(kind)
+    else:
+        of = resolve(kinds[check_name(command.subject, kind, kinds) if command.subject else kind])
+    options = parse(of, program, rest)
     if options is not None:
         run = resolve(f"palpate.commands.{name}:run")
         run(options, *([kind] if name == "reproduce" else []))
     return 0
+
+
+def _note(show: Callable[..., None], message: Warning | str, *where: Any, **more: Any) -> None:
+    if isinstance(message, PalpateWarning):
+        print(f"note: {message}", file=sys.stderr)
+    else:
+        show(message, *where, **more)
 
 
 def _refuse(sentence: str) -> int:
@@ -152,6 +177,7 @@ def _subjects(name: str, command: Command, kinds: Iterable[str]) -> str:
         f"Each {command.subject} has its own options:",
         "",
         *(f"  palpate {name} {kind} --help" for kind in kinds),
+        *([f"  palpate {name} FILE.py:CLASS --help"] if command.own else []),
     ]
     return "\n".join(lines)
 

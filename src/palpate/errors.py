@@ -12,6 +12,10 @@ class PalpateError(ValueError):
     """
 
 
+class PalpateWarning(UserWarning):
+    """What somebody should know and nothing fails for; the command line prints it as a note."""
+
+
 def listed(names: Iterable[str], most: int = 6) -> str:
     """The first of `names`, and how many more there are, for a sentence."""
     every = list(names)

@@ -22,6 +22,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
@@ -341,6 +342,25 @@ def describe(model: Any) -> list[dict[str, Any]]:
         }
         for path, declaration in parameters_of(model).items()
     ]
+
+
+def table(model: Any) -> str:
+    """The parameters of a model for a person: name, value, meaning, and whether fixed or shared."""
+    rows = []
+    for path, declared in parameters_of(model).items():
+        value = value_of(model, path)
+        try:
+            shown = format_value(value, declared.unit) if np.size(value) else "none"
+        except (TypeError, ValueError):  # while it is traced, or in a tree of something else
+            shown = f"{value} {declared.unit}"
+        said = ("fixed", declared.fixed), ("shared", declared.shared and np.size(value) > 1)
+        notes = ", ".join(name for name, true in said if true)
+        rows.append((path, shown, declared.about + (f" ({notes})" if notes else "")))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    )
 
 
 def format_value(value: Any, unit: str) -> str:

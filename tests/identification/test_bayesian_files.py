@@ -57,9 +57,11 @@ def test_a_more_complete_model_may_be_kept(posterior, tmp_path, toys):
     np.testing.assert_array_equal(models.mass, posterior.models().mass)
 
 
-def test_draws_of_a_model_without_a_name_are_refused(posterior, tmp_path):
-    with pytest.raises(PalpateError, match=r"holds the unknown model 'None'; there are: .*rope"):
-        read_models(write_posterior(tmp_path / "posterior.npz", posterior))
+def test_draws_of_a_model_of_somebodys_own_need_its_class(posterior, tmp_path):
+    path = write_posterior(tmp_path / "posterior.npz", posterior)
+    with pytest.raises(PalpateError, match=r"holds a model of 'bayesian_toys.py:Sled'"):
+        read_models(path)
+    np.testing.assert_array_equal(read_models(path, kind=Sled).mass, posterior.models().mass)
 
 
 def test_draws_that_do_not_fit_their_model_are_refused(posterior, tmp_path, toys):

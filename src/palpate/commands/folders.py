@@ -10,6 +10,7 @@ from typing import Any
 
 from palpate.errors import PalpateError
 from palpate.families.options import Options
+from palpate.models.python_files import file_of
 from palpate.report import build_report
 from palpate.report.evidence import EVIDENCE, RENDERINGS
 from palpate.runs import Figure, Result, Run
@@ -108,6 +109,11 @@ def finish(
     )
     run.finish(result.to_dict())
     return result
+
+
+def source_of(place: str) -> dict[str, Path]:
+    """Among the inputs of a command, the Python file of a `file.py:Class`; none without a place."""
+    return {"source": file_of(place)} if place else {}
 
 
 def deliver(options: Options, run: Run, product: str) -> Path:

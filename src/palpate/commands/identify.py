@@ -6,6 +6,7 @@ Nothing here knows what was recorded: the options of each family do.
 import dataclasses
 import importlib.util
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from palpate.commands import folders, identify_report
@@ -57,7 +58,11 @@ def run(options: Identify) -> Path:
         cut_pieces(data.fitted_aligned, reference, options.piece)
         check_seen(cut_pieces(data.validation_aligned, reference, options.piece))
     product = folders.MODEL if options.fits else DRAWS
-    inputs = {"recordings": options.recordings, "validate": options.validate}
+    inputs: dict[str, Path | Sequence[Path]] = {
+        "recordings": options.recordings,
+        "validate": options.validate,
+        **folders.source_of(options.place),
+    }
     if options.init is not None:
         inputs["init"] = (_model_file(options.init),)
     words = f"identify {options.family}"
@@ -96,6 +101,7 @@ def run(options: Identify) -> Path:
 
 def _check(options: Identify) -> None:
     """Raise `PalpateError` for options that do not go together, or cannot be met here."""
+    options.check()
     check_numbers(options.chains, options.draws)
     if options.fits and any(x is not None for x in (options.chains, options.draws, options.arviz)):
         raise PalpateError(

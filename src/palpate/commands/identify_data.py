@@ -45,22 +45,31 @@ def read(options: Identify) -> Data:
     else:
         fitted, validation = raw, None
     fitted = _prepared(options.repair(fitted), options, "")
-    observation, action = options.observation, options.action(fitted)
+    observed, action = options.observed, options.action(fitted)
     if not options.fits:
         _check_duration(fitted, options)
     # The control period is that of the sensor, free of the last digits of its clock.
-    periods = [trial[observation].nominal_period for trial in fitted.trials]
+    periods = [trial[observed[0]].nominal_period for trial in fitted.trials]
     period = 1.0 / options.rate if options.rate else float(f"{np.median(periods):.5g}")
-    aligned = scored = fitted.align(period, observation, action)
+    aligned = scored = fitted.align(period, observed, action)
     if validation is not None:
         validation = _prepared(validation, options, "validation, ")
-        scored = validation.align(period, observation, action)
-    return Data(fitted, validation, aligned, scored, fitted.trials[0][observation].unit)
+        scored = validation.align(period, observed, action)
+    return Data(fitted, validation, aligned, scored, _unit(fitted, observed))
+
+
+def _unit(recording: Recording, observed: tuple[str, ...]) -> str:
+    """Of one channel as it says, of several that of each of their numbers: "m, m, rad"."""
+    channels = [recording.trials[0][name] for name in observed]
+    if len(channels) == 1:
+        return channels[0].unit
+    return ", ".join(c.unit for c in channels for _ in range(c.values[0].size))
 
 
 def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
     how = {"rate": options.rate, "unit": options.unit, "up": options.up}
-    return join([read_recording(path, topics=options.topics or (), **how) for path in paths])
+    what = {"topics": options.topics or (), "columns": options.columns}
+    return join([read_recording(path, **what, **how) for path in paths])
 
 
 def _prepared(recording: Recording, options: Identify, where: str) -> Recording:
@@ -72,7 +81,7 @@ def _prepared(recording: Recording, options: Identify, where: str) -> Recording:
 
 
 def _check_duration(recording: Recording, options: Identify) -> None:
-    lasting = sum(float(np.ptp(t[options.observation].time)) for t in recording.trials)
+    lasting = sum(float(np.ptp(t[options.observed[0]].time)) for t in recording.trials)
     if lasting < SHORTEST:
         raise PalpateError(
             f"{' and '.join(map(str, options.recordings))} last {lasting:.3g} s in all: expected "

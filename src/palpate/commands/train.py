@@ -33,14 +33,15 @@ def run(options: Train) -> Path:
     Raises `PalpateError` for a model the task cannot use, and for folders that cannot be used.
     """
     file = folders.product_of(options.model, folders.MODEL, "identify")
+    task = options.wanted()  # first: its file may bring the model's class
     model = options.prepare(load_model(file)[0])
-    task = named_task(options.task)
     training = settings(options)
     words = f"train {options.task}"
     decided = {"task": constants(task), "training": dataclasses.asdict(training)}
-    with folders.begin(options, words, {"model": file}, folders.POLICY, **decided) as run:
+    inputs = {"model": file, **folders.source_of(options.place)}
+    with folders.begin(options, words, inputs, folders.POLICY, **decided) as run:
         if not run.finished:
-            command = folders.command(options, words)
+            command = folders.command(options, f"train {options.place or options.task}")
             policy = trained(task, model, training, options.seed, run, command=command)
             figures = figures_in_model(task, model, policy, options.seed)
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}

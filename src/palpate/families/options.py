@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, arg
 
 from palpate.errors import PalpateError
+from palpate.family import find
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from palpate.networks import CommandPolicy, Controller
     from palpate.recordings import Aligned, Recording
     from palpate.runs import Figure, Run
+    from palpate.tasks.task import Task
     from palpate.trials.trial import Trial
 
 Number = Annotated[float | None, arg(metavar="NUMBER", help_behavior_hint="(default: none)")]
@@ -139,6 +141,7 @@ class Identify(Reading, ABC):
 
     family: ClassVar[str]
     observation: ClassVar[str]  # the channel that is predicted
+    place: ClassVar[str] = ""  # `file.py:Class` of a model that no family has
     held_out: ClassVar[float] = 0.25  # of the trials, where no recording for validation is given
     one_object: ClassVar[bool] = False  # points of one thing are observed, with one noise
     piece: ClassVar[float] = 2.0  # s of motion that draws predict open loop
@@ -182,6 +185,19 @@ class Identify(Reading, ABC):
     arviz: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Write the draws as NetCDF too, for ArviZ."""
 
+    def check(self) -> None:
+        """Raise `PalpateError` for what cannot be, before any recording is read."""
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """The channels that are predicted, side by side."""
+        return (self.observation,)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Of a CSV file, by name, where it holds no markers."""
+        return ()
+
     @property
     def fits(self) -> bool:
         """Whether the method gives one model with intervals, and not draws."""
@@ -196,8 +212,8 @@ class Identify(Reading, ABC):
         return recording
 
     @abstractmethod
-    def action(self, recording: Recording) -> str:
-        """The channel of a prepared recording that drives the model."""
+    def action(self, recording: Recording) -> str | tuple[str, ...]:
+        """The channel or channels of a prepared recording that drive the model."""
 
     @abstractmethod
     def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Model:
@@ -236,6 +252,7 @@ class Train(Options, ABC):
     """Training through an identified model; each task says in `prepare` how it needs the model."""
 
     task: ClassVar[str]
+    place: ClassVar[str] = ""  # `file.py:Class` of a task that no family has
 
     model: Annotated[Path, arg(metavar="MODEL")]
     """What `palpate identify` wrote: its folder, or the model file in it."""
@@ -251,6 +268,10 @@ class Train(Options, ABC):
     @abstractmethod
     def prepare(self, model: Model) -> Model:
         """The model as the task drives it."""
+
+    def wanted(self) -> Task:
+        """The task, as it is by default: it has defaults for all its fields."""
+        return find("tasks", self.task)()
 
 
 @dataclass(frozen=True)

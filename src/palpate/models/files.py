@@ -1,6 +1,7 @@
 """Models on disk: JSON that a person can read, with the unit and meaning of every parameter."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, PalpateWarning
 from palpate.family import name_of, places, resolve
 from palpate.models.model import Model
+from palpate.models.python_files import named_class, source_of
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.parameters import LogNormal, axes_of, describe, parameters_of
 from palpate.runs.storage import read_json, write_json
@@ -24,16 +26,18 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
     """Write a model as JSON; `about` is what it was made from (recordings, errors, intervals).
 
     Of a `Residual` the network's arrays too. What this instance declares differently (fixed,
-    shared, other priors) is not kept: it belongs to the identification that used it. Raises
-    `PalpateError` for a model that is not registered, and for a batch of models.
+    shared, other priors) is not kept: it belongs to the identification that used it.
+
+    A model that no family has is saved as `file.py:Class` with the SHA-256 of that file. Raises
+    `PalpateError` for one that is not in a file either, and for a batch of models.
     """
     network = model.network if isinstance(model, Residual) else None
     physics = model.physics if isinstance(model, Residual) else model
     name = registered(physics)
     if name is None:
         raise PalpateError(
-            f"a model of type {type(physics).__name__} cannot be saved; known: "
-            + ", ".join(places("models"))
+            f"a model of type {type(physics).__name__} cannot be saved: expected a class at the "
+            f"top of a Python file, or one of {', '.join(places('models'))}"
         )
     for field, axes in axes_of(type(physics)).items():
         shape = getattr(physics, field).shape
@@ -48,6 +52,7 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
             "format": _FORMAT,
             "version": 1 if network is None else 2,
             "model": name,
+            **({"sha256": source[1]} if (source := file_of(physics)) else {}),
             "structure": {name: getattr(physics, name) for name in structure_of(type(physics))},
             "parameters": describe(physics),
             **({} if network is None else {"correction": dict(vars(network))}),
@@ -56,8 +61,11 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
     )
 
 
-def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
+def load_model(path: str | Path, kind: type[Model] | None = None) -> tuple[Model, dict[str, Any]]:
     """Read what `save_model` wrote: the model, and what it was made from.
+
+    `kind` is the class of a model of somebody's own, saved as `file.py:Class`; it may be left out
+    where `load_class` has loaded it. Warns if that file is another than when the model was saved.
 
     Raises `PalpateError` that says what is wrong with the file.
     """
@@ -72,7 +80,7 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
             f"{path} has version {version}; this palpate reads versions "
             + " and ".join(map(str, _VERSIONS))
         )
-    kind = kind_of(path, content.get("model"))
+    kind = kind_of(path, content.get("model"), content.get("sha256"), kind)
     try:
         rows = {row["name"]: row["value"] for row in content["parameters"]}
         structure: dict[str, Any] = {
@@ -100,17 +108,54 @@ def load_model(path: str | Path) -> tuple[Model, dict[str, Any]]:
 
 def registered(model: Model) -> str | None:
     """The name of the model's kind in files, None for one that has none."""
-    return name_of(type(model), places("models"))
+    return name_of(type(model), places("models")) or (file_of(model) or (None,))[0]
 
 
-def kind_of(path: str | Path, name: Any) -> type[Model]:
-    """The class of models that the file `path` names so; raises `PalpateError` where none is."""
+def file_of(model: Model) -> tuple[str, str] | None:
+    """`file.py:Class` and the file's SHA-256 of a model that no family has; else None."""
+    known = name_of(type(model), places("models"))
+    return None if known else source_of(type(model))
+
+
+def kind_of(
+    path: str | Path, name: Any, digest: Any = None, given: type[Model] | None = None
+) -> type[Model]:
+    """The class of models that the file `path` names so; raises `PalpateError` where none is.
+
+    One of `file.py:Class` is the `given` one or has been named before, and is held against the
+    file's `digest`; arguments as of `load_model`.
+    """
     known = places("models")
+    if isinstance(name, str) and ".py:" in name and name not in known:
+        return _kind_of_file(path, name, digest, given)
     if not isinstance(name, str) or name not in known:
         raise PalpateError(
             f"{path} holds the unknown model '{name}'; there are: {', '.join(known)}"
         )
     return resolve(known[name])
+
+
+def _kind_of_file(
+    path: str | Path, name: str, digest: Any, given: type[Model] | None
+) -> type[Model]:
+    kind, file = given or named_class(name, Model), name.partition(":")[0]
+    source = None if kind is None else source_of(kind)
+    if kind is None or source is None or source[0] != name:
+        came = f", and {kind.__name__} was given" if kind is not None else ""
+        raise PalpateError(
+            f"{path} holds a model of '{name}'{came}; a Python file is run only when you name it: "
+            f"expected it as the first word, such as `palpate identify {name}` or `palpate train "
+            f"{file}:TASK` (a task there or in a file that imports it), in Python "
+            f"load_model(path, {name.rpartition(':')[2]})"
+        )
+    if source[1] != digest:
+        warnings.warn(
+            f"{file} has changed since {path} was written: the parameters saved there are taken "
+            "for those of the class as it is now",
+            PalpateWarning,
+            stacklevel=4,
+        )
+    return kind
 
 
 def structure_of(kind: type[Model]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from palpate.errors import PalpateError
-from palpate.parameters import Parameter
+from palpate.parameters import Parameter, table
 
 State = TypeVar("State")
 
@@ -27,6 +27,10 @@ class Model(eqx.Module):
 
     overrides: eqx.AbstractVar[tuple[tuple[str, Parameter], ...]]
     control_period: eqx.AbstractVar[float]
+
+    def __str__(self) -> str:
+        """The parameters with their values and units, one in a line."""
+        return f"{type(self).__name__}, every {self.control_period:g} s\n{table(self)}"
 
     @property
     @abstractmethod

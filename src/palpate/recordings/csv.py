@@ -18,8 +18,8 @@ from palpate.errors import PalpateError, listed
 from palpate.recordings.tables import MarkerTable
 
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
-_SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_TIME = re.compile(r"(?:time|t|timestamp)[\s_(\[]*(s|sec|seconds|ms|us|ns|)[)\]]?", re.IGNORECASE)
+SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIME = re.compile(r"(?:time|t|timestamp)[\s_(\[]*(s|sec|seconds|ms|us|ns|)[)\]]?", re.IGNORECASE)
 _COORDINATE = re.compile(r"(?:(.*)[_.:\s])?([xyz])", re.IGNORECASE)
 
 
@@ -37,7 +37,7 @@ def read_csv(path: str | Path) -> MarkerTable:
     Blank cells are NaN. Raises `PalpateError` that names the line (the path is the caller's part).
     """
     with open(path, newline="", encoding="utf-8-sig") as file:
-        lines = _Lines(file)
+        lines = Lines(file)
         try:
             first = next((cells for cells in lines if any(cells)), None)
             if first is None:
@@ -53,7 +53,7 @@ def read_csv(path: str | Path) -> MarkerTable:
             raise PalpateError(f"line {lines.number} is not CSV: {error}") from error
 
 
-class _Lines:
+class Lines:
     """Lines of cells without surrounding blanks, and the number of the current line."""
 
     def __init__(self, file: Iterator[str]):
@@ -89,14 +89,14 @@ class _Lines:
         return value
 
 
-def _plain(names: list[str], lines: _Lines) -> MarkerTable:
+def _plain(names: list[str], lines: Lines) -> MarkerTable:
     twice = next((name for name in names if name and names.count(name) > 1), None)
     if twice is not None:
         raise PalpateError(f"two columns are called '{twice}'")
     clocks = [
-        (column, _SECONDS[match[1].lower()])
+        (column, SECONDS[match[1].lower()])
         for column, name in enumerate(names)
-        if (match := _TIME.fullmatch(name))
+        if (match := TIME.fullmatch(name))
     ]
     axes: dict[str, dict[str, int]] = {}
     for column, name in enumerate(names):
@@ -123,7 +123,7 @@ def _plain(names: list[str], lines: _Lines) -> MarkerTable:
     )
 
 
-def _motive(first: list[str], lines: _Lines) -> MarkerTable:
+def _motive(first: list[str], lines: Lines) -> MarkerTable:
     facts = {key.lower(): value for key, value in zip(first[::2], first[1::2], strict=False)}
     rows: list[list[str]] = []
     while not (rows and rows[-1][0].lower() == "frame"):
@@ -164,7 +164,7 @@ def _motive(first: list[str], lines: _Lines) -> MarkerTable:
     return MarkerTable("OptiTrack Motive CSV", time, positions, markers, unit, "y", notes)
 
 
-def _vicon(first: list[str], lines: _Lines) -> MarkerTable:
+def _vicon(first: list[str], lines: Lines) -> MarkerTable:
     while first[0].lower() != "trajectories":
         first = lines.header("a header with several columns or a block 'Trajectories'")
     rate = lines.value(lines.header("the rate")[0], 0)
@@ -189,7 +189,7 @@ def _vicon(first: list[str], lines: _Lines) -> MarkerTable:
 
 
 def _table(
-    lines: _Lines, width: int, clock: int | None, triples: list[list[int]], block: bool = False
+    lines: Lines, width: int, clock: int | None, triples: list[list[int]], block: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Column `clock` (frames,) and `triples` (frames, markers, 3) of the lines that remain.
 

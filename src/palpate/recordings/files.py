@@ -15,6 +15,7 @@ from palpate.errors import PalpateError
 from palpate.recordings import npz
 from palpate.recordings.alignment import MAX_BYTES
 from palpate.recordings.channel import Role
+from palpate.recordings.columns import read_channels
 from palpate.recordings.csv import read_csv
 from palpate.recordings.npz import write_recording
 from palpate.recordings.recording import Recording
@@ -33,6 +34,7 @@ def read_recording(
     unit: str | None = None,
     up: str | None = None,
     topics: Sequence[str] = (),
+    columns: Sequence[str] = (),
 ) -> Recording:
     """Read a recording from `.npz` (ours or foreign), `.csv` or a log, in SI units and z up.
 
@@ -42,6 +44,9 @@ def read_recording(
     "markers" in each trial. Logs are MCAP files, rosbag2 folders or databases and ROS 1 bags,
     described at `rosbag.bag.read_bag`; `topics` names which of their topics to take, and besides
     "markers" they may give a driven "gripper" and a "command".
+
+    A plain CSV that has `columns` by name, and no markers, becomes a channel for each, as
+    `columns.read_channels` describes.
 
     `rate` (Hz) is for files without time, `unit` ("m", "cm", "mm") for files that do not say, and
     `up` ("x", "y", "z") names the axis that points up, by default y in a Motive export and z
@@ -61,7 +66,7 @@ def read_recording(
         if path.suffix.lower() == ".npz":
             found = _read_npz(path)
         elif path.suffix.lower() == ".csv":
-            found = [(path.stem, read_csv(path))]
+            found = read_channels(path, columns, rate) if columns else [(path.stem, read_csv(path))]
         elif is_bag(path):
             found = read_bag(path, topics)
         else:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from palpate.errors import PalpateError
 from palpate.identification.posterior.posterior import Posterior, spread_out
-from palpate.models.files import built, kind_of, registered, structure_of
+from palpate.models.files import built, file_of, kind_of, registered, structure_of
 from palpate.models.model import Model
 from palpate.parameters import parameters_of
 from palpate.runs.storage import DamagedFileError, parse_json, plain, write_bytes
@@ -43,6 +43,7 @@ def write_posterior(path: str | Path, posterior: Posterior, model: Model | None 
     about = {
         "format": FORMAT,
         "model": kind,
+        **({"sha256": source[1]} if (source := file_of(whole)) else {}),
         "settings": settings,
         "names": list(posterior.target.names),
         "table": [vars(row) for row in posterior.table],
@@ -83,10 +84,13 @@ def read_posterior(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "..."]
     return arrays, about
 
 
-def read_models(path: str | Path, count: int | None = None) -> Model:
+def read_models(
+    path: str | Path, count: int | None = None, kind: type[Model] | None = None
+) -> Model:
     """The models that `write_posterior` wrote, as one whose free parameters lead with the draws.
 
-    All draws of all chains, or about `count` (at least one) evenly spaced ones.
+    All draws of all chains, or about `count` (at least one) evenly spaced ones. `kind`: the class
+    of a model of somebody's own, as of `load_model`.
 
     Raises `PalpateError` when the file is missing, no posterior, or of a model that has no name in
     files, `DamagedFileError` when something of the model is missing or does not fit.
@@ -94,7 +98,7 @@ def read_models(path: str | Path, count: int | None = None) -> Model:
     if count is not None and count < 1:
         raise PalpateError(f"at least one draw is needed, not {count}")
     arrays, about = read_posterior(path)
-    kind = kind_of(path, about.get("model"))
+    kind = kind_of(path, about.get("model"), about.get("sha256"), kind)
     fields = {name[6:]: value for name, value in arrays.items() if name.startswith("model.")}
     values = {name[6:]: value for name, value in arrays.items() if name.startswith("value.")}
     lead = arrays["position"].shape[:2] if "position" in arrays else ()

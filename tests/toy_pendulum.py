@@ -214,11 +214,11 @@ class EvaluatePendulumDamping(Evaluate):
     def prepare(self, model: Pendulum) -> Pendulum:
         return model
 
-    def trials(self) -> list[SwingTrial]:
+    def trials(self, base: None) -> list[SwingTrial]:
         lengths = np.random.default_rng(self.seed).uniform(0.6, 0.8, self.pendulums)
         return [SwingTrial(seed, float(length)) for seed, length in enumerate(lengths)]
 
-    def controllers(self, policy: Any) -> dict[str, Controller]:
+    def controllers(self, policy: Any, base: None) -> dict[str, Controller]:
         return {"controlled": Damper(policy), "held still": HeldStill()}
 
     def show(self, run: Run, trials: Any, evaluated: Mapping[str, Swings]) -> None:

@@ -1,14 +1,20 @@
-"""What cannot be evaluated is refused before anything is tried, in a sentence."""
+"""What a policy is tried in, and what cannot be evaluated: refused before anything is tried."""
 
 import jax
 import jax.numpy as jnp
 import pytest
 
+from deployed import rope_policy
 from palpate.cli import main
+from palpate.commands import train
+from palpate.families.rope import options as rope_options
 from palpate.families.rope.options import EvaluateRopeStabilization
 from palpate.models.files import save_model
 from palpate.models.rope import Rope
 from palpate.networks import Channel, CommandPolicy, save_controller
+from palpate.parameters import describe
+from palpate.runs.result import read_result
+from palpate.trials.rope import stabilization
 
 
 @pytest.fixture
@@ -57,12 +63,48 @@ def test_a_model_that_the_task_cannot_have(refused):
     assert "needs a rope driven by velocity at node 0" in refused(nodes=6, driven=(0, 5))
 
 
-def test_a_policy_of_another_rate_than_the_world(refused):
-    assert refused(period=0.02, nodes=6, control_period=0.02) == (
-        "a controller that decides every 0.02 s does not fit a world with a control period of "
-        "0.01 s: expected one that was trained through a model identified at 100 Hz"
-    )
-
-
 def test_no_rope_to_evaluate(refused):
     assert refused(options="--ropes 0", nodes=6) == "an evaluation has at least one rope, not 0"
+
+
+@pytest.fixture
+def tried(tmp_path, monkeypatch, capsys):
+    """Evaluate an untrained policy of 12 markers at 60 Hz, for a moment; (lines, settings)."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.2)
+    monkeypatch.setattr(rope_options, "RENDERED", 0.1)
+    monkeypatch.setattr(train, "EPISODES", 8)
+    own = Rope.uniform(length=0.73, mass=0.055, nodes=12, control_period=1 / 60)
+    manifest = {
+        "task": "rope-stabilization",
+        "model": describe(own),
+        "recordings": {"file": "own.npz"},
+        "training": {"observation_noise": 2e-3},
+    }
+    save_controller("policy.safetensors", rope_policy(12, period=1 / 60), manifest)
+    save_model("model.json", Rope.uniform(length=0.9, nodes=12, control_period=1 / 60), {})
+
+    def tried(options=""):
+        words = "evaluate rope-stabilization --policy policy.safetensors --ropes 1 --fresh"
+        assert main([*words.split(), "--out", "tried", *options.split()]) == 0
+        return capsys.readouterr().out.splitlines(), read_result("tried/result.json").settings
+
+    return tried
+
+
+def test_ones_own_rope_is_tried_to_the_end(tried):
+    lines, settings = tried()
+    assert lines[0] == (
+        "tried in MuJoCo ropes drawn around that of the model it was trained on: 0.733 m, 55 g, "
+        "bending stiffness 0.00066 N m^2, 12 markers at 60 Hz"
+    )
+    assert lines[1].startswith("controlled")
+    assert settings["world.control_period"] == pytest.approx(1 / 60)
+    assert settings["world.observation_noise"] == 2e-3
+
+
+def test_ropes_are_drawn_around_the_model_that_is_named_and_its_figures_are_said(tried):
+    lines, settings = tried("--model model.json --mass 0.2")
+    assert "around that of the model: 0.905 m, 200 g" in lines[0]
+    assert any(line.startswith("in model: success ") for line in lines)
+    assert settings["world.length"] == pytest.approx(0.9, rel=0.02)

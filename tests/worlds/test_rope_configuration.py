@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.worlds.rope.configuration import in_step
 from palpate.worlds.rope.rope import Disturbance, RopeConfiguration, sample_configurations
 
 
@@ -38,7 +39,11 @@ def test_sampled_ropes_span_their_ranges_and_nothing_else_changes():
         ({"length": 0.0}, "length is greater than 0, not 0"),
         ({"mass": np.nan}, "mass is greater than 0, not nan"),
         ({"tip_mass": -1.0}, "tip_mass is 0 or greater, not -1"),
-        ({"markers": 7}, "7 markers .* over 40 bodies; 2, 3, 5, 6, 9, 11, 21, 41 markers do"),
+        ({"markers": 1}, "a whole number of markers, 2 or more: 1"),
+        ({"markers": 3, "marker_places": (0.0, 1.0)}, "are 3 growing shares of its length"),
+        ({"markers": 2, "marker_places": (0.5, 0.1)}, "are 2 growing shares of its length"),
+        ({"markers": 2, "marker_places": (0.0, 1.1)}, "growing shares .* to 1 at the tip"),
+        ({"grip_damping": -1.0}, "grip_damping is 0 or greater, not -1"),
         ({"bodies": 2}, "a whole number of bodies, 3 or more, not 2"),
         ({"control_period": 0.0101}, "makes 20.2 time steps; it has to be a whole number"),
         ({"observation_delay": 0.015}, "makes 1.5 control periods"),
@@ -53,6 +58,24 @@ def test_sampled_ropes_span_their_ranges_and_nothing_else_changes():
 def test_constants_that_make_no_rope_are_refused(constants, sentence):
     with pytest.raises(PalpateError, match=sentence):
         RopeConfiguration(**constants)
+
+
+@pytest.mark.parametrize("rate", [20, 30, 59.94, 60, 100, 120, 144, 200, 240])
+def test_any_control_rate_is_kept_step_with(rate):
+    rope = in_step(1 / rate, length=0.73, mass=0.055)
+    steps = rope.control_period / rope.time_step
+    assert rope.control_period == 1 / rate
+    assert steps == pytest.approx(round(steps), abs=1e-9)
+    assert 0.8 * 5e-4 < rope.time_step <= 5e-4 * (1 + 1e-9)
+
+
+def test_steps_are_short_enough_for_stiff_ropes_and_those_drawn_around_them():
+    stiff = in_step(0.01, bending_stiffness=0.02)
+    assert max(stiff.fastest().values()) * stiff.time_step <= 1
+    assert len(sample_configurations(stiff, 100, 0)) == 100
+    assert in_step(0.01) == RopeConfiguration()
+    with pytest.raises(PalpateError, match="too slow to wait for: expected one of less stiffness"):
+        in_step(0.01, bending_stiffness=5.0)
 
 
 @pytest.mark.parametrize(

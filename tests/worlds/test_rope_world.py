@@ -217,3 +217,42 @@ def test_a_disturbance_acts_on_its_node_from_its_time_on():
     for _ in range(50):
         pushed.step(STILL)
     assert pushed.truth().energy < before  # the push has ended
+
+
+# --- markers ---
+
+
+@pytest.mark.parametrize("markers", [5, 12, 17, 30, 60])
+def test_any_number_of_markers_lies_evenly_along_the_rope(markers):
+    """On the straight bodies between the nodes, so that along them they are evenly apart."""
+    world = rope(markers=markers, bodies=10, length=0.73)
+    world.reset(0, start="half_circle")
+    seen, nodes = world.step(STILL).markers, world.truth().positions
+    assert seen.shape == (markers, 3)
+    along = np.linspace(0, 10, markers)
+    for axis in range(3):
+        np.testing.assert_allclose(
+            seen[:, axis], np.interp(along, np.arange(11), nodes[:, axis]), atol=1e-9
+        )
+    assert (seen[[0, -1]] == nodes[[0, -1]]).all()
+
+
+def test_markers_on_nodes_are_the_nodes_to_the_last_digit():
+    world = rope(bodies=40, markers=21)
+    world.reset(0, start="helix")
+    assert (world.step(STILL).markers == world.truth().positions[::2]).all()
+
+
+def test_markers_are_where_they_were_glued():
+    world = rope(length=2.0, markers=3, marker_places=(0.0, 0.33, 0.95))
+    depth = 1.5 - world.reset(0).markers[:, 2]
+    np.testing.assert_allclose(depth, [0.0, 0.66, 1.9], atol=1e-9)
+
+
+def test_a_grip_may_damp_more_than_the_joints_do():
+    height = []
+    for damping in (None, 0.3):
+        world = rope(grip_damping=damping)
+        world.reset(0, start="straight")
+        height.append([world.step(STILL).markers[1, 2] for _ in range(50)][-1])
+    assert height[1] - height[0] > 1e-2

@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 
 from palpate.commands import folders
-from palpate.commands.train import figures_in_model, named_task
+from palpate.commands.train import figures_in_model, line_of, named_task
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate
 from palpate.models.files import load_model
@@ -29,7 +29,6 @@ def run(options: Evaluate) -> Path:
         raise PalpateError(
             f"{file} was trained for '{manifest.get('task')}', not for {options.task}"
         )
-    options.check(policy)
     task = named_task(options.task)
     model, inputs = None, {"policy": file}
     if options.model is not None:
@@ -37,13 +36,17 @@ def run(options: Evaluate) -> Path:
         model = options.prepare(load_model(described)[0])
         check_model(policy, model, task, str(described))
         inputs["model"] = described
+    base, about = options.base(policy, manifest, model)
+    options.check(policy, base)
     with folders.begin(options, f"evaluate {options.task}", inputs) as run:
         if not run.finished:
-            found = options.evaluate(policy, run)
-            figures = [*found.figures]
+            found = options.evaluate(policy, run, base)
+            figures, lines = [*found.figures], [about, *found.lines]
             if model is not None:
-                figures += figures_in_model(task, model, policy, options.seed)
-            write_text(run.path / folders.TABLE, "\n".join(found.lines) + "\n")
+                inside = figures_in_model(task, model, policy, options.seed)
+                figures += inside
+                lines += map(line_of, inside)
+            write_text(run.path / folders.TABLE, "\n".join(filter(None, lines)) + "\n")
             settings = found.settings | {"notes": found.notes}
             folders.finish(run, figures, settings, found.split)
         print((run.path / folders.TABLE).read_text(encoding="utf-8"), end="")

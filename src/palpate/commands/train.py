@@ -4,7 +4,9 @@ Nothing here knows the task but by its name: `options.prepare` does.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -34,7 +36,8 @@ def run(options: Train) -> Path:
     """
     file = folders.product_of(options.model, folders.MODEL, "identify")
     task = options.wanted()  # first: its file may bring the model's class
-    model = options.prepare(load_model(file)[0])
+    model, about = load_model(file)
+    model = options.prepare(model)
     training = settings(options)
     words = f"train {options.task}"
     decided = {"task": constants(task), "training": dataclasses.asdict(training)}
@@ -42,27 +45,36 @@ def run(options: Train) -> Path:
     with folders.begin(options, words, inputs, folders.POLICY, **decided) as run:
         if not run.finished:
             command = folders.command(options, f"train {options.place or options.task}")
-            policy = trained(task, model, training, options.seed, run, command=command)
+            more = {"recordings": about.get("recordings", {})}
+            policy = trained(
+                task, model, training, options.seed, run, command=command, manifest=more
+            )
             figures = figures_in_model(task, model, policy, options.seed)
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
             folders.finish(run, figures, split=split)
         for figure in read_result(run.path / RESULT).figures:
-            value = "none" if figure.value is None else f"{figure.value:.4g} {figure.unit}"
-            print(f"{figure.name.replace('_', ' ').replace('.', ': ')} {value}".rstrip())
+            print(line_of(figure))
         title = f"How a controller was trained for {options.task}"
         folders.hand_over(options, run, title, folders.POLICY)
         return run.path
 
 
 def trained(
-    task: Task, model: Model, training: Training, seed: int, run: Run, *, command: str
+    task: Task,
+    model: Model,
+    training: Training,
+    seed: int,
+    run: Run,
+    *,
+    command: str,
+    manifest: Mapping[str, Any] = MappingProxyType({}),
 ) -> CommandPolicy:
     """The policy that is trained in `run`, which keeps it with all that its reader has to know.
 
-    `command`: what makes it again.
+    `command`: what makes it again. `manifest`: what else its file is to say.
     """
     policy = train(task, model, training, seed, run)
-    manifest = {
+    told = {
         "task": task.name,
         "command": command,
         "seed": seed,
@@ -71,7 +83,7 @@ def trained(
         "machine": machine(),
         "wall_time_s": run.elapsed,
     }
-    save_controller(run.path / folders.POLICY, policy, manifest)
+    save_controller(run.path / folders.POLICY, policy, {**manifest, **told})
     return policy
 
 
@@ -111,6 +123,12 @@ def figures_in_model(task: Task, model: Model, policy: Controller, seed: int) ->
         unit = task.outcome_units.get(name, "")
         figures.append(Figure(f"in_model.{name}", value, unit, better=better))
     return figures
+
+
+def line_of(figure: Figure) -> str:
+    """For a person."""
+    value = "none" if figure.value is None else f"{figure.value:.4g} {figure.unit}"
+    return f"{figure.name.replace('_', ' ').replace('.', ': ')} {value}".rstrip()
 
 
 def constants(task: Task) -> dict[str, Any]:

@@ -300,41 +300,51 @@ class Evaluate(Options, ABC):
     policy: Annotated[Path, arg(metavar="POLICY")]
     """What `palpate train` wrote: its folder, or the policy file in it."""
     model: Annotated[Path | None, arg(metavar="MODEL", help_behavior_hint="(default: none)")] = None
-    """Try the policy in this identified model too, to compare."""
+    """Try the policy in worlds that are like this identified model, and in the model itself."""
 
     @abstractmethod
     def prepare(self, model: Model) -> Model:
         """The model as the task drives it."""
 
-    @abstractmethod
-    def trials(self) -> Sequence[Trial]:
-        """What is tried, drawn by the seed."""
+    def base(
+        self, policy: CommandPolicy, manifest: Mapping[str, Any], model: Model | None
+    ) -> tuple[Any, str]:
+        """What the worlds are drawn around, and a line that says so.
+
+        `manifest` is the policy's, `model` the prepared one that was named. Here worlds do not
+        depend on them, and nothing is said.
+        """
+        return None, ""
 
     @abstractmethod
-    def controllers(self, policy: CommandPolicy) -> Mapping[str, Controller]:
+    def trials(self, base: Any) -> Sequence[Trial]:
+        """What is tried, drawn by the seed around the `base`."""
+
+    @abstractmethod
+    def controllers(self, policy: CommandPolicy, base: Any) -> Mapping[str, Controller]:
         """Who decides, by name: the policy, and then what it is held against."""
 
     def show(self, run: Run, trials: Sequence[Any], evaluated: Mapping[str, Any]) -> None:
         """Leave evidence for the run's page, as `palpate.report.evidence` describes; here none."""
 
-    def constants(self) -> dict[str, Any]:
+    def constants(self, base: Any) -> dict[str, Any]:
         """Of the worlds, for the result."""
         return {}
 
-    def check(self, policy: CommandPolicy) -> None:
+    def check(self, policy: CommandPolicy, base: Any) -> None:
         """Raise `PalpateError` where some world is controlled at another rate."""
         from palpate.trials.controller import check_period
 
-        for controller in self.controllers(policy).values():
-            for trial in self.trials():
+        for controller in self.controllers(policy, base).values():
+            for trial in self.trials(base):
                 check_period(controller, trial.control_period)
 
-    def evaluate(self, policy: CommandPolicy, run: Run) -> Found:
+    def evaluate(self, policy: CommandPolicy, run: Run, base: Any) -> Found:
         """Let each controller decide in the same trials; the figures of each."""
         from palpate.trials.trial import evaluate_trials, table
 
-        trials = self.trials()
-        evaluated = evaluate_trials(self.controllers(policy), trials, run)
+        trials = self.trials(base)
+        evaluated = evaluate_trials(self.controllers(policy, base), trials, run)
         self.show(run, trials, evaluated)
         ends = ["", *(f".{name.replace(' ', '_')}" for name in [*evaluated][1:])]
         figures = [
@@ -344,7 +354,7 @@ class Evaluate(Options, ABC):
         return Found(
             figures=[figure for own in figures for figure in own],
             lines=table(trials, evaluated),
-            settings={"trials": len(trials), **self.constants()},
+            settings={"trials": len(trials), **self.constants(base)},
             split={"evaluated": f"{len(trials)} trials, seed {self.seed}"},
         )
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from palpate.runs import Run
     from palpate.trials.rope.stabilization import StabilizationTrial
     from palpate.trials.rope.tracking import PathTrial
+    from palpate.worlds.rope.configuration import RopeConfiguration
 
 NOISE = 5e-4  # m, standard deviation of a marker's coordinate in the simulated world
 RENDERED = 3.0  # s of a trial in the moving picture
@@ -249,26 +250,48 @@ class TrainRopeTracking(TrainRope):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateRope(Evaluate):
-    """Evaluation in MuJoCo ropes, drawn around the one that is recorded by default."""
+    """Evaluation in MuJoCo ropes, drawn around one's own or the one that was recorded."""
 
     ropes: int
+    length: Number = None
+    """Of the rope that the others are drawn around, m; this and the next change single constants
+    of it."""
+    mass: Number = None
+    """Without tip mass, kg."""
+    tip_mass: Number = None
+    """A point at its end, kg."""
+    bending_stiffness: Number = None
+    """E I, N m^2."""
+    joint_damping: Number = None
+    """Against bending, N m s/rad at each of 40 joints."""
 
     def prepare(self, model: Rope) -> Rope:
         """The rope moved by its gripper's velocity."""
         return _driven_by_velocity(model)
 
-    def check(self, policy: CommandPolicy) -> None:
+    def check(self, policy: CommandPolicy, base: RopeConfiguration) -> None:
         """See `Evaluate.check`; there has to be a rope, too."""
         if self.ropes < 1:
             raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
-        super().check(policy)
+        super().check(policy, base)
 
-    def constants(self) -> dict[str, Any]:
+    def base(
+        self, policy: CommandPolicy, manifest: Mapping[str, Any], model: Rope | None
+    ) -> tuple[RopeConfiguration, str]:
+        """See `Evaluate.base` and `palpate.families.rope.counterpart`."""
+        from palpate.families.rope.counterpart import adapted, described, rope_for
+
+        around, whose = rope_for(policy, manifest, model)
+        names = "length", "mass", "tip_mass", "bending_stiffness", "joint_damping"
+        given = {name: getattr(self, name) for name in names}
+        around = adapted(around, {name: n for name, n in given.items() if n is not None})
+        return around, f"tried in MuJoCo ropes drawn around {whose}: {described(around)}"
+
+    def constants(self, base: RopeConfiguration) -> dict[str, Any]:
         """Of the rope that the others are drawn around."""
         from palpate.families.rope.recording import constants
-        from palpate.worlds.rope.configuration import RopeConfiguration
 
-        return constants(RopeConfiguration())
+        return constants(base)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,30 +300,35 @@ class EvaluateRopeStabilization(EvaluateRope):
 
     Beside it, in the same trials: a gripper held still, and a tuned swing damper.
 
+    The ropes are drawn around that of --model; else around the one that the policy's recordings
+    were made of, as far as its file says so.
+
     1. After `palpate train`:                   palpate evaluate rope-stabilization
                                                     --policy runs/train-rope-stabilization-001
+    2. In ropes like another model's:           palpate evaluate rope-stabilization
+                                                    --policy P --model runs/identify-rope-002
+    3. Twice as heavy as that:                  palpate evaluate rope-stabilization
+                                                    --policy P --mass 0.11
     """
 
     task: ClassVar[str] = "rope-stabilization"
 
     ropes: int = 10
-    """Drawn around the rope that `palpate record` has by default; each from four poses."""
+    """How many; each from four poses."""
 
-    def trials(self) -> list[StabilizationTrial]:
+    def trials(self, base: RopeConfiguration) -> list[StabilizationTrial]:
         """Each rope from each pose, for four first periods of the longest."""
         from palpate.trials.rope.stabilization import evaluation_trials
-        from palpate.worlds.rope.configuration import RopeConfiguration
 
-        return evaluation_trials(RopeConfiguration(), self.ropes, self.seed)
+        return evaluation_trials(base, self.ropes, self.seed)
 
-    def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
+    def controllers(self, policy: CommandPolicy, base: RopeConfiguration) -> dict[str, Controller]:
         from palpate.tasks.rope import RopeStabilization
         from palpate.trials.rope.baselines import baselines
         from palpate.trials.rope.learned import LearnedController
-        from palpate.worlds.rope.configuration import RopeConfiguration
 
         controlled = LearnedController(policy, RopeStabilization())
-        return {"controlled": controlled, **baselines(RopeConfiguration())}
+        return {"controlled": controlled, **baselines(base)}
 
     def show(
         self, run: Run, trials: Sequence[StabilizationTrial], evaluated: Mapping[str, Any]
@@ -310,12 +338,12 @@ class EvaluateRopeStabilization(EvaluateRope):
 
         write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
 
-    def evaluate(self, policy: CommandPolicy, run: Run) -> Found:
+    def evaluate(self, policy: CommandPolicy, run: Run, base: RopeConfiguration) -> Found:
         """See `Evaluate.evaluate`; one trial is rendered, too."""
         from palpate.trials.rope.rendering import render_trial
 
-        found, (first, *_) = super().evaluate(policy, run), self.trials()
-        controller = self.controllers(policy)["controlled"]
+        found, (first, *_) = super().evaluate(policy, run, base), self.trials(base)
+        controller = self.controllers(policy, base)["controlled"]
         try:
             render_trial(run.path / "rendering.webp", first, controller, RENDERED)
         except PalpateError as error:  # a machine without OpenGL: the page draws the ropes itself
@@ -340,7 +368,7 @@ class EvaluateRopeTracking(EvaluateRope):
     task: ClassVar[str] = "rope-tracking"
 
     ropes: int = 5
-    """Drawn around the rope that `palpate record` has by default; each on every path."""
+    """How many; each on every path."""
     paths: Annotated[tuple[str, ...], arg(metavar="NAME|FILE.csv ...")] = (
         "lemniscate",
         "egg",
@@ -348,21 +376,19 @@ class EvaluateRopeTracking(EvaluateRope):
     )
     """Of these three, of random size, speed and direction, or from files, as they stand there."""
 
-    def trials(self) -> list[PathTrial]:
+    def trials(self, base: RopeConfiguration) -> list[PathTrial]:
         """Each rope on each path."""
         from palpate.trials.rope.tracking import path_trials
-        from palpate.worlds.rope.configuration import RopeConfiguration
 
-        return path_trials(RopeConfiguration(), self.ropes, self.seed, self.paths)
+        return path_trials(base, self.ropes, self.seed, self.paths)
 
-    def controllers(self, policy: CommandPolicy) -> dict[str, Controller]:
+    def controllers(self, policy: CommandPolicy, base: RopeConfiguration) -> dict[str, Controller]:
         from palpate.tasks.rope import RopeTracking
         from palpate.trials.rope.learned import LearnedController
         from palpate.trials.rope.tracking import blind_controllers
-        from palpate.worlds.rope.configuration import RopeConfiguration
 
         controlled = LearnedController(policy, RopeTracking())
-        return {"controlled": controlled, **blind_controllers(RopeConfiguration())}
+        return {"controlled": controlled, **blind_controllers(base)}
 
     def show(self, run: Run, trials: Sequence[PathTrial], evaluated: Mapping[str, Any]) -> None:
         """Motions, and a picture of all tips."""

@@ -1,6 +1,7 @@
 """The textbook swing damper, which learned controllers of a rope are compared with."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +32,16 @@ class Gains:
     position: float  # 1/s^2, on the gripper's distance from where it started
     velocity: float  # 1/s, on the gripper's velocity
     part: float  # how much of the rope is watched, from the gripper on; 1 or more: all of it
+
+    def alike(self, size: float) -> "Gains":
+        """For a rope `size` times as long, whose swings last sqrt(size) times (Froude 1868)."""
+        return dataclasses.replace(
+            self,
+            offset=self.offset / size,
+            rate=self.rate / math.sqrt(size),
+            position=self.position / size,
+            velocity=self.velocity / math.sqrt(size),
+        )
 
 
 # Found by `python -m palpate.trials.rope.baselines` (seed 7000, which no evaluation uses).
@@ -91,7 +102,8 @@ def _shortened(vectors: np.ndarray, limit: float) -> np.ndarray:
 
 def baselines(base: RopeConfiguration) -> dict[str, Controller]:
     """What a controller that is to bring ropes like this one to rest is held against."""
-    return {"held still": HeldStill(), "swing damper": SwingDamper(base)}
+    gains = TUNED.alike(base.length)  # they were tuned for 1 m
+    return {"held still": HeldStill(), "swing damper": SwingDamper(base, gains)}
 
 
 def coarse(configuration: RopeConfiguration) -> RopeConfiguration:

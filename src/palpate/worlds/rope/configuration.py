@@ -4,11 +4,13 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from palpate.errors import PalpateError
+
+SHORTEST_STEP = 2e-5  # s, of a simulation that anybody waits for
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,9 @@ class RopeConfiguration:
     the length (0 at the gripper, 1 at the tip) to a weight; weights are relative and `mass` is
     their sum.
 
+    `marker_places` says how far along the rope each marker is, from 0 at the gripper to 1 at the
+    tip; one that lies between two nodes is a point of the rigid body between them.
+
     Raises `PalpateError` for values that are not physical, that do not divide evenly, or that
     the explicit time step cannot integrate.
     """
@@ -68,6 +73,7 @@ class RopeConfiguration:
     bending_stiffness: float = 1e-4  # EI, N m^2
     twisting_stiffness: float = 7e-5  # GJ, N m^2
     joint_damping: float = 3e-3  # N m s/rad per joint
+    grip_damping: float | None = None  # N m s/rad of the pivot in the gripper; None: as a joint
     air_density: float = 1.2  # kg/m^3
     air_viscosity: float = 3e-3  # Pa s, effective: see above
     gravity: float = 9.81  # m/s^2
@@ -76,7 +82,8 @@ class RopeConfiguration:
     grip: Literal["pivot", "clamped"] = "pivot"  # clamped: the first body always points down
     speed_limit: float = 1.5  # m/s, Euclidean norm of the gripper's velocity
     acceleration_limit: float = 10.0  # m/s^2, Euclidean norm
-    markers: int = 21  # spread evenly over the nodes, gripper and tip included
+    markers: int = 21
+    marker_places: Sequence[float] | None = None  # shares of the length; None: evenly, 0 to 1
     observation_noise: float = 5e-4  # m, standard deviation per marker coordinate
     observation_delay: float = 0.0  # s, whole control periods
     observation_rate: float | None = None  # Hz; None: the control rate
@@ -88,6 +95,8 @@ class RopeConfiguration:
         for name in positive:
             if not 0 < getattr(self, name) < math.inf:
                 raise PalpateError(f"a rope's {name} is greater than 0, not {getattr(self, name)}")
+        if self.grip_damping is not None and not 0 <= self.grip_damping < math.inf:
+            raise PalpateError(f"a rope's grip_damping is 0 or greater, not {self.grip_damping}")
         zero_or_more = ("tip_mass", "joint_damping", "air_density", "air_viscosity", "gravity",
                         "observation_noise", "observation_delay")  # fmt: skip
         for name in zero_or_more:
@@ -97,13 +106,9 @@ class RopeConfiguration:
             raise PalpateError(f"a rope's grip is 'pivot' or 'clamped', not {self.grip!r}")
         if not isinstance(self.bodies, int | np.integer) or self.bodies < 3:
             raise PalpateError(f"a rope has a whole number of bodies, 3 or more, not {self.bodies}")
-        whole = isinstance(self.markers, int | np.integer) and self.markers >= 2
-        if not whole or self.bodies % (self.markers - 1):
-            fitting = [n + 1 for n in range(1, self.bodies + 1) if self.bodies % n == 0]
-            raise PalpateError(
-                f"{self.markers} markers do not spread evenly over {self.bodies} bodies; "
-                f"{', '.join(map(str, fitting))} markers do"
-            )
+        if not isinstance(self.markers, int | np.integer) or self.markers < 2:
+            raise PalpateError(f"a rope has a whole number of markers, 2 or more: {self.markers}")
+        self._check_places()
         self._whole("control_period", self.control_period / self.time_step, "time steps")
         delay = self.observation_delay / self.control_period
         self._whole("observation_delay", delay, "control periods")
@@ -125,6 +130,18 @@ class RopeConfiguration:
                 "it has to be a whole number of them"
             )
 
+    def _check_places(self) -> None:
+        if self.marker_places is None:
+            return
+        places = np.asarray(self.marker_places, float)
+        in_order = places.ndim == 1 and bool((np.diff(places) > 0).all())
+        if len(places) != self.markers or not in_order or places[0] < 0 or places[-1] > 1:
+            raise PalpateError(
+                f"a rope's marker_places are {self.markers} growing shares of its length, from 0 "
+                f"at the gripper to 1 at the tip, not {self.marker_places}"
+            )
+        object.__setattr__(self, "marker_places", tuple(places.tolist()))
+
     def _weights(self) -> str | tuple[float, ...]:
         weights = self.mass_distribution
         if isinstance(weights, str):
@@ -145,7 +162,17 @@ class RopeConfiguration:
         return tuple(weights.tolist())
 
     def _check_time_step(self) -> None:
-        """Refuse what symplectic Euler cannot integrate: angular frequency x time step < 2.
+        """Refuse what symplectic Euler cannot integrate: angular frequency x time step < 2."""
+        for name, omega in self.fastest().items():
+            if omega * self.time_step >= 2:
+                raise PalpateError(
+                    f"a {name} of {getattr(self, name):g} N m^2 needs a time_step below "
+                    f"{2 / omega:.3g} s with bodies of {self.body_masses().min():.3g} kg and "
+                    f"{self.length / self.bodies:.3g} m, not {self.time_step:g}"
+                )
+
+    def fastest(self) -> dict[str, float]:
+        """Greatest angular frequency in rad/s that each stiffness makes.
 
         The fastest bending of a chain of rods of mass m and length h is its zigzag, whose
         kinetic energy is the rods' rotation: omega^2 = 48 EI / (h^3 m). The fastest twisting
@@ -154,13 +181,22 @@ class RopeConfiguration:
         mass, spacing = self.body_masses().min(), self.length / self.bodies
         bending = math.sqrt(48 * self.bending_stiffness / (spacing**3 * mass))
         twisting = math.sqrt(8 * self.twisting_stiffness / (spacing * mass * self.radius**2))
-        for name, omega in (("bending_stiffness", bending), ("twisting_stiffness", twisting)):
-            if omega * self.time_step >= 2:
-                raise PalpateError(
-                    f"a {name} of {getattr(self, name):g} N m^2 needs a time_step below "
-                    f"{2 / omega:.3g} s with bodies of {mass:.3g} kg and {spacing:.3g} m, "
-                    f"not {self.time_step:g}"
-                )
+        return {"bending_stiffness": bending, "twisting_stiffness": twisting}
+
+    def sideways_drag(self) -> tuple[float, float]:
+        """Linear (N s/m) and quadratic (N s^2/m^2) drag of a body that moves across its axis.
+
+        By the class's law, with the inertia of a capsule of uniform density as MuJoCo has it.
+        """
+        radius, length = self.radius, self.length / self.bodies
+        ends = 4 * radius / (3 * length + 4 * radius)  # share of the mass in the two half spheres
+        axial = (1 - ends) * radius**2 / 2 + ends * 2 * radius**2 / 5
+        across = (1 - ends) * (length**2 / 12 + radius**2 / 4) + ends * (
+            2 * radius**2 / 5 + length**2 / 4 + 3 * length * radius / 8
+        )
+        long, thin = math.sqrt(1.5 * (2 * across - axial)), math.sqrt(1.5 * axial)
+        linear = 6 * math.pi * self.air_viscosity * (long + 2 * thin) / 3
+        return linear, 2 * self.air_density * long * thin
 
     def body_masses(self) -> np.ndarray:
         """Mass of each body from gripper to tip in kg, shape (bodies,), without `tip_mass`."""
@@ -168,6 +204,27 @@ class RopeConfiguration:
             return np.full(self.bodies, self.mass / self.bodies)
         weights = np.asarray(self.mass_distribution)
         return self.mass * weights / weights.sum()
+
+
+def in_step(period: float, **constants: Any) -> RopeConfiguration:
+    """A rope of these constants, controlled every `period` s, whose simulation keeps step with it.
+
+    Its time step is the longest that divides the period, is no longer than the default, and is
+    half of what the stiffness allows, so that ropes drawn around it can be simulated as well.
+
+    Raises `PalpateError` where that is below 20 microseconds, and as `RopeConfiguration`.
+    """
+    instant = {"time_step": 1e-6, "control_period": 1e-6}
+    quickest = max(RopeConfiguration(**{**constants, **instant}).fastest().values())
+    longest = min(RopeConfiguration.time_step, 1 / quickest)
+    if longest < SHORTEST_STEP:
+        raise PalpateError(
+            f"this rope would be simulated in steps of {longest:.2g} s, too slow to wait for: "
+            f"expected one of less stiffness for its mass and length, so that {SHORTEST_STEP:g} s "
+            "are enough"
+        )
+    steps = math.ceil(period / longest - 1e-9)
+    return RopeConfiguration(**{**constants, "control_period": period, "time_step": period / steps})
 
 
 def sample_configurations(
@@ -187,6 +244,7 @@ def sample_configurations(
             tip_mass=base.tip_mass * mass,
             bending_stiffness=base.bending_stiffness * bending,
             joint_damping=base.joint_damping * damping,
+            grip_damping=None if base.grip_damping is None else base.grip_damping * damping,
             air_density=base.air_density * drag,
             air_viscosity=base.air_viscosity * drag,
         )

@@ -83,8 +83,7 @@ class RopeWorld(World):
         self._first = self._model.body("B_first").id
         self._rope = slice(self._first, self._first + configuration.bodies)
         self._tip_site = self._model.site("S_last").id
-        spacing = configuration.bodies // (configuration.markers - 1)
-        self._marker_nodes = np.arange(0, configuration.bodies + 1, spacing)
+        self._before, self._share = _marker_places(configuration)
         self._steps_per_period = round(configuration.control_period / configuration.time_step)
         self._delay = round(configuration.observation_delay / configuration.control_period)
         self._every = 1
@@ -238,7 +237,9 @@ class RopeWorld(World):
     def _measure(self) -> RopeObservation:
         configuration, data = self._configuration, self._data
         mujoco.mj_kinematics(self._model, data)
-        markers = self._nodes()[self._marker_nodes]
+        nodes = self._nodes()
+        after = nodes[np.minimum(self._before + 1, configuration.bodies)]
+        markers = nodes[self._before] + self._share * (after - nodes[self._before])
         noise = configuration.observation_noise * self._random.standard_normal(markers.shape)
         return RopeObservation(
             time=self._step_count * configuration.control_period,
@@ -322,6 +323,9 @@ def _compile(configuration: RopeConfiguration) -> mujoco.MjModel:
     </mujoco>""")
     body = spec.body("B_first")
     body.quat = DOWNWARDS  # the cable's own axis is x
+    if configuration.grip_damping is not None:
+        for joint in body.joints:
+            joint.damping[0] = configuration.grip_damping
     for mass in configuration.body_masses():
         body.geoms[0].mass = mass
         body = body.bodies[0] if body.bodies else body
@@ -332,6 +336,18 @@ def _compile(configuration: RopeConfiguration) -> mujoco.MjModel:
             rgba=(0.3, 0.3, 0.35, 1),
         )  # fmt: skip
     return spec.compile()
+
+
+def _marker_places(configuration: RopeConfiguration) -> tuple[np.ndarray, np.ndarray]:
+    """The node before each marker, (markers,), and how far it is to the next, (markers, 1)."""
+    bodies, places = configuration.bodies, configuration.marker_places
+    if places is None:
+        place = np.arange(configuration.markers) * bodies / (configuration.markers - 1)
+    else:
+        place = np.array(places) * bodies
+    place = np.where(abs(place - place.round()) < 1e-9, place.round(), place)
+    before = np.floor(place).astype(int)
+    return before, (place - before)[:, None]
 
 
 def _limit(vector: np.ndarray, greatest: float) -> np.ndarray:

@@ -1,0 +1,141 @@
+"""The MuJoCo rope that stands for an identified one swings as its model does."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from deployed import rope_policy
+from palpate.errors import PalpateError
+from palpate.families.rope.counterpart import adapted, counterpart, described, rope_for
+from palpate.families.rope.recording import record_rope
+from palpate.models.model import rollout
+from palpate.models.rope import Rope, RopeState
+from palpate.parameters import describe
+from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
+
+TILT = 0.1  # rad, of a small swing
+OWN: dict = {"length": 0.73, "mass": 0.055, "nodes": 12, "control_period": 1 / 60, "substeps": 17}
+
+
+def own_rope(**fields) -> Rope:
+    return Rope.uniform(drive="velocity", **{**OWN, **fields})
+
+
+def swing(time: np.ndarray, tip: np.ndarray) -> tuple[float, float]:
+    """Period in s and decay rate in 1/s of a damped sinusoid."""
+
+    def off(p):
+        return p[0] * np.exp(-p[1] * time) * np.cos(p[2] * time + p[3]) - tip
+
+    fits = [least_squares(off, [tip[0], 0.2, omega, 0.0]) for omega in (4.0, 5.0)]
+    _, decay, omega, _ = min(fits, key=lambda fit: fit.cost).x
+    return 2 * np.pi / omega, decay
+
+
+def swung(model: Rope, steps: int = 240):
+    """(period, decay) of a straight start, in the model and in its counterpart."""
+    direction = np.array([np.sin(TILT), 0.0, -np.cos(TILT)])
+    depth = np.append(0.0, np.cumsum(model.rest_length))
+    position = jnp.asarray(depth[:, None] * direction, jnp.float32)
+    start = RopeState(position, jnp.zeros_like(position))
+    states = jax.jit(rollout)(model, start, jnp.zeros((steps, 1, 3)))
+    world = RopeWorld(counterpart(model, observation_noise=0.0))
+    world.reset(0, start=np.stack([np.zeros(3), direction]), azimuth=0.0)
+    tips = [world.step(np.zeros(3)).markers[-1, 0] for _ in range(steps)]
+    time = np.arange(1, steps + 1) * model.control_period
+    return swing(time, np.asarray(states.position)[:, -1, 0]), swing(time, np.array(tips))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"air_drag": 3e-3, "quadratic_drag": 1e-6, "bend_damping": 1e-5, "grip_damping": 1e-6},
+        {"air_drag": 1e-5, "quadratic_drag": 3e-2, "bend_damping": 1e-5, "grip_damping": 1e-6},
+    ],
+    ids=["as the priors expect", "linear drag", "quadratic drag"],
+)
+def test_a_small_free_swing_has_the_period_and_the_decay_of_the_model(fields):
+    (period, decay), (own_period, own_decay) = swung(own_rope(**fields))
+    assert own_period == pytest.approx(period, rel=0.01)
+    assert own_decay == pytest.approx(decay, rel=0.1)
+    assert decay > 0.02  # there is something to agree on
+
+
+def test_uneven_markers_and_masses_are_where_the_model_has_them():
+    lengths = np.array([0.1, 0.2, 0.13, 0.3])
+    model = Rope.from_rest_lengths(lengths, 0.055)
+    heavy = eqx.tree_at(lambda rope: rope.node_mass, model, model.node_mass.at[-1].mul(3.0))
+    found = counterpart(heavy, 2e-3)
+    assert found.length == pytest.approx(0.73, rel=0.01)  # and what it stretches
+    places = np.append(0.0, np.cumsum(lengths)) / 0.73
+    assert found.marker_places == pytest.approx(places, abs=2e-3)
+    assert found.mass == pytest.approx(float(heavy.node_mass.sum()))
+    masses = found.body_masses()
+    assert 2.5 < masses[-1] / masses[0] < 3
+    assert found.observation_noise == 2e-3
+    assert counterpart(own_rope(), 0.0).mass_distribution == "uniform"
+
+
+def test_bending_is_that_of_a_beam_whatever_its_bodies_are():
+    model = own_rope(bend_stiffness=8e-3, bend_damping=2e-4)
+    found, segment = counterpart(model, 0.0), OWN["length"] / (OWN["nodes"] - 1)
+    assert found.bending_stiffness == pytest.approx(8e-3 * segment, rel=1e-3)
+    beam = found.joint_damping * found.length / found.bodies
+    assert beam == pytest.approx(2e-4 * segment, rel=1e-2)
+    assert found.grip_damping == pytest.approx(float(model.grip_damping))
+
+
+def test_a_rope_held_at_both_ends_has_no_counterpart():
+    with pytest.raises(PalpateError, match=r"driven at \(0, 11\) has no MuJoCo rope"):
+        counterpart(own_rope(driven=(0, 11)), 0.0)
+
+
+def manifest(model: Rope, recordings=None) -> dict:
+    """As `palpate train` writes it, shortened."""
+    told = {} if recordings is None else {"recordings": recordings}
+    return {"model": describe(model), "training": {"observation_noise": 2e-3}, **told}
+
+
+def test_which_rope_a_policy_is_tried_in():
+    foreign = {"file": "own.npz", "format": "positions"}
+    policy = rope_policy(12, period=1 / 60)
+    rope, whose = rope_for(policy, manifest(own_rope(), foreign))
+    assert whose == "that of the model it was trained on"
+    assert rope == counterpart(own_rope(), 2e-3)
+    assert described(rope).startswith("0.73")
+    assert described(rope).endswith("12 markers at 60 Hz")
+    other = own_rope(length=0.5)
+    assert rope_for(policy, manifest(own_rope(), foreign), other) == (
+        counterpart(other, 2e-3),
+        "that of the model",
+    )
+    # Files from before, and those that ship, do not say what was recorded.
+    assert rope_for(rope_policy(11), manifest(own_rope(nodes=11)))[0] == RopeConfiguration()
+    assert rope_for(policy, manifest(own_rope()))[0] == counterpart(own_rope(), 2e-3)
+    assert rope_for(policy, {})[0] == RopeConfiguration()
+
+
+def test_a_rope_that_palpate_recorded_is_that_rope_again():
+    recorded = RopeConfiguration(length=0.8, bodies=10, markers=11)
+    provenance = dict(record_rope(recorded, [0], 0.1).provenance)
+    model, policy = own_rope(nodes=11, control_period=0.01), rope_policy(11)
+    assert rope_for(policy, manifest(model, provenance)) == (recorded, "the one that was recorded")
+    several = provenance | {"world.length": "0.8; 0.9"}
+    assert rope_for(policy, manifest(model, several))[1] == "that of the model it was trained on"
+
+
+def test_single_constants_are_changed_and_the_time_step_follows():
+    base = counterpart(own_rope(), 1e-3)
+    heavy = adapted(base, {"mass": 0.2})
+    assert heavy.mass == 0.2
+    assert dataclasses.replace(heavy, mass=base.mass, time_step=base.time_step) == base
+    stiff = adapted(base, {"bending_stiffness": 0.01})
+    assert stiff.time_step < base.time_step
+    assert adapted(base, {}) is base
+    assert adapted(RopeConfiguration(), {"length": 0.9}) == RopeConfiguration(length=0.9)

@@ -24,9 +24,9 @@ class Door(Model):
         )
         (angle, rate), time = state, self.control_period / 4
         for _ in range(4):
-            torque = action - damping * rate - friction * jnp.tanh(rate / 0.05)
-            rate = rate + time * torque / inertia
-            angle = angle + time * rate
+            after = rate + time * (action - damping * rate) / inertia
+            after = after / (1 + time * friction / inertia / jnp.sqrt(after**2 + 0.01**2))
+            angle, rate = angle + time * (rate + after) / 2, after
         return angle, rate
 
     def observe(self, state):

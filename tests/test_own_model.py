@@ -11,9 +11,11 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import PalpateError
+from palpate.identification.posterior.files import read_models
 from palpate.models.files import load_model, save_model
 from palpate.models.model import Model, rollout
 from palpate.models.python_files import load_class
+from palpate.report import read_evidence
 from palpate.runs.result import read_result
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -74,6 +76,36 @@ def test_what_is_identified_is_the_door_that_was_recorded(workshop):
         assert rows[name]["lower"] < rows[name]["value"] < rows[name]["upper"]
     assert rows["inertia"]["unit"] == "kg m^2"
     assert read_result("model/result.json").split == {"fitted": ["R"], "validation": ["V"]}
+
+
+def test_the_page_shows_what_was_observed_beside_what_is_predicted(workshop):
+    curves = read_evidence("model").prediction
+    assert curves is not None
+    observed, identified = curves.values["observed"], curves.values["identified"]
+    assert observed.shape == identified.shape == (199, 1, 1)  # after the two frames of the start
+    assert np.abs(np.diff(observed[:, 0, 0])).max() < 0.1  # no jump where the angle passes pi
+    assert np.ptp(observed) > 1.0
+    assert (
+        np.abs(identified - observed).mean()
+        < 0.2 * np.abs(curves.values["start model"] - observed).mean()
+    )
+    page = Path("model/report.html").read_text()
+    assert "<h2>Observed and predicted</h2>" in page
+    assert "angle (rad)" in page
+
+
+def test_draws_of_it_are_shown_as_a_fan_and_come_back(workshop, capsys):
+    few = "--method local-global --chains 2 --draws 20 --fixed inertia --init model"
+    do(f"identify door.py:Door R.csv {CHANNELS} {few} --out drawn")
+    assert "inertia" not in capsys.readouterr().out
+    curves = read_evidence("drawn").prediction
+    assert curves is not None
+    draws, observed = curves.values["draws"], curves.values["observed"]
+    assert draws.shape == (100, 1, 40)
+    assert np.abs(draws - observed).max() < 0.5
+    models = read_models("drawn/posterior.npz")
+    assert models.damping.shape == (40,)
+    assert abs(np.median(models.friction) / TRUE["friction"] - 1) < 0.05
 
 
 def test_the_file_says_which_class_of_which_file_it_holds(workshop):

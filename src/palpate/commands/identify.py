@@ -202,7 +202,9 @@ def _write_draws(
     model = posterior.target.coordinates.reference
     pieces = cut_pieces(data.validation_aligned, model, options.piece)
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
-    write_evidence(run.path, identify_report.expected_errors(predicted, pieces, model))
+    evidence = identify_report.expected_errors(predicted, pieces, model)
+    evidence |= identify_report.drawn_motion(predicted, pieces, model)
+    write_evidence(run.path, evidence)
     settings = {
         "structure": comparison.structure,
         "probability": comparison.probability,
@@ -211,6 +213,7 @@ def _write_draws(
         "pieces": pieces.count,
         "scored_on": "what was fitted" if data.validation is None else "what was not fitted",
         "observation_unit": identify_report.units_of(data.unit, model)[0],
+        "predicted": identify_report.predicted_names(data, model),
     }
     figures = identify_report.drawn_figures(posterior, score, model, run.elapsed, data.unit)
     meanings = options.meanings(posterior.models(), posterior.prior)

@@ -15,13 +15,14 @@ SHORTEST = 0.5  # s of recordings that a posterior needs, in all
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """What there is to fit and to score: aligned trials, and the observation's unit."""
+    """What there is to fit and to score: aligned trials, the observation's unit and channels."""
 
     fitted: Recording
     validation: Recording | None
     fitted_aligned: Aligned
     validation_aligned: Aligned
     unit: str
+    observed: tuple[str, ...]
 
     @property
     def shown(self) -> list[Recording]:
@@ -55,7 +56,7 @@ def read(options: Identify) -> Data:
     if validation is not None:
         validation = _prepared(validation, options, "validation, ")
         scored = validation.align(period, observed, action)
-    return Data(fitted, validation, aligned, scored, _unit(fitted, observed))
+    return Data(fitted, validation, aligned, scored, _unit(fitted, observed), observed)
 
 
 def _unit(recording: Recording, observed: tuple[str, ...]) -> str:

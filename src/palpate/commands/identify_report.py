@@ -13,7 +13,7 @@ from palpate.identification.data.segments import Segments, difference
 from palpate.identification.gradient.residual import Correction
 from palpate.identification.identify import Identified
 from palpate.identification.posterior.comparison import PIECE
-from palpate.identification.posterior.posterior import Posterior
+from palpate.identification.posterior.posterior import Posterior, spread_out
 from palpate.identification.posterior.predictive import Predicted, Score
 from palpate.identification.verdicts import verdict
 from palpate.models.model import Model
@@ -22,6 +22,7 @@ from palpate.report.charts import quantiles
 from palpate.runs import Figure, Result
 
 LEVEL = 0.9
+PANELS, FAN = 6, 40  # numbers of an observation, and draws, that the page shows
 CORRECTION = "correction"  # what the result's settings say of it
 UNITS = {"m": (100.0, "cm")}  # a person reads these errors of a fit in another unit
 
@@ -31,6 +32,49 @@ def units_of(unit: str, model: Model) -> tuple[str, ...]:
     several = tuple(unit.split(", "))
     count = model.observation_shape[-1] if model.observation_shape else 1
     return several if len(several) == count else (unit,) * count
+
+
+def predicted_names(data: Data, model: Model) -> list[str]:
+    """What the first numbers of an observation are called, with their units: "angle (rad)"."""
+    count, units = math.prod(model.observation_shape), units_of(data.unit, model)
+    names = [*data.observed]
+    if len(names) != count:
+        names = [f"{' '.join(names)} {index + 1}" for index in range(count)]
+    return [f"{name} ({units[i % len(units)]})" for i, name in enumerate(names[:PANELS])]
+
+
+def _compared(
+    model: Model, target: np.ndarray, seen: np.ndarray, predictions: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Evidence of one motion: what was observed (times, ...), and predictions (lines, times, ...).
+
+    Angles run on beyond a full turn, so that no line jumps.
+    """
+    rows = np.where(seen, np.arange(len(seen)).reshape(-1, *(1,) * (seen.ndim - 1)), -1)
+    last = np.maximum.accumulate(rows)
+    filled = np.take_along_axis(target, np.where(last < 0, seen.argmax(axis=0), last), axis=0)
+    turned = np.cumsum(difference(model, filled[1:], filled[:-1]), axis=0)
+    path = filled[0] + np.concatenate([np.zeros_like(turned[:1]), turned])
+    lines = {"observed": np.where(seen, path, np.nan)[None]} | {
+        label: path + difference(model, lines, np.broadcast_to(filled, lines.shape))
+        for label, lines in predictions.items()
+    }
+    return {"prediction.time": model.control_period * np.arange(1, len(seen) + 1)} | {
+        f"prediction.{label}": np.moveaxis(of.reshape(*of.shape[:2], -1)[..., :PANELS], 0, -1)
+        for label, of in lines.items()
+    }
+
+
+def drawn_motion(predicted: Predicted, pieces: Segments, model: Model) -> dict[str, np.ndarray]:
+    """Evidence of the piece whose error is the median: a fan of draws beside what was observed."""
+    seen, target = np.asarray(pieces.seen), np.asarray(pieces.target)
+    off = difference(model, predicted.motion.mean(axis=0), target)
+    axes = tuple(range(1, seen.ndim))
+    square = np.where(seen, off**2, 0.0).sum(axis=axes) / or_nan(seen.sum(axis=axes))
+    order = np.argsort(square)  # NaN, of what nobody saw, comes last
+    piece = int(order[np.isfinite(square).sum() // 2])
+    draws = predicted.motion[spread_out(len(predicted.motion), FAN), piece]
+    return _compared(model, target[piece], seen[piece], {"draws": draws})
 
 
 def split(data: Data) -> dict[str, Any]:
@@ -114,6 +158,7 @@ class FitReport:
             "scored_trials": len(scored.length),
             "scored_duration_s": float(np.median(scored.length) - 1) * scored.period,
             "end_s": float(self.scored.horizon[self.scored.last_seen]),
+            "predicted": predicted_names(self.data, self.delivered),
         }
         if self.correction is None:
             return known
@@ -142,13 +187,25 @@ class FitReport:
         if self._is_chain():
             low, high = quantiles(_root_mean_square(_distances(error)), (0.1, 0.9))
             arrays |= {"horizon.identified.low": low, "horizon.identified.high": high}
-            scored = np.isfinite(error.by_trial).sum()  # the others, NaN, are sorted last
-            trial = int(np.argsort(error.by_trial)[scored // 2])
+            trial = self._median_trial()
             seen = np.asarray(error.segments.seen[trial])
             arrays["motion.time"] = error.horizon
             arrays["motion.observed"] = np.where(seen, error.segments.target[trial], np.nan)
             arrays["motion.predicted"] = np.asarray(error.prediction[trial])
+        else:
+            trial = self._median_trial()
+            predicted = {"identified": error.prediction, "start model": self.start.prediction}
+            arrays |= _compared(
+                self.delivered,
+                np.asarray(error.segments.target[trial]),
+                np.asarray(error.segments.seen[trial]),
+                {label: np.asarray(of[trial])[None] for label, of in predicted.items()},
+            )
         return arrays
+
+    def _median_trial(self) -> int:
+        scored = np.isfinite(self.scored.by_trial).sum()  # the others, NaN, are sorted last
+        return int(np.argsort(self.scored.by_trial)[scored // 2])
 
     def _units(self) -> dict[str, np.ndarray]:
         """Which entries of the last axis of an observation are in each unit."""

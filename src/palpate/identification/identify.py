@@ -103,7 +103,10 @@ def drawn(comparison: Comparison) -> Identified:
     """The draws of the most probable hypothesis with their intervals."""
     posterior = comparison.posterior
     lower, upper = (
-        {path: np.quantile(of, level, axis=(0, 1)) for path, of in posterior.values.items()}
+        {
+            path: np.asarray(np.quantile(of, level, axis=(0, 1)))
+            for path, of in posterior.values.items()
+        }
         for level in INTERVAL
     )
     best = posterior.flat[np.argmax(posterior.draws.density)]

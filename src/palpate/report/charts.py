@@ -52,6 +52,32 @@ def horizon(curves: Curves, looks: Mapping[str, int], unit: str) -> Chart:
     return {"data": data, "layout": layout}
 
 
+def prediction(curves: Curves, looks: Mapping[str, int], names: Sequence[str]) -> Chart:
+    """Predicted numbers over time, a panel for each; several lines of a label are a fan."""
+    data, count = [], curves.values[next(iter(curves.values))].shape[1]
+    layout, height = empty_layout(90 + 200 * count), 1.0 / count
+    for row in range(count):
+        for label, values in curves.values.items():
+            line = curve_line(label, looks, curves.time, values[:, row, 0], "%{y:.4g}")
+            if values.shape[2] > 1:
+                every = max(1, math.ceil(values.shape[0] * values.shape[2] / (4 * _MOST_POINTS)))
+                gap = np.full((1, values.shape[2]), math.nan)  # between one line and the next
+                y = np.concatenate([values[::every, row], gap]).T.ravel()
+                x = np.tile(np.append(curves.time[::every], math.nan), values.shape[2])
+                thin = {"color": f"@series-{looks[label]}:0.3", "width": 1}
+                line |= {"x": _numbers(x), "y": _numbers(y), "mode": "lines", "line": thin}
+                line |= {"hoverinfo": "skip"}
+                del line["hovertemplate"]
+            data.append(line | _panel(row) | {"showlegend": row == 0})
+        top = 1.0 - row * height
+        layout[f"yaxis{row + 1 if row else ''}"] = titled_axis(plain_text(names[row])) | {
+            "domain": [top - 0.86 * height, top]
+        }
+    last = f"y{count}" if count > 1 else "y"
+    layout["xaxis"] = titled_axis("time since the prediction began (s)") | {"anchor": last}
+    return {"data": data, "layout": layout}
+
+
 # --- learning ---------------------------------------------------------------------------------
 
 _PANELS = {"horizon": "horizon (steps)", "amplitude": "amplitude (1)"}

@@ -8,12 +8,15 @@ folder and holds plain arrays, named by what they are:
     horizon.time         (times,)             s since the prediction began
     horizon.<label>      (times,)             root-mean-square error of the prediction
     horizon.<label>.low, horizon.<label>.high  (times,)  quantiles around it, both or neither
+    prediction.time      (times,)             s since a prediction began
+    prediction.<label>   (times, numbers, lines)  some numbers of an observation, one line or a fan
 
 A family adds kinds of its own, `<kind>.time` and `<kind>.<label>`: each is a `Piece` that stands in
 the table of families (`Family.evidence`) with the axes of its arrays.
 
 Several motions stand side by side as `motion/<group>.time`, `motion/<group>.<label>`. NaN is a gap.
-Errors are in the unit that "observation_unit" names in the settings of `result.json`, else in m.
+Errors are in the unit that "observation_unit" names in the settings of `result.json`, else in m,
+and what the numbers of a prediction are called stands there as "predicted": ["angle (rad)"].
 What else a report shows is read from the run's other files: figures from `result.json`, and from
 its "parameters" rows {name, value, unit, about, fixed, shared, lower, upper, verdict, derived},
 where value and 90 % interval are a number, a list of them or null, and what is derived follows from
@@ -111,9 +114,10 @@ class Parameter:
 class Evidence:
     """All that a run's folder holds for a report; what is not there is empty or None.
 
-    `unit` is that of `horizon`; `pieces` are the curves that families add, by name. `metrics` are
-    the run's logged lines. `rendering` is a moving picture of the scene, `rendering.webp`, `.gif`
-    or `.png`, where the machine could render one; `pictures` are all others that it drew, PNGs.
+    `unit` is that of `horizon`; `prediction` is one motion beside what was observed; `pieces` are
+    the curves that families add, by name. `metrics` are the run's logged lines. `rendering` is a
+    moving picture of the scene, `rendering.webp`, `.gif` or `.png`, where the machine could render
+    one; `pictures` are all others that it drew, PNGs.
     """
 
     path: Path
@@ -121,6 +125,7 @@ class Evidence:
     motions: tuple[Motion, ...] = ()
     horizon: Curves | None = None
     unit: str = "m"
+    prediction: Curves | None = None
     pieces: dict[str, Curves] = field(default_factory=dict)
     parameters: tuple[Parameter, ...] = ()
     metrics: tuple[dict[str, Any], ...] = ()
@@ -167,7 +172,7 @@ def read_evidence(run: str | Path) -> Evidence:
     known = (CONFIGURATION, RESULT, METRICS, EVIDENCE)
     if not any((run / name).exists() for name in known):
         raise PalpateError(f"{run} holds no run: expected {', '.join(known)} or some of them")
-    motions, horizon, added = _arrays(run / EVIDENCE)
+    motions, horizon, prediction, added = _arrays(run / EVIDENCE)
     result = _object(run / RESULT)
     settings = result.get("settings")
     unit = settings.get("observation_unit", "m") if isinstance(settings, dict) else "m"
@@ -178,6 +183,7 @@ def read_evidence(run: str | Path) -> Evidence:
         motions=motions,
         horizon=horizon,
         unit=str(unit),
+        prediction=prediction,
         pieces=added,
         parameters=tuple(_rows(run / RESULT, result, "parameters", _parameter)),
         metrics=tuple(read_metrics(run)),
@@ -195,12 +201,17 @@ RENDERINGS = {".webp": "image/webp", ".gif": "image/gif", ".png": "image/png"}
 
 # --- arrays -----------------------------------------------------------------------------------
 
-_Sections = tuple[tuple[Motion, ...], Curves | None, dict[str, Curves]]
+_Sections = tuple[tuple[Motion, ...], Curves | None, Curves | None, dict[str, Curves]]
+_OWN = {  # axes of what is no family's
+    "motion": ("frames", "points", 3),
+    "horizon": ("times",),
+    "prediction": ("times", "numbers", "lines"),
+}
 
 
 def _arrays(path: Path) -> _Sections:
     if not path.exists():
-        return (), None, {}
+        return (), None, None, {}
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
@@ -226,8 +237,8 @@ def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
     sections: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     for key, values in arrays.items():
         match = _KEY.fullmatch(key)
-        if match is None or (match[4] or "horizon") not in {"horizon", *known}:
-            kinds = "motion", "motion/<group>", "horizon", *known
+        if match is None or (match[4] or "motion") not in {*_OWN, *known}:
+            kinds = "motion", "motion/<group>", "horizon", "prediction", *known
             kinds = ", ".join(f"{kind}.<label>" for kind in kinds)
             raise PalpateError(f"unknown evidence '{key}': expected {kinds}, each beside its .time")
         kind, group, label = match[1] or match[4], match[2] or "", match[3] or match[5]
@@ -236,7 +247,7 @@ def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
         if values.size == 0 or np.isinf(values).any():
             raise PalpateError(f"'{key}' is empty or infinite: expected numbers, NaN for a gap")
         sections.setdefault((kind, group), {})[label] = values
-    motions, horizon, added = [], None, {}
+    motions, horizon, prediction, added = [], None, None, {}
     for (kind, group), values in sections.items():
         where = f"{kind}/{group}" if group else kind
         time = values.pop("time", None)
@@ -245,16 +256,17 @@ def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
             raise PalpateError(f"the evidence lacks {lacking}")
         if time.ndim != 1 or not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
             raise PalpateError(f"'{where}.time' has to be one axis of finite, increasing seconds")
-        own = {"motion": ("frames", "points", 3), "horizon": ("times",)}
-        axes = own[kind] if kind in own else known[kind].axes
+        axes = _OWN[kind] if kind in _OWN else known[kind].axes
         _check_shapes(where, values, time, axes)
         if kind == "motion":
             motions.append(Motion(group, time, values))
         elif kind == "horizon":
             horizon = _banded(time, values)
+        elif kind == "prediction":
+            prediction = Curves(time, values)
         else:
             added[kind] = Curves(time, values)
-    return tuple(motions), horizon, added
+    return tuple(motions), horizon, prediction, added
 
 
 def _check_shapes(

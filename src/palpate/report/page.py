@@ -68,6 +68,7 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
         ("Results", _results),
         ("Pictures", lambda e, looks: _pictures(e) if e is found[0] else ""),
         ("Motion", _motion),
+        ("Observed and predicted", _prediction),
         ("Path of the tip", _tips),
         ("Error against horizon", _horizon),
         ("Parameters", _parameters),
@@ -76,7 +77,11 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
     )
     looks = []
     for evidence in found:
-        curves = [curves for curves in (evidence.horizon, *evidence.pieces.values()) if curves]
+        curves = [
+            curves
+            for curves in (evidence.horizon, evidence.prediction, *evidence.pieces.values())
+            if curves
+        ]
         labelled = (*(motion.chains for motion in evidence.motions), *(c.values for c in curves))
         looks.append(numbered(chain.from_iterable(labelled)))
     for heading, part in parts:
@@ -173,6 +178,19 @@ def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
         caption = f"{motion.group}: {caption}" if motion.group else caption[0].upper() + caption[1:]
         content += _caption(f"{caption}.") + _chart(charts.tip(motion, looks, height))
     return content
+
+
+def _prediction(evidence: Evidence, looks: dict[str, int]) -> str:
+    curves, settings = evidence.prediction, evidence.result.get("settings") or {}
+    if curves is None:
+        return ""
+    (count,) = {values.shape[1] for values in curves.values.values()}
+    names = [str(name) for name in settings.get("predicted", [])]
+    names += [f"number {index + 1}" for index in range(len(names), count)]
+    fans = [label for label, values in curves.values.items() if values.shape[2] > 1]
+    caption = "One motion, predicted from its first moment alone beside what was observed"
+    caption += f"; each thin line is one of the {fans[0]}." if fans else "."
+    return _caption(caption) + _chart(charts.prediction(curves, looks, names))
 
 
 def _horizon(evidence: Evidence, looks: dict[str, int]) -> str:

@@ -16,6 +16,7 @@ state that it does not send was due; `at_rest_excess_ms` from there until its gr
 """
 
 import argparse
+import dataclasses
 import importlib.resources
 import json
 import os
@@ -57,13 +58,15 @@ def robot(endpoint: str, markers: int, period: float, seconds: float, trials: in
         Disturbance(time, PUSH[1], (PUSH[0] * np.cos(angle), PUSH[0] * np.sin(angle), 0.0), 0.5)
         for angle, time in enumerate(np.arange(EVERY, seconds, EVERY).tolist())
     )
+    still = servoed(RopeConfiguration(markers=markers), period)
+    pushed = dataclasses.replace(still, disturbances=pushes)
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=endpoint) as link:
-        body = RopeRobot(link, servoed(markers, period, disturbances=pushes), 0, "straight", period)
+        body = RopeRobot(link, pushed, 0, "straight", period)
         began = link.clock()
         while not body.released or link.clock() - began < seconds:
             began = began if body.released else link.clock()
             body.advance()
-        told = [silence(link, servoed(markers, period), seed, period) for seed in range(trials)]
+        told = [silence(link, still, seed, period) for seed in range(trials)]
     print(json.dumps(told))
 
 

@@ -17,7 +17,6 @@ from palpate.errors import PalpateError, PalpateWarning
 from palpate.family import check_name, families, options_of, places, resolve
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
-BAD_INPUT = 2
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,8 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
-    0: done; 2: bad input, one sentence on stderr; 130: interrupted by Ctrl-C.
+    0: done; 2: bad input, one sentence on stderr; 3: it was stopped, likewise; 130: interrupted by
+    Ctrl-C.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = functools.partial(_note, warnings.showwarning)
             return _run(words)
     except PalpateError as error:
-        return _refuse(str(error))
+        return _refuse(str(error), error.status)
     except KeyboardInterrupt:
         again = shlex.join(["palpate", *words])
         print(f"\npalpate: interrupted; `{again}` goes on where it stopped", file=sys.stderr)
@@ -146,9 +146,9 @@ def _note(show: Callable[..., None], message: Warning | str, *where: Any, **more
         show(message, *where, **more)
 
 
-def _refuse(sentence: str) -> int:
+def _refuse(sentence: str, status: int = PalpateError.status) -> int:
     print(f"palpate: {' '.join(sentence.split())}", file=sys.stderr)
-    return BAD_INPUT
+    return status
 
 
 def _overview() -> str:

@@ -2,14 +2,22 @@
 
 import importlib
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 
 class PalpateError(ValueError):
     """Bad input: one sentence that says what was expected, what came and what would work.
 
-    The command line prints it and exits with status 2; a library user sees a `ValueError`.
+    The command line prints it and exits with its `status`; a library user sees a `ValueError`.
     """
+
+    status: ClassVar[int] = 2
+
+
+class StoppedError(PalpateError):
+    """Work that was done, and had to be stopped before its end: nothing was given wrongly."""
+
+    status = 3
 
 
 class PalpateWarning(UserWarning):

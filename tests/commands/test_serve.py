@@ -1,18 +1,26 @@
 """`palpate serve`: what is refused, and a short service with nobody there."""
 
 import json
+import os
+import signal
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 
 from deployed import PERIOD, impedance_policy, manifest, rope_policy
 from palpate.cli import main
-from palpate.commands.serve import free_endpoint, limits_of, supervisor_of
+from palpate.commands.serve import free_endpoint, limits_of, stopped_by, supervisor_of
 from palpate.deployment.deployment import deployment_of
+from palpate.deployment.loop import Record
 from palpate.deployment.messages import StateMessage, encode_state
 from palpate.deployment.supervisor import GOOD, Mode
+from palpate.families.rope.deployment import RopeDeployment
+from palpate.models.rope import Rope
 from palpate.networks import load_policy, save_controller
+from palpate.parameters import describe
 from palpate.runs.result import read_result
 
 
@@ -53,7 +61,6 @@ def test_sentences(refused, tmp_path, monkeypatch):
         "--simulate", {"task": "cart-to-origin"}
     )
     assert "does not say how long its rope's segments are" in refused("", {"model": []})
-    assert "servo every 0.002 s: expected a whole number" in refused("--simulate", period=0.015)
     assert not (tmp_path / "runs").exists()
     monkeypatch.setitem(sys.modules, "zenoh", None)
     assert "pip install 'palpate[zenoh]'" in refused("")
@@ -108,3 +115,77 @@ def test_a_policy_of_no_family_is_served_by_its_declared_channels(tmp_path):
     wrong = encode_state(StateMessage(1, 1, 0.0, {"features": np.zeros(6, np.float32)}))
     order = supervisor_of(deployment, limits).tick(0.0, [(0.0, wrong)])
     assert order.reason == "6 features where 7 were agreed"
+
+
+def own_policy():
+    """Of 12 markers at 60 Hz, on a rope of 0.73 m; it acts at random."""
+    own = Rope.uniform(length=0.73, mass=0.055, nodes=12, control_period=1 / 60)
+    told = {"model": describe(own), "recordings": {"file": "own.npz"}}
+    save_controller("policy.safetensors", rope_policy(12, period=1 / 60), manifest() | told)
+
+
+def test_one_interrupt_ends_the_loop_and_the_simulated_robot(tmp_path):
+    """Ones own rope is served; both processes are gone soon after a signal to the first."""
+    pytest.importorskip("zenoh")
+    own_policy()
+    words = "-m palpate serve policy.safetensors --simulate --seconds 40 --out served"
+    loop = subprocess.Popen([sys.executable, *words.split()], stdout=subprocess.PIPE, text=True)
+    try:
+        assert loop.stdout is not None
+        said = []
+        while not said or not said[-1].startswith("running"):
+            said.append(loop.stdout.readline())
+            assert said[-1], said
+        (robot,) = _children(loop.pid)
+        began = time.monotonic()
+        loop.send_signal(signal.SIGINT)
+        rest = loop.communicate(timeout=30)[0]
+        assert time.monotonic() - began < 4.0  # 2 s, and as much for a busy machine
+        assert loop.returncode == 0
+        assert "stopped: asked to stop" in rest
+        assert not os.path.exists(f"/proc/{robot}")
+    finally:
+        loop.kill()
+
+
+def _children(process: int) -> list[int]:
+    with open(f"/proc/{process}/task/{process}/children", encoding="ascii") as file:
+        return [int(word) for word in file.read().split()]
+
+
+def test_a_rope_that_cannot_be_stops_the_policy_and_the_command_says_so(monkeypatch, capsys):
+    pytest.importorskip("zenoh")
+    own_policy()
+    usual = RopeDeployment.simulated_robot
+
+    def another(self, endpoint, seconds, seed):  # the same points on a rope of 1 m
+        words = usual(self, endpoint, seconds, seed)
+        place = words.index("--rope") + 1
+        words[place] = json.dumps({**json.loads(words[place]), "length": 1.2})
+        return words
+
+    monkeypatch.setattr(RopeDeployment, "simulated_robot", another)
+    began = time.monotonic()
+    words = "serve policy.safetensors --simulate --seconds 1 --out served"
+    assert main(words.split()) == 3
+    assert time.monotonic() - began < 60
+    said = capsys.readouterr().err
+    assert said.startswith("palpate: the policy was stopped and did not go on: ")
+    assert "m apart" in said
+    assert (read_result("served/result.json")).figures  # all is written down
+
+
+@pytest.mark.parametrize(
+    ("events", "fault"),
+    [
+        ([], ""),
+        ([(Mode.WAITING, "no state has come yet"), (Mode.STOPPED, "asked to stop")], ""),
+        ([(Mode.RUNNING, ""), (Mode.BRAKING, "asked to stop")], ""),
+        ([(Mode.RUNNING, ""), (Mode.STOPPED, "no state for 23 ms")], ""),
+        ([(Mode.RUNNING, ""), (Mode.BRAKING, "marker 3 jumped")], "marker 3 jumped"),
+        ([(Mode.WAITING, "marker 3 jumped"), (Mode.STOPPED, "asked to stop")], "marker 3 jumped"),
+        ([(Mode.STOPPED, "marker 3 jumped"), (Mode.RUNNING, "")], ""),
+    ],
+)
+def test_what_kept_a_policy_from_going_on(events, fault):
+    assert stopped_by(Record(events=[(0.0, *event) for event in events])) == fault

@@ -20,6 +20,7 @@ from palpate.deployment.supervisor import (
 )
 from palpate.errors import PalpateError
 from palpate.networks import Channel
+from small_rope import VELOCITY
 
 WAITING, RUNNING, BRAKING, STOPPED = Mode
 FULL_SPEED = 20 + SOFT  # periods until 1.5 m/s are reached with the soft start
@@ -163,6 +164,17 @@ def test_the_way_from_nothing_to_running(bench):
     assert bench.good(1).mode is RUNNING
     assert bench.orders[-1].reason == ""
     assert 0 < np.linalg.norm(bench.orders[-1].action) <= CHANGE / SOFT * 1.001
+
+
+@pytest.mark.parametrize(("period", "needed"), [(1 / 240, 120), (0.01, GOOD), (0.05, 10)])
+def test_half_a_second_of_good_states_starts_it_at_any_rate(period, needed):
+    supervised, modes = supervisor(limits=Limits([VELOCITY], period)), []
+    still = shape(0.0)
+    for step in range(needed):
+        now = step * period
+        order = supervised.tick(now, [(now, state(step + 1, now, markers=still))])
+        modes.append(order.mode)
+    assert modes == [WAITING] * (needed - 1) + [RUNNING]
 
 
 def test_a_start_is_soft(bench):

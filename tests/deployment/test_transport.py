@@ -104,7 +104,7 @@ def test_a_robot_that_is_killed_is_braked_for(monkeypatch):
     monkeypatch.setattr(supervising, "PAUSE", 30.0)
     endpoint, killed = free_endpoint(), []
     words = [sys.executable, "-m", "palpate.families.rope.robot", "--connect", endpoint]
-    words += ["--markers", str(NODES), "--period", str(PERIOD), "--seconds", "60"]
+    words += ["--rope", json.dumps({"markers": NODES}), "--period", str(PERIOD), "--seconds", "60"]
     supervisor = supervised(Pusher((0.3, 0.0, 0.0)), length=1.0)
     with subprocess.Popen(words, stdout=subprocess.DEVNULL) as robot:
         try:

@@ -30,6 +30,18 @@ def problem(checked, gripper, markers):
     return checked.problem({"gripper": gripper, "markers": markers})
 
 
+@pytest.mark.parametrize(("markers", "period"), [(60, 1 / 240), (30, 0.01), (5, 0.05)])
+def test_noise_that_was_agreed_on_is_no_fault(markers, period):
+    depth = np.linspace(0, 0.5, markers)
+    still = np.stack([0 * depth, 0 * depth, 1.5 - depth], axis=-1)
+    noise = 2e-3 * np.random.default_rng(0).standard_normal((500, markers, 3))
+    checks = [ChainCheck(np.diff(depth), period, agreed) for agreed in (2e-3, 0.0)]
+    problems = [{problem(one, still[0], still + off) for off in noise} for one in checks]
+    assert problems[0] == {""}
+    assert markers < 60 or len(problems[1]) > 1
+    assert "apart" in problem(checks[0], still[0], 1.5 * still + [0.3, 0, -0.75])
+
+
 @pytest.mark.parametrize("start", START_POSES)
 def test_a_rope_that_is_thrown_about_is_possible(start):
     gripper, markers = motion(start, length=1.1)  # 10 % longer than what was agreed

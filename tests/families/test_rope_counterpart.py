@@ -11,8 +11,15 @@ from scipy.optimize import least_squares
 
 from deployed import rope_policy
 from palpate.errors import PalpateError
-from palpate.families.rope.counterpart import adapted, counterpart, described, rope_for
+from palpate.families.rope.counterpart import (
+    adapted,
+    counterpart,
+    described,
+    rope_for,
+    with_markers,
+)
 from palpate.families.rope.recording import record_rope
+from palpate.families.rope.robot import servoed
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.parameters import describe
@@ -128,6 +135,24 @@ def test_a_rope_that_palpate_recorded_is_that_rope_again():
     assert rope_for(policy, manifest(model, provenance)) == (recorded, "the one that was recorded")
     several = provenance | {"world.length": "0.8; 0.9"}
     assert rope_for(policy, manifest(model, several))[1] == "that of the model it was trained on"
+
+
+def test_markers_between_markers():
+    base = counterpart(own_rope(nodes=5), 0.0)
+    more = with_markers(base, 9)
+    assert more.marker_places is not None
+    assert more.marker_places[::2] == base.marker_places
+    assert with_markers(base, 5) is base
+    assert with_markers(RopeConfiguration(), 11) == RopeConfiguration(markers=11)
+
+
+@pytest.mark.parametrize("rate", [20, 60, 100, 144, 240])
+def test_a_servo_is_asked_a_whole_number_of_times_in_a_period(rate):
+    rope = servoed(counterpart(own_rope(control_period=1 / rate, substeps=30), 0.0), 1 / rate)
+    asked = 1 / rate / rope.control_period
+    assert asked == pytest.approx(round(asked))
+    assert 1.5e-3 < rope.control_period < 3e-3
+    assert servoed(RopeConfiguration(), 0.01) == RopeConfiguration(control_period=0.002)
 
 
 def test_single_constants_are_changed_and_the_time_step_follows():

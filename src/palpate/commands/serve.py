@@ -14,12 +14,12 @@ import numpy as np
 from palpate.commands import folders
 from palpate.commands.options import Serve
 from palpate.deployment.deployment import Deployment, deployment_of
-from palpate.deployment.intake import Intake
+from palpate.deployment.intake import MISSING, Intake
 from palpate.deployment.loop import Record, run_loop
 from palpate.deployment.scheduling import real_time
-from palpate.deployment.supervisor import ASKED, Limits, Mode, Supervisor
+from palpate.deployment.supervisor import ASKED, NOTHING, Limits, Mode, Supervisor
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, StoppedError
 from palpate.family import check_name
 from palpate.networks import CommandPolicy, load_policy
 from palpate.runs import Figure
@@ -28,6 +28,8 @@ from palpate.runs.storage import write_json
 
 LATENCY = "latency.json"
 SIMULATED = 10.0  # s
+START = 60.0  # s that a simulated robot may take to start, on a busy machine
+FAREWELL = 1.0  # s in which it says what happened
 WARM_UP = 200  # decisions
 ORDINARY = "the system refuses real-time scheduling, so other work can make the loop late"
 
@@ -36,7 +38,8 @@ def run(options: Serve) -> Path:
     """Serve until Ctrl-C, or as long as was asked for; return the folder with the record of it.
 
     Raises `PalpateError` for a policy that cannot be served, limits above the policy's, without
-    the extra `zenoh`, and when nothing can listen at the address.
+    the extra `zenoh`, and when nothing can listen at the address; `StoppedError`, when all is
+    written down, where a fault kept the policy from going on.
     """
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_policy(file)
@@ -62,13 +65,31 @@ def run(options: Serve) -> Path:
             if not prompt:
                 print(f"note: {ORDINARY}")
             print(f"listening at {listen}; Ctrl-C brakes and ends", flush=True)
-            record = _served(supervisor, link, policy.period, options.seconds, robot)
-            printed = [] if robot is None else robot.communicate()[0].splitlines()
+            record, asked = _served(supervisor, link, policy.period, options.seconds, robot)
+            printed, status = ([], 0) if robot is None else _ended(robot)
         write_json(run.path / LATENCY, record.to_dict())
         figures = figures_of(record) + (deployment.outcome(printed[-1]) if printed else [])
         result = folders.finish(run, figures, {"real_time_scheduling": prompt})
         print("\n".join(result.lines()))
-        return folders.hand_over(options, run, "A policy in real time")
+        path = folders.hand_over(options, run, "A policy in real time")
+        if fault := stopped_by(record):
+            raise StoppedError(f"the policy was stopped and did not go on: {fault}")
+        if status or (options.simulate and not asked and not record.decisions.count):
+            raise StoppedError(
+                "the policy never began: the simulated robot sent no good states"
+                + (f" and ended with status {status}" if status else "")
+            )
+        return path
+
+
+def stopped_by(record: Record) -> str:
+    """The fault for which the policy stood still in the end; "" where it ran or saw nobody.
+
+    A robot that fell silent has ended its work, and is no fault.
+    """
+    served = [(mode, reason) for _, mode, reason in record.events if reason != ASKED]
+    mode, reason = served[-1] if served else (Mode.WAITING, NOTHING)
+    return "" if mode is Mode.RUNNING or reason.startswith((NOTHING, MISSING)) else reason
 
 
 def limits_of(policy: CommandPolicy, limit: Sequence[str], rate_limit: Sequence[str]) -> Limits:
@@ -152,20 +173,36 @@ def _served(
     period: float,
     seconds: float | None,
     robot: subprocess.Popen | None,
-) -> Record:
+) -> tuple[Record, bool]:
+    """How it went, and whether it was ended by a signal."""
+
     def report(mode: Mode, reason: str) -> None:
         print(f"{mode.name.lower()}{': ' if reason else ''}{reason}", flush=True)
 
     def goes_on(elapsed: float, stop: Stop) -> bool:
         if robot is not None:
-            return not stop and robot.poll() is None
+            return not stop and robot.poll() is None and elapsed < START + (seconds or SIMULATED)
         return not stop and (seconds is None or elapsed < seconds)
 
     record = Record()
     # Ctrl-C is how serving ends: nothing is cut off by it.
     with contextlib.suppress(KeyboardInterrupt), interruptible() as stop:
         record = run_loop(supervisor, link, period, lambda now: goes_on(now, stop), report)
-    return record
+        return record, bool(stop)
+    return record, True
+
+
+def _ended(robot: subprocess.Popen) -> tuple[list[str], int]:
+    """What the robot's process printed, and its status if it had failed by itself, else 0.
+
+    It is asked to end, and not waited for in vain.
+    """
+    status = robot.poll() or 0
+    robot.terminate()
+    try:
+        return robot.communicate(timeout=FAREWELL)[0].splitlines(), status
+    except subprocess.TimeoutExpired:
+        return [], status
 
 
 @contextlib.contextmanager
@@ -175,7 +212,10 @@ def _robot(words: list[str] | None) -> Iterator[subprocess.Popen | None]:
         yield None
         return
     command = [sys.executable, "-m", *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as robot:
+    # In a session of its own: Ctrl-C at a terminal is for the loop, which brakes first.
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as robot:
         try:
             yield robot
         finally:

@@ -55,8 +55,8 @@ class Deployment:
     def simulated_robot(self, endpoint: str, seconds: float, seed: int) -> list[str]:
         """A Python module, and arguments, that simulate the robot of a loop at `endpoint`.
 
-        It runs until it is killed or `seconds` after the policy began. Raises `PalpateError`
-        where there is none.
+        It runs for so many `seconds`, or until SIGTERM, and prints what happened. Raises
+        `PalpateError` where there is none.
         """
         raise PalpateError(
             f"no family brings a simulated robot for '{self.manifest.get('task')}': serve the "

@@ -11,6 +11,7 @@ from palpate.deployment.plausibility import Check
 from palpate.errors import PalpateError
 from palpate.networks import Channel
 
+MISSING = "no state"  # how a sentence about one that did not come begins
 PATIENCE = 1.4  # periods after one state at which the next one is missing
 LATE = 1.0  # periods that a state may have been under way longer than the fastest
 JITTER = 0.5  # periods by which two of the sender's stamps may differ from one period
@@ -57,7 +58,7 @@ class Intake:
         """What to say if the next state should have come by `now` (s); "" while it need not."""
         if now < self.due:
             return ""
-        return f"no state for {1e3 * (now - self._arrived):.0f} ms"
+        return f"{MISSING} for {1e3 * (now - self._arrived):.0f} ms"
 
     def take(self, arrived: float, data: bytes) -> bool:
         """Whether this message, which `arrived` at so many s, is a new good state: then `newest`.

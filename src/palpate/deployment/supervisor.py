@@ -28,8 +28,10 @@ from palpate.networks import Channel, count_of
 
 GOOD = 50  # good states in a row, before the policy starts
 SOFT = 50  # periods in which the rate of the action grows to its limit after a start
+AT = 0.01  # s, of the loop in which GOOD and SOFT are meant: half a second in any
+FEWEST = 10  # of either, however slow the loop
 PAUSE = 2.0  # periods without a command after which a robot brakes by itself
-ASKED = "asked to stop"
+ASKED, NOTHING = "asked to stop", "no state has come yet"
 
 
 class Mode(IntEnum):
@@ -120,7 +122,10 @@ class Supervisor:
         self._first: StateMessage | None = None  # when counting began
         self.mode = Mode.WAITING
         self.action = np.zeros(limits.count, np.float32)
-        self.reason = "no state has come yet"
+        self.reason = NOTHING
+        self._needed, self._soft = (
+            max(FEWEST, round(count * AT / limits.period)) for count in (GOOD, SOFT)
+        )
 
     @property
     def seen(self) -> int:
@@ -191,7 +196,7 @@ class Supervisor:
             return
         self.mode = Mode.WAITING
         self._good += fresh
-        if self._good >= GOOD:
+        if self._good >= self._needed:
             self.mode, self.reason, self._ran = Mode.RUNNING, "", 0
             self._run()
 
@@ -201,7 +206,7 @@ class Supervisor:
             self._start_over("the policy gave a command that is not finite")
             return
         self._ran += 1
-        share = min(1.0, self._ran / SOFT)
+        share = min(1.0, self._ran / self._soft)
         action = np.empty_like(self.action)
         for part, limit, change in self._limits.vectors:
             own = self.action[part]

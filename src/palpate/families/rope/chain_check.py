@@ -12,6 +12,7 @@ from palpate.deployment.plausibility import Values
 STRETCH = 1.3  # of a segment's length at rest; ropes 10 % longer than the model, and noise, pass
 FASTEST = 15.0  # m/s; a free tip of 1 m swings and whips at 7
 HARDEST = 300.0  # m/s^2; seen of a whipping tip with noise: 140
+UNLIKELY = 6.0  # standard deviations of noise that no check takes for a fault
 STANDING = 0.02  # m by which a gripper at rest may move, servo and noise included
 
 
@@ -21,13 +22,16 @@ class ChainCheck:
     Args:
         spacing: (markers - 1,) rest length between neighbouring markers, gripper to tip, in m.
         period: seconds between frames.
+        noise: standard deviation of a marker's coordinate, m; of a difference of two it is
+            sqrt(2) times that, of a second difference sqrt(6).
     """
 
-    def __init__(self, spacing: np.ndarray, period: float):
+    def __init__(self, spacing: np.ndarray, period: float, noise: float = 0.0):
         # The first marker sits at the gripper, as nearly as anybody can glue it there.
-        self._longest = STRETCH * np.concatenate([spacing[:1], spacing])
-        self._farthest = FASTEST * period
-        self._sharpest = HARDEST * period**2
+        margin = UNLIKELY * noise * np.sqrt(2.0)
+        self._longest = STRETCH * np.concatenate([spacing[:1], spacing]) + margin
+        self._farthest = FASTEST * period + margin
+        self._sharpest = HARDEST * period**2 + margin * np.sqrt(3.0)
         self.forget()
 
     def forget(self) -> None:

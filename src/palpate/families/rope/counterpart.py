@@ -152,7 +152,19 @@ def adapted(base: RopeConfiguration, constants: Mapping[str, float]) -> RopeConf
     if not constants:
         return base
     own = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-    return in_step(base.control_period, **{**own, **constants})
+    changed = {**own, **constants}
+    return in_step(changed.pop("control_period"), **changed)
+
+
+def with_markers(rope: RopeConfiguration, count: int) -> RopeConfiguration:
+    """The rope with so many markers: between its own ones, as many between each two."""
+    if count == rope.markers:
+        return rope
+    places = rope.marker_places
+    if places is not None:
+        places = np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(places)), places)
+        places = tuple(places.tolist())
+    return dataclasses.replace(rope, markers=count, marker_places=places)
 
 
 def described(rope: RopeConfiguration) -> str:

@@ -1,5 +1,6 @@
 """A rope's policy on a robot: markers and a gripper in, the gripper's velocity out."""
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from palpate.deployment.deployment import Deployment
 from palpate.deployment.plausibility import Values
 from palpate.errors import PalpateError
 from palpate.families.rope.chain_check import ChainCheck
+from palpate.families.rope.counterpart import rope_for, with_markers
 from palpate.family import check_name
 from palpate.networks import Channel, CommandPolicy
 from palpate.perception.velocity import VelocityEstimator
@@ -85,7 +87,8 @@ class RopeDeployment(Deployment):
 
     def check(self) -> ChainCheck:
         """See `Deployment.check`. Raises `PalpateError` where the segments' length is unknown."""
-        return ChainCheck(self.segment_lengths(), self.policy.period)
+        noise = self.manifest.get("training", {}).get("observation_noise", 0.0)
+        return ChainCheck(self.segment_lengths(), self.policy.period, noise)
 
     def segment_lengths(self) -> np.ndarray:
         """Rest length (markers - 1,) in m between markers of the rope that was trained on."""
@@ -101,12 +104,17 @@ class RopeDeployment(Deployment):
         return np.repeat(own / every, every)
 
     def simulated_robot(self, endpoint: str, seconds: float, seed: int) -> list[str]:
-        """See `Deployment.simulated_robot`: `palpate.families.rope.robot`."""
+        """See `Deployment.simulated_robot`: `palpate.families.rope.robot`, with the policy's rope.
+
+        That is the one around which `palpate evaluate` draws others. Raises as `rope_for`.
+        """
         from palpate.families.rope import robot
 
-        period = self.policy.period
-        robot.servoed(self.markers, period)
-        arguments = {"markers": self.markers, "period": period, "seconds": seconds, "seed": seed}
+        period, rope = self.policy.period, rope_for(self.policy, self.manifest)[0]
+        rope = with_markers(rope, self.markers)
+        robot.servoed(rope, period)
+        described = json.dumps(dataclasses.asdict(rope))
+        arguments = {"rope": described, "period": period, "seconds": seconds, "seed": seed}
         words = [robot.__name__, "--connect", endpoint]
         return words + [
             word for name, value in arguments.items() for word in (f"--{name}", f"{value}")
@@ -116,6 +124,8 @@ class RopeDeployment(Deployment):
         """When the rope had settled, and the energy it was left with; see `Deployment.outcome`."""
         motion = {name: np.array([values]) for name, values in json.loads(printed).items()}
         energy, speed = motion["energy_j"], motion["gripper_speed_m_per_s"]
+        if energy.shape[1] == 1:
+            return []  # it was never let go
         time = float(settling_time(energy, speed, self.policy.period)[0])
         return [
             Figure("time_to_1pct_s", time if math.isfinite(time) else None, "s"),

@@ -6,8 +6,8 @@ writes: publish what was seen every period, obey the newest command, and brake w
 
 import argparse
 import json
-import math
 import secrets
+import signal
 import time
 from typing import Any
 
@@ -23,10 +23,10 @@ from palpate.deployment.messages import (
 from palpate.deployment.scheduling import ROBOT, real_time
 from palpate.deployment.supervisor import PAUSE, Mode, slowed
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
-from palpate.errors import PalpateError
+from palpate.families.rope.counterpart import adapted
 from palpate.worlds.rope.rope import RopeConfiguration, RopeObservation, RopeWorld
 
-SERVO = 0.002  # s in which a new command is followed
+SERVO = 0.002  # s, about, in which a new command is followed
 
 
 class RopeRobot:
@@ -104,38 +104,33 @@ class RopeRobot:
             self.velocity = slowed(self.velocity, self._change)
 
 
-def servoed(markers: int, period: float, **fields: Any) -> RopeConfiguration:
-    """The default rope with so many markers, behind a servo, for a loop of this period.
-
-    Raises `PalpateError` where that is no whole number of the servo's.
-    """
-    if abs(round(period / SERVO) * SERVO / period - 1) > 1e-3:
-        raise PalpateError(
-            f"the policy decides every {period:.4g} s and the simulated robot's servo every "
-            f"{SERVO:g} s: expected a whole number of these; serve it without --simulate"
-        )
-    return RopeConfiguration(markers=markers, control_period=SERVO, **fields)
+def servoed(rope: RopeConfiguration, period: float) -> RopeConfiguration:
+    """The rope behind a servo that is asked a whole number of times in a loop's `period` (s)."""
+    return adapted(rope, {"control_period": period / max(1, round(period / SERVO))})
 
 
 def main() -> None:
-    """Run until killed or for some seconds after the rope was let go; print its motion."""
+    """Run for some seconds, or until SIGTERM; print how the rope moved since it was let go."""
     parser = argparse.ArgumentParser(description="a simulated rope and its robot")
     parser.add_argument("--connect", required=True, help="where the loop listens")
-    parser.add_argument("--markers", type=int, required=True)
+    parser.add_argument("--rope", type=json.loads, required=True, help="its constants, as JSON")
     parser.add_argument("--period", type=float, required=True)
     parser.add_argument("--seconds", type=float, required=True)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--start", default="straight")
     options = parser.parse_args()
+    asked: list[Any] = []
+    signal.signal(signal.SIGTERM, lambda *given: asked.append(given))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's, which says when to end
     # Urgent, because it stands for a robot with a computer of its own.
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
-        rope = servoed(options.markers, options.period)
+        rope = servoed(RopeConfiguration(**options.rope), options.period)
         robot = RopeRobot(link, rope, options.seed, options.start, options.period)
-        energies, speeds, ends = [robot.energy], [robot.gripper_speed], math.inf
-        while link.clock() < ends:
+        energies, speeds = [robot.energy], [robot.gripper_speed]
+        ends = link.clock() + options.seconds
+        while link.clock() < ends and not asked:
             robot.advance()
             if robot.released:
-                ends = min(ends, link.clock() + options.seconds)
                 energies.append(robot.energy)
                 speeds.append(robot.gripper_speed)
     print(json.dumps({"energy_j": energies, "gripper_speed_m_per_s": speeds}))

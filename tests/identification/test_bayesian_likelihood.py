@@ -23,7 +23,8 @@ from palpate.identification.posterior.likelihood import (
 from palpate.identification.posterior.predictive import Predicted, predict, score
 from palpate.models.model import rollout
 from palpate.parameters import sample_prior
-from toys import Cart, CartState
+from palpate.recordings import Aligned
+from toys import Cart, CartState, Pendulum
 
 SLED = Sled(mass=14.0, friction=[6.0, 40.0])
 
@@ -325,3 +326,43 @@ def test_the_most_probable_error_of_a_start_is_found_where_the_model_is_not_line
     prior = 0.5 * float(jnp.sum(jnp.square(start)) - jnp.sum(jnp.square(found["good"].error)))
     assert densities["bad"] == pytest.approx(densities["good"] - prior, abs=0.5)
     assert densities["linear"] < densities["good"] - 50.0
+
+
+def test_a_rest_is_averaged_whole_and_not_seen_again():
+    """Forty frames at rest, then motion: one start of a fortieth of the noise's variance."""
+    rng = np.random.default_rng(0)
+    still = np.zeros((1, 60, 1))
+    still[0, 40:, 0] = 0.1 * np.arange(1, 21)
+    noise = 1e-3 * rng.standard_normal(still.shape)
+    aligned = Aligned(0.02, still + noise, np.zeros((1, 59, 1)), np.array([60]))
+    (pieces, usual) = (
+        cut(aligned, hinge.TRUE, 5.0, at_rest=True, ringing=ringing) for ringing in (True, False)
+    )
+    (deviation,) = np.asarray(VAGUE * pieces.pose_deviation)[0]
+    assert np.asarray(pieces.rate_deviation) == 0.0
+    assert deviation == pytest.approx(noise_scale(aligned, hinge.TRUE)[0] / np.sqrt(36))
+    assert abs(float(pieces.pose[0, 0])) < 3.0 * deviation
+    first = int(np.argmax(np.asarray(pieces.target)[0, :, 0] > 0.05))
+    assert first == 40 - 36  # the frames of the rest are not there again
+    assert int(np.argmax(np.asarray(usual.target)[0, :, 0] > 0.05)) == 39
+
+
+def test_starts_that_ring_on_are_not_taken_for_damping():
+    """A pendulum left alone, its angle known to a tenth of a radian: the density has the slope of
+    one whose starts are propagated anew everywhere, and not of one that has them fixed.
+    """
+    model, still = Pendulum(1.0, 0.5), jnp.zeros((3, 100, 1))
+    pieces = known_start(jnp.zeros((3, 1)), jnp.zeros((3, 1)), still, still)
+    pieces = eqx.tree_at(lambda p: p.pose_deviation, pieces, jnp.full((3, 1), 0.1 / VAGUE))
+    target = motion_posterior(model, pieces, known_scales(model, np.array([0.01])), ringing=True)
+    here, (index,) = initial_position(target), (0,)
+    assert target.names[index] == "damping"
+
+    def slope(densities):
+        return (float(densities[1]) - float(densities[0])) / 0.2
+
+    sides = here.at[index].add(-0.1), here.at[index].add(0.1)
+    anew = slope([target.linearised(side).density(side) for side in sides])
+    assert slope([target.density(side) for side in sides]) == pytest.approx(anew, abs=0.05)
+    fixed = eqx.tree_at(lambda t: t.volume_slope, target, jnp.zeros_like(target.volume_slope))
+    assert slope([fixed.density(side) for side in sides]) < anew - 0.2

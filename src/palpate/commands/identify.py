@@ -55,8 +55,8 @@ def run(options: Identify) -> Path:
     if options.residual:  # now, and not after the physics was fitted
         check_correctable(reference, data.fitted_aligned)
     if not options.fits:
-        cut_pieces(data.fitted_aligned, reference, options.piece)
-        check_seen(cut_pieces(data.validation_aligned, reference, options.piece))
+        cut_pieces(data.fitted_aligned, reference, *_cut(options))
+        check_seen(cut_pieces(data.validation_aligned, reference, *_cut(options)))
     product = folders.MODEL if options.fits else DRAWS
     inputs: dict[str, Path | Sequence[Path]] = {
         "recordings": options.recordings,
@@ -126,6 +126,11 @@ def _begun(model: Model, options: Identify) -> Model:
 
 def _model_file(path: Path) -> Path:
     return folders.product_of(path, folders.MODEL, "identify")
+
+
+def _cut(options: Identify) -> tuple[float, bool]:
+    """How trials are cut into pieces for draws."""
+    return options.piece, options.one_object
 
 
 def _method(options: Identify) -> str:
@@ -200,7 +205,7 @@ def _write_draws(
     if options.arviz is not None:
         write_netcdf(run.path / NETCDF, posterior)
     model = posterior.target.coordinates.reference
-    pieces = cut_pieces(data.validation_aligned, model, options.piece)
+    pieces = cut_pieces(data.validation_aligned, model, *_cut(options))
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
     evidence = identify_report.expected_errors(predicted, pieces, model)
     evidence |= identify_report.drawn_motion(predicted, pieces, model)

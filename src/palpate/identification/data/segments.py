@@ -22,6 +22,7 @@ from palpate.recordings import Aligned
 REACH = 0.2  # s before and after a frame that its smoothed pose is taken from, at most
 ORDER = 3  # of the polynomial: a velocity that changes within the reach
 STILL = 0.06  # s at the beginning of a trial at rest that its pose is averaged over
+MOVED = 4.0  # deviations of a mean of frames at rest, from those of another rest, at most
 # A polynomial that misses the frames by more than noise does once in a thousand times is taken over
 # half the reach: there the motion is too fast for it.
 CHANCE = 1e-3
@@ -190,7 +191,12 @@ class SegmentSource:
 
 
 def cut(
-    aligned: Aligned, model: Model, seconds: float, at_rest: bool = False, count: int | None = None
+    aligned: Aligned,
+    model: Model,
+    seconds: float,
+    at_rest: bool = False,
+    count: int | None = None,
+    ringing: bool = False,
 ) -> Segments:
     """Cut aligned trials into consecutive pieces of `seconds`, each beginning where one ended.
 
@@ -209,12 +215,16 @@ def cut(
     pieces = []
     for trial, length in enumerate(aligned.length):
         observed = aligned.observation[trial, :length]
-        for first in range(0, int(length) - 1, horizon):
+        rest = _rest(observed, model, spread, period) if at_rest and ringing else 1
+        for first in range(rest - 1, int(length) - 1, horizon):
             last = min(first + horizon, int(length) - 1)
             if last - first < min(shortest, int(length) - 1):
                 continue
-            still = at_rest and first == 0
-            start = _smoothed(observed, model, first, period, spread, still, reaches=1)
+            if rest > 1 and first == rest - 1:
+                start = _mean(observed, model, rest, period, spread)
+            else:
+                still = at_rest and first == 0
+                start = _smoothed(observed, model, first, period, spread, still, reaches=1)
             if start is None:
                 continue  # nothing is seen around: the piece before it ends here
             pieces.append((*start, *_padded(observed, aligned.action[trial], first, last, horizon)))
@@ -275,6 +285,34 @@ def noise_scale(aligned: Aligned, model: Model, fast: bool = False) -> Float[np.
 def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
     """The model's difference of two arrays of observations, in float64."""
     return np.asarray(model.difference(jnp.asarray(predicted), jnp.asarray(observed)), np.float64)
+
+
+def _rest(observed: np.ndarray, model: Model, spread: np.ndarray, period: float) -> int:
+    """For how many frames of a trial that begins at rest nothing moves beyond the noise; or one.
+
+    What moved too little to be seen may have moved in the last frames: they do not count.
+    """
+    frames = max(2, round(STILL / period))
+    first = observed[:frames].mean(axis=0)
+    rest = frames
+    while rest + frames <= len(observed):
+        moved = difference(model, observed[rest : rest + frames].mean(axis=0), first)
+        if not np.all(np.abs(moved) <= MOVED * spread * np.sqrt(2.0 / frames)):
+            break
+        rest += frames
+    return max(1, rest - frames)
+
+
+def _mean(
+    observed: np.ndarray, model: Model, rest: int, period: float, spread: np.ndarray
+) -> tuple[np.ndarray, ...] | None:
+    """Pose, rate and their deviations at the end of a rest of so many frames."""
+    found = _fitted(observed, model, 0, slice(0, rest), 0, period)
+    if found is None:
+        return None
+    noise = np.broadcast_to(spread, observed.shape[1:])
+    # No piece sees these frames again: what `moved` widens is narrowed to what they say.
+    return found[0][0], np.zeros_like(noise), noise * found[1][0] / VAGUE, np.zeros_like(noise)
 
 
 def _smoothed(

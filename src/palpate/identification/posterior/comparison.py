@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
-from palpate.identification.data.segments import Segments, cut, difference, noise_scale
+from palpate.identification.data.segments import MOVED, Segments, cut, difference, noise_scale
 from palpate.identification.posterior.likelihood import (
     MotionPosterior,
     inferred_scales,
@@ -89,13 +89,15 @@ def posterior_of(
     noise scales (`inferred_scales`), and ring where their start is off (`motion_posterior`).
     """
     scales = inferred_scales(model, noise_scale(aligned, model), one_object)
-    pieces = cut_pieces(aligned, model, seconds)
+    pieces = cut_pieces(aligned, model, seconds, one_object)
     return motion_posterior(model, pieces, scales, ringing=one_object).with_one_rotation()
 
 
-def cut_pieces(aligned: Aligned, model: Model, seconds: float = PIECE) -> Segments:
+def cut_pieces(
+    aligned: Aligned, model: Model, seconds: float = PIECE, one_object: bool = False
+) -> Segments:
     """Consecutive pieces of the trials, for a posterior to be fitted to or held against."""
-    return cut(aligned, model, seconds, begins_at_rest(aligned, model))
+    return cut(aligned, model, seconds, begins_at_rest(aligned, model), ringing=one_object)
 
 
 def begins_at_rest(aligned: Aligned, model: Model) -> bool:
@@ -107,6 +109,6 @@ def begins_at_rest(aligned: Aligned, model: Model) -> bool:
         if len(late) < frames or not (np.isfinite(early).all() and np.isfinite(late).all()):
             return False  # nobody knows
         moved = difference(model, late.mean(axis=0), early.mean(axis=0))
-        if np.any(np.abs(moved) > 4.0 * noise * np.sqrt(2.0 / frames)):
+        if np.any(np.abs(moved) > MOVED * noise * np.sqrt(2.0 / frames)):
             return False
     return True

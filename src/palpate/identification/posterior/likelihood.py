@@ -10,11 +10,15 @@ piece, plus
 - what errors of the initial pose and rate become: linear in them, with the derivatives of a model
   nearby (`linearised`), and marginalised in closed form. The smoothed start has seen the piece's
   own frames, so its deviation is widened (`Segments.moved`), and the piece decides. Where a start
-  that is off makes the model ring, the derivatives are those at the most probable errors.
+  that is off makes the model ring, the derivatives are those at the most probable errors; and of
+  starts at rest, whose deviations are not widened, it counts to first order how their volume
+  depends on the parameters: errors that ring on explain more noise than errors that are damped.
 
 The scales s and w are inferred beside the parameters. The covariance of the discrepancy has the
 same eigenvectors whatever its scale, so that all but the rollout is elementwise.
 """
+
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -33,6 +37,7 @@ from palpate.numerics.devices import compiled_at_once
 from palpate.numerics.small_systems import cholesky, solve, solve_lower
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
 
+DIFFERENCE = 0.05  # prior standard deviations, by which a volume's slope is measured
 FARTHEST = 4.0  # vague standard deviations that an error of a start may be found to have
 NOISE_SPREAD = 0.7  # standard deviation of the logarithm of s about what the sensor seems to have
 GROWTH_RATIO, GROWTH_SPREAD = 3.0, 1.5  # median of w over that of s (after 1 s), and its spread
@@ -113,6 +118,9 @@ class MotionPosterior(Target):
     products: Float[Array, "segments starts starts time"] | None = None
     # Errors of the starts, in vague standard deviations, at which the sensitivity is taken.
     error: Float[Array, "segments starts"] | None = None
+    # Where the sensitivity was taken, and the slope there of what `_root` makes of it.
+    centre: Float[Array, " free"] | None = None
+    volume_slope: Float[Array, " free"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -152,7 +160,7 @@ class MotionPosterior(Target):
         return scale[np.array(self.scales.of_channel)]
 
     def log_likelihood(self, position: Float[Array, " free"]) -> Float[Array, ""]:
-        return jnp.sum(self.by_segment(position))
+        return jnp.sum(self.by_segment(position)) + self._volume(position)
 
     def by_segment(self, position: Float[Array, " free"]) -> Float[Array, " segments"]:
         """Log-likelihood of each piece alone; they are independent given the coordinates."""
@@ -165,7 +173,13 @@ class MotionPosterior(Target):
 
     def _densities(self, positions: Array, residual: Array, variance: Array) -> Array:
         likelihood = jnp.sum(jax.vmap(self._by_segment)(residual, variance), axis=1)
-        return jax.vmap(self._density)(likelihood, positions)
+        return jax.vmap(self._density)(likelihood + jax.vmap(self._volume)(positions), positions)
+
+    def _volume(self, position: Array) -> Array:
+        """What the errors of starts contribute as their sensitivity changes, to first order."""
+        if self.volume_slope is None or self.centre is None:
+            return jnp.zeros((), position.dtype)
+        return jnp.dot(self.volume_slope, position - self.centre)
 
     def predicted(
         self, positions: Float[Array, "batch free"], segments: Segments
@@ -234,8 +248,11 @@ class MotionPosterior(Target):
         target = eqx.tree_at(lambda t: t.sensitivity, self, found)
         if self.products is not None:
             target = eqx.tree_at(lambda t: t.products, target, _products(found))
-        if self.error is None or not rounds:
+        if self.error is None:
             return target
+        if not rounds:
+            about = position, _volume_slope(target, position)
+            return eqx.tree_at(lambda t: (t.centre, t.volume_slope), target, about)
         likely = eqx.tree_at(lambda t: t.error, target, _likely_error(target, position))
         return likely.linearised(position, rounds - 1)
 
@@ -335,9 +352,12 @@ def motion_posterior(
         jnp.asarray(counted, dtype),
         empty if uncertain else None,
         jnp.zeros((segments.count, starts, starts, horizon), dtype) if one_variance else None,
-        jnp.zeros((segments.count, starts), dtype) if uncertain and ringing else None,
     )
-    return target.linearised(initial_position(target))
+    first = initial_position(target)
+    if uncertain and ringing:
+        error, slope = jnp.zeros((segments.count, starts), dtype), jnp.zeros_like(first)
+        target = dataclasses.replace(target, error=error, centre=first, volume_slope=slope)
+    return target.linearised(first)
 
 
 def initial_position(target: MotionPosterior) -> Float[Array, " free"]:
@@ -408,6 +428,40 @@ def _likely_error(target: MotionPosterior, position: Array) -> Array:
     explained = jnp.einsum("wqct,wct->wq", target.sensitivity, weighted)
     found = -solve(target._root(variance), explained)
     return jnp.where(jnp.isfinite(found), jnp.clip(found, -FARTHEST, FARTHEST), 0.0)
+
+
+def _volume_slope(target: MotionPosterior, position: Array) -> Array:
+    """The slope (free,) of the volume of starts at rest, by central differences.
+
+    For these nothing is compiled anew.
+    """
+    slope = np.zeros(target.dimension)
+    for index in range(target.parameters):
+        step = np.zeros(target.dimension, np.float32)
+        step[index] = DIFFERENCE
+        after, before = (
+            float(_volume_at_rest(target, _sensitivity(target, position + sign * step), position))
+            for sign in (1.0, -1.0)
+        )
+        slope[index] = (after - before) / (2.0 * DIFFERENCE)
+    return jnp.asarray(np.where(np.isfinite(slope), slope, 0.0), position.dtype)
+
+
+@eqx.filter_jit
+def _volume_at_rest(target: MotionPosterior, sensitivity: Array, position: Array) -> Array:
+    """Minus half the logarithm of the determinant, for another sensitivity.
+
+    Of starts in motion none: they have seen the frames of their pieces, and the volume of what was
+    widened for it would only say by how much.
+    """
+    variance = target._rotated(position[None])[1][0]
+    target = eqx.tree_at(lambda t: t.sensitivity, target, sensitivity)
+    if target.products is not None:
+        target = eqx.tree_at(lambda t: t.products, target, _products(sensitivity))
+    log_root = jnp.log(jnp.diagonal(target._root(variance), axis1=-2, axis2=-1))
+    rate = target.segments.rate_deviation
+    at_rest = jnp.all(rate == 0.0, axis=tuple(range(1, rate.ndim)))
+    return -jnp.sum(jnp.where(at_rest, jnp.sum(log_root, axis=1), 0.0))
 
 
 @eqx.filter_jit

@@ -24,7 +24,7 @@ from palpate.models.model import Model
 from palpate.networks.policy import CommandPolicy
 from palpate.runs import Run
 from palpate.runs.storage import load_arrays, read_manifest, save_arrays
-from palpate.tasks.task import Start, Task
+from palpate.tasks.task import Start, Task, draw_starts
 
 OBSERVED = "observed.safetensors"
 
@@ -136,7 +136,7 @@ def go_on(
     """
     configuration = {"stage": "train", "about": dict(about), "seed": seed, "training": training}
     for_own, for_extra = jax.random.split(jax.random.fold_in(jax.random.key(seed), 3))
-    pool = jax.jit(task.starts, static_argnums=2)(model, for_own, training.starts)
+    pool = draw_starts(task, model, for_own, training.starts)
     if extra is not None:
         count = extra.command.shape[0]
         chosen = jax.random.randint(for_extra, (training.starts,), 0, count)

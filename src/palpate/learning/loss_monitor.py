@@ -124,20 +124,9 @@ def promise(
     task: Task, model: Model, policy: CommandPolicy, key: PRNGKeyArray, noise: float = 0.0
 ) -> Promise:
     """What a loss is followed by under this policy, in episodes such as it was trained on."""
-    for_starts, for_models, for_symmetry, for_noise = jax.random.split(key, 4)
     horizon, every = _horizon(task, model)
     steps = horizon + max(horizon, round(task.duration / model.control_period))
-
-    @eqx.filter_jit
-    def losses(policy: CommandPolicy) -> Array:
-        models = randomise(model, for_models, 1.0, EPISODES)
-        start = task.augment(task.starts(model, for_starts, EPISODES), for_symmetry)
-        start = task.adapt(start, models)
-        keys = jax.random.split(for_noise, EPISODES)
-        seen = in_model(task, models, policy, start, steps, keys, noise)
-        return _evolution(task, models, start, seen.states, seen.before, -1)
-
-    loss = np.asarray(losses(policy), float)
+    loss = np.asarray(_training_losses(task, model, policy, key, steps, noise), float)
     now, following = _windows(loss, np.arange(0, steps - horizon, every), horizon)
     groups = np.array_split(np.argsort(now, axis=None), LEVELS)
     means = (np.array([each.ravel()[g].mean() for g in groups]) for each in (now, following))
@@ -167,24 +156,10 @@ def compare(
         )
     steps = np.arange(0, times - horizon, every)
     rows, columns = (index.ravel() for index in np.indices((trials, len(steps))))
-
-    @eqx.filter_jit
-    def observed(seen: Observed) -> Array:
-        first = seen.starts(task, jnp.arange(trials), jnp.zeros(trials, int))
-        return _evolution(task, model, first, seen.states, seen.before, -1)
-
-    @eqx.filter_jit
-    def predicted(policy: CommandPolicy, seen: Observed, rows: Array, steps: Array) -> Array:
-        start = seen.starts(task, rows, steps)
-        states, actions = simulate(task, model, policy, start, horizon)
-        # Relative to how the trial began, as what was observed is.
-        first = seen.starts(task, rows, jnp.zeros_like(steps))
-        first = Start(first.state, first.command, start.goal)
-        return jnp.mean(_evolution(task, model, first, states, actions, 0), axis=1)
-
-    loss = np.asarray(observed(seen), float)
+    loss = np.asarray(_observed_losses(task, model, seen), float)
     now, following = _windows(loss, steps, horizon)
-    means = predicted(policy, seen, jnp.asarray(rows), jnp.asarray(steps[columns]))
+    beginnings = jnp.asarray(rows), jnp.asarray(steps[columns])
+    means = _predicted_means(task, model, policy, seen, beginnings, horizon)
     means = np.asarray(means, float).reshape(trials, -1)
     return Comparison(loss, steps, following, means, promised(now))
 
@@ -235,6 +210,50 @@ def _horizon(task: Task, model: Model) -> tuple[int, int]:
     """Control steps that are predicted ahead, and from one decision that is watched to the next."""
     horizon = max(1, round(HORIZON * task.duration / model.control_period))
     return horizon, max(1, horizon // DECISIONS)
+
+
+# Compiled once for all rounds of a run, whose policies and observations differ in numbers alone.
+
+
+@eqx.filter_jit
+def _training_losses(
+    task: Task, model: Model, policy: CommandPolicy, key: PRNGKeyArray, steps: int, noise: float
+) -> Array:
+    """The loss of every instant (episodes, steps) in episodes such as the policy was trained on."""
+    for_starts, for_models, for_symmetry, for_noise = jax.random.split(key, 4)
+    models = randomise(model, for_models, 1.0, EPISODES)
+    start = task.augment(task.starts(model, for_starts, EPISODES), for_symmetry)
+    start = task.adapt(start, models)
+    keys = jax.random.split(for_noise, EPISODES)
+    seen = in_model(task, models, policy, start, steps, keys, noise)
+    return _evolution(task, models, start, seen.states, seen.before, -1)
+
+
+@eqx.filter_jit
+def _observed_losses(task: Task, model: Model, seen: Observed) -> Array:
+    """The loss of every instant (trials, times) that was seen."""
+    trials = seen.actions.shape[0]
+    first = seen.starts(task, jnp.arange(trials), jnp.zeros(trials, int))
+    return _evolution(task, model, first, seen.states, seen.before, -1)
+
+
+@eqx.filter_jit
+def _predicted_means(
+    task: Task,
+    model: Model,
+    policy: CommandPolicy,
+    seen: Observed,
+    beginnings: tuple[Array, Array],
+    horizon: int,
+) -> Array:
+    """Means (n,) of the model's loss over the horizon from `beginnings`: trials and decisions."""
+    rows, steps = beginnings
+    start = seen.starts(task, rows, steps)
+    states, actions = simulate(task, model, policy, start, horizon)
+    # Relative to how the trial began, as what was observed is.
+    first = seen.starts(task, rows, jnp.zeros_like(steps))
+    first = Start(first.state, first.command, start.goal)
+    return jnp.mean(_evolution(task, model, first, states, actions, 0), axis=1)
 
 
 def _evolution(

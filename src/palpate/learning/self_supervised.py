@@ -23,7 +23,7 @@ from palpate.numerics.devices import data_parallel, everywhere
 from palpate.parameters import randomise
 from palpate.runs import Run
 from palpate.runs.progress import interruptible, progress
-from palpate.tasks.task import Start, Task
+from palpate.tasks.task import Start, Task, draw_starts
 
 MOST_SKIPPED = 20  # updates in a row without a finite gradient: more will not help
 
@@ -100,7 +100,7 @@ def train(
     for_starts, for_policy, for_updates = jax.random.split(key, 3)
     starts = pool
     if starts is None:
-        starts = jax.jit(task.starts, static_argnums=2)(model, for_starts, training.starts)
+        starts = draw_starts(task, model, for_starts, training.starts)
     if policy is None:
         policy = CommandPolicy.create(
             for_policy,

@@ -95,3 +95,9 @@ class Task(eqx.Module):
 
         Axes as in `loss`; NaN where an episode has no such value.
         """
+
+
+@eqx.filter_jit
+def draw_starts(task: Task, model: Model, key: PRNGKeyArray, count: int) -> Start:
+    """`Task.starts`, compiled once for tasks and models of one structure."""
+    return task.starts(model, key, count)

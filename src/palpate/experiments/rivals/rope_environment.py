@@ -21,6 +21,7 @@ from palpate.parameters import randomise
 from palpate.perception.velocity import VelocityEstimator
 from palpate.tasks import Start
 from palpate.tasks.rope import RopeStabilization
+from palpate.tasks.task import draw_starts
 
 
 class Actor(CommandPolicy):
@@ -104,7 +105,7 @@ class Episodes(eqx.Module):
         Raises `PalpateError` for a rope that the task cannot use.
         """
         for_starts, for_actor = jax.random.split(key)
-        pool = jax.jit(task.starts, static_argnums=2)(model, for_starts, training.starts)
+        pool = draw_starts(task, model, for_starts, training.starts)
         actor = Actor.untrained(
             for_actor,
             task.features(pool.state, pool.goal),

@@ -9,7 +9,7 @@ author = "The palpate developers"
 version = release = installed_version("palpate")
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 nb_execution_raise_on_error = True
 exclude_patterns = ["_build", "_generated"]
 

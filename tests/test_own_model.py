@@ -2,15 +2,20 @@
 
 import csv
 import json
+import re
 import shutil
+import sys
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from palpate.cli import main
+from palpate.commands.parsing import parse
 from palpate.errors import PalpateError
+from palpate.family import resolve
 from palpate.identification.posterior.files import read_models
 from palpate.models.files import load_model, save_model
 from palpate.models.model import Model, rollout
@@ -246,6 +251,30 @@ def test_a_model_is_printed_with_units(workshop):
     assert first == "Door, every 0.02 s"
     assert lines[0].split()[:3] == ["inertia", "0.8", "kg"]
     assert len(lines) == 3
+
+
+def test_the_page_of_the_docs_runs(workshop, tmp_path, monkeypatch, capsys):
+    page = (EXAMPLES.parent / "docs" / "own-model.md").read_text()
+    for name in ("door.py", "door_task.py"):
+        shutil.copy(EXAMPLES / name, tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for words in re.findall(r"^\$ palpate (.*)$", page, re.MULTILINE):  # in the workshop, unrun
+        name, *rest = words.split()
+        if name == "export":
+            continue
+        options = resolve(f"palpate.families.own_model:{name}_options")(rest[0])
+        assert parse(options, f"palpate {name}", rest[1:]) is not None, words
+    monkeypatch.chdir(tmp_path)
+    known: dict[str, Any] = {}
+    for block in re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
+        exec(compile(block, "own-model.md", "exec"), known)
+    for name in ("door", "door_task"):
+        sys.modules.pop(name)
+    for name, true in TRUE.items():
+        assert abs(getattr(known["model"], name) / true - 1) < 0.05
+        assert known["found"].lower[name] < true < known["found"].upper[name]
+    assert "(fixed)" in str(known["weighed"])
+    assert known["about"] == {"recording": "R.npz"}
 
 
 def test_the_examples_are_short():

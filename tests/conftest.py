@@ -1,6 +1,7 @@
 """What every test may ask for: float64, and no implicit promotion of dtypes."""
 
 import gc
+import os
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -14,6 +15,19 @@ if cores() == 1:  # what is divided over devices has to be divided here too
     jax.config.update("jax_num_cpu_devices", 2)
 
 MAPS, MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def fast_compilation(request):
+    """Leave out most of XLA's optimisations: most tests compile for longer than they compute.
+
+    Not in a module that is marked `optimised`. Child processes do as the module does.
+    """
+    short = request.node.get_closest_marker("optimised") is None
+    if short != jax.config.read("jax_disable_most_optimizations"):
+        jax.clear_caches()  # what was compiled the other way would be used on
+        jax.config.update("jax_disable_most_optimizations", short)
+        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(short))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -17,6 +17,8 @@ from palpate.identification.posterior.likelihood import known_scales, motion_pos
 from palpate.identification.posterior.posterior import SAMPLERS, Sampler, preparing, sample
 from palpate.identification.posterior.settled import Part, Settled, settle_each
 
+pytestmark = pytest.mark.optimised
+
 TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])
 

@@ -9,6 +9,8 @@ from bayesian_toys import NOISE, Sled
 from palpate.errors import PalpateError
 from palpate.identification.posterior.calibration import histogram, p_values, problem, ranks_of
 
+pytestmark = pytest.mark.optimised
+
 SIMULATIONS, DRAWS, BINS = 40, 31, 8
 LONG = 63  # draws where R-hat is asked for: of half as many some are above 1.1 by chance
 

@@ -18,6 +18,8 @@ from palpate.worlds.camera import Sensor
 from palpate.worlds.rope.filmed import ROPE_COLOUR, TRIPOD, FilmedRope
 from palpate.worlds.rope.rope import START_POSES, RopeConfiguration
 
+pytestmark = pytest.mark.optimised
+
 ROPE = Appearance(ROPE_COLOUR, 5e-3)
 GRIPPER = np.array([0.0, 0.0, 1.5], np.float32)
 MODEL = Rope.uniform(

@@ -12,6 +12,8 @@ from palpate.models.model import rollout
 from palpate.planning.open_loop import CommandSequence, cma_package, search
 from toys import Cart, CartState
 
+pytestmark = pytest.mark.optimised
+
 SEQUENCE = CommandSequence(knots=8, active=60, steps=90, period=0.01, limit=0.4, rate_limit=6.0)
 NONE = jnp.zeros((5, 60, 1, 3))
 

@@ -18,12 +18,14 @@ from palpate.families.rope.counterpart import (
     rope_for,
     with_markers,
 )
+from palpate.families.rope.options import EvaluateRopeStabilization
 from palpate.families.rope.recording import record_rope
 from palpate.families.rope.robot import servoed
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.parameters import describe
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
+from small_rope import MINE
 
 TILT = 0.1  # rad, of a small swing
 OWN: dict = {"length": 0.73, "mass": 0.055, "nodes": 12, "control_period": 1 / 60, "substeps": 17}
@@ -135,6 +137,20 @@ def test_a_rope_that_palpate_recorded_is_that_rope_again():
     assert rope_for(policy, manifest(model, provenance)) == (recorded, "the one that was recorded")
     several = provenance | {"world.length": "0.8; 0.9"}
     assert rope_for(policy, manifest(model, several))[1] == "that of the model it was trained on"
+
+
+def test_the_cable_of_a_file_is_seen_as_ones_own_rope_is(tmp_path):
+    (tmp_path / "mine.xml").write_text(MINE)
+    options = EvaluateRopeStabilization(
+        policy=tmp_path, world=tmp_path / "mine.xml", mass=0.09, seed=0
+    )
+    own = manifest(own_rope(), {"file": "own.npz"})
+    base, said = options.base(rope_policy(12, period=1 / 60), own, None)
+    assert (base.bodies, base.markers, base.mass) == (30, 12, 0.09)
+    assert (base.length, base.control_period) == pytest.approx((0.8, 1 / 60))
+    assert base.observation_noise == 2e-3
+    assert said.startswith("tried in MuJoCo ropes drawn around the cable of ")
+    assert options.inputs() == {"world": tmp_path / "mine.xml"}
 
 
 def test_markers_between_markers():

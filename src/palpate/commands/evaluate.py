@@ -30,7 +30,7 @@ def run(options: Evaluate) -> Path:
             f"{file} was trained for '{manifest.get('task')}', not for {options.task}"
         )
     task = named_task(options.task)
-    model, inputs = None, {"policy": file}
+    model, inputs = None, {"policy": file, **options.inputs()}
     if options.model is not None:
         described = folders.product_of(options.model, folders.MODEL, "identify")
         model = options.prepare(load_model(described)[0])

@@ -306,6 +306,10 @@ class Evaluate(Options, ABC):
     def prepare(self, model: Model) -> Model:
         """The model as the task drives it."""
 
+    def inputs(self) -> dict[str, Path]:
+        """Files, by name, that decide the outcome beside the policy and the model."""
+        return {}
+
     def base(
         self, policy: CommandPolicy, manifest: Mapping[str, Any], model: Model | None
     ) -> tuple[Any, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import arg
@@ -264,6 +265,14 @@ class EvaluateRope(Evaluate):
     """E I, N m^2."""
     joint_damping: Number = None
     """Against bending, N m s/rad at each of 40 joints."""
+    world: Annotated[Path | None, arg(metavar="FILE.xml", help_behavior_hint="(default: none)")] = (
+        None
+    )
+    """An MJCF file with a cable to draw the ropes around."""
+
+    def inputs(self) -> dict[str, Path]:
+        """See `Evaluate.inputs`."""
+        return {} if self.world is None else {"world": self.world}
 
     def prepare(self, model: Rope) -> Rope:
         """The rope moved by its gripper's velocity."""
@@ -284,6 +293,10 @@ class EvaluateRope(Evaluate):
         around, whose = rope_for(policy, manifest, model)
         names = "length", "mass", "tip_mass", "bending_stiffness", "joint_damping"
         given = {name: getattr(self, name) for name in names}
+        if self.world is not None:
+            from palpate.worlds.rope.mjcf import read_cable
+
+            around, whose = adapted(around, read_cable(self.world)), f"the cable of {self.world}"
         around = adapted(around, {name: n for name, n in given.items() if n is not None})
         return around, f"tried in MuJoCo ropes drawn around {whose}: {described(around)}"
 
@@ -309,6 +322,8 @@ class EvaluateRopeStabilization(EvaluateRope):
                                                     --policy P --model runs/identify-rope-002
     3. Twice as heavy as that:                  palpate evaluate rope-stabilization
                                                     --policy P --mass 0.11
+    4. Like a cable in MuJoCo:                  palpate evaluate rope-stabilization
+                                                    --policy P --world rope.xml
     """
 
     task: ClassVar[str] = "rope-stabilization"

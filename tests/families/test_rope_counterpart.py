@@ -18,12 +18,13 @@ from palpate.families.rope.counterpart import (
     rope_for,
     with_markers,
 )
-from palpate.families.rope.options import EvaluateRopeStabilization
+from palpate.families.rope.options import EvaluateRopeStabilization, TrainRopeStabilization
 from palpate.families.rope.recording import record_rope
 from palpate.families.rope.robot import servoed
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.parameters import describe
+from palpate.trials.rope import stabilization
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import MINE
 
@@ -151,6 +152,21 @@ def test_the_cable_of_a_file_is_seen_as_ones_own_rope_is(tmp_path):
     assert base.observation_noise == 2e-3
     assert said.startswith("tried in MuJoCo ropes drawn around the cable of ")
     assert options.inputs() == {"world": tmp_path / "mine.xml"}
+
+
+def test_a_training_tries_its_policy_in_the_same_rope(tmp_path, monkeypatch):
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.1)
+    options = TrainRopeStabilization(model=tmp_path, observation_noise=2e-3)
+    told = manifest(own_rope(), {"file": "own.npz"})
+    figures = options.in_world(rope_policy(12, period=1 / 60), told)
+    assert figures[0].name == "in_world.success_rate"
+    assert figures[0].value == 0.0
+
+
+def test_what_cannot_be_tried_is_not_trained(tmp_path):
+    stiff = own_rope(substeps=400, bend_stiffness=60.0)
+    with pytest.raises(PalpateError, match="too slow to wait for: expected one of less stiffness"):
+        TrainRopeStabilization(model=tmp_path).prepare(stiff)
 
 
 def test_markers_between_markers():

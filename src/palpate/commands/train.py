@@ -4,7 +4,7 @@ Nothing here knows the task but by its name: `options.prepare` does.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -19,7 +19,7 @@ from palpate.family import find
 from palpate.learning import Training, simulate, train
 from palpate.models.files import load_model
 from palpate.models.model import Model
-from palpate.networks import CommandPolicy, Controller, save_controller
+from palpate.networks import CommandPolicy, Controller, load_policy, save_controller
 from palpate.parameters import describe
 from palpate.runs import Figure, Run
 from palpate.runs.result import machine, read_result
@@ -27,6 +27,7 @@ from palpate.runs.run import RESULT
 from palpate.tasks.task import Task
 
 EPISODES = 256  # from start states that were not trained on, for the figures
+POOR = 0.5  # share of successes below which a policy is warned of
 
 
 def run(options: Train) -> Path:
@@ -50,10 +51,14 @@ def run(options: Train) -> Path:
                 task, model, training, options.seed, run, command=command, manifest=more
             )
             figures = figures_in_model(task, model, policy, options.seed)
+            figures += options.in_world(*load_policy(run.path / folders.POLICY))
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
-            folders.finish(run, figures, split=split)
-        for figure in read_result(run.path / RESULT).figures:
+            folders.finish(run, figures, split=split, warnings=doubts(figures))
+        result = read_result(run.path / RESULT)
+        for figure in result.figures:
             print(line_of(figure))
+        for warning in result.warnings:
+            print(f"warning: {warning}")
         title = f"How a controller was trained for {options.task}"
         folders.hand_over(options, run, title, folders.POLICY)
         return run.path
@@ -123,6 +128,27 @@ def figures_in_model(task: Task, model: Model, policy: Controller, seed: int) ->
         unit = task.outcome_units.get(name, "")
         figures.append(Figure(f"in_model.{name}", value, unit, better=better))
     return figures
+
+
+def doubts(figures: Sequence[Figure]) -> list[str]:
+    """What to say of a policy that succeeds too seldom, in its own model or beyond it."""
+    known = {figure.name: figure.value for figure in figures}
+    inside, outside = known.get("in_model.success"), known.get("in_world.success_rate")
+    if inside is not None and inside < POOR:
+        return [
+            f"in its own model the policy succeeds in {inside:.0%} of the starts: expected at "
+            f"least {POOR:.0%} before it is tried elsewhere; more --iterations or a larger --batch "
+            "may help"
+        ]
+    if outside is not None and outside < POOR:
+        return [
+            f"the policy succeeds in {inside or 0.0:.0%} of the starts in its own model and in "
+            f"{outside:.0%} of a few trials in a simulated world, which has noise, lag and what "
+            "the model leaves out: the noise of your sensors as --observation-noise, a model "
+            "identified from more motion, or more --iterations may help; `palpate evaluate` tries "
+            "more worlds"
+        ]
+    return []
 
 
 def line_of(figure: Figure) -> str:

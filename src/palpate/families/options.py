@@ -269,6 +269,10 @@ class Train(Options, ABC):
     def prepare(self, model: Model) -> Model:
         """The model as the task drives it."""
 
+    def in_world(self, policy: CommandPolicy, manifest: Mapping[str, Any]) -> list[Figure]:
+        """Figures "in_world..." of a few trials in a world like the model; where there is one."""
+        return []
+
     def wanted(self) -> Task:
         """The task, as it is by default: it has defaults for all its fields."""
         return find("tasks", self.task)()

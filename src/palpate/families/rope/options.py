@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from palpate.models.rope import Rope
     from palpate.networks import CommandPolicy, Controller
     from palpate.recordings import Aligned, Recording
-    from palpate.runs import Run
+    from palpate.runs import Figure, Run
     from palpate.trials.rope.stabilization import StabilizationTrial
     from palpate.trials.rope.tracking import PathTrial
     from palpate.worlds.rope.configuration import RopeConfiguration
@@ -221,8 +222,26 @@ class TrainRope(Train):
     """Standard deviation of a marker's coordinate as the policy will see it, m."""
 
     def prepare(self, model: Rope) -> Rope:
-        """The rope moved by its gripper's velocity."""
-        return _driven_by_velocity(model)
+        """The rope moved by its gripper's velocity; refused if it could not be tried in MuJoCo."""
+        from palpate.families.rope.counterpart import counterpart
+
+        prepared = _driven_by_velocity(model)
+        counterpart(prepared, self.observation_noise)
+        return prepared
+
+    @abstractmethod
+    def evaluation(self) -> EvaluateRope:
+        """A small one, of the policy."""
+
+    def in_world(self, policy: CommandPolicy, manifest: Mapping[str, Any]) -> list[Figure]:
+        """See `Train.in_world`: what `palpate evaluate` finds with one rope."""
+        from palpate.trials.trial import run_trials
+
+        small = self.evaluation()
+        base, _ = small.base(policy, manifest, None)
+        trials, (controller, *_) = small.trials(base), small.controllers(policy, base).values()
+        figures = type(trials[0]).figures(trials, run_trials(trials, controller))
+        return [dataclasses.replace(one, name=f"in_world.{one.name}") for one in figures]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,6 +253,10 @@ class TrainRopeStabilization(TrainRope):
     """
 
     task: ClassVar[str] = "rope-stabilization"
+
+    def evaluation(self) -> EvaluateRopeStabilization:
+        """One rope from each pose."""
+        return EvaluateRopeStabilization(policy=self.model, seed=self.seed, ropes=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,6 +270,10 @@ class TrainRopeTracking(TrainRope):
     """
 
     task: ClassVar[str] = "rope-tracking"
+
+    def evaluation(self) -> EvaluateRopeTracking:
+        """One rope on each path."""
+        return EvaluateRopeTracking(policy=self.model, seed=self.seed, ropes=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,23 @@
+"""What `palpate train` says of a policy in the end."""
+
+import pytest
+
+from palpate.commands import train
+from palpate.runs import Figure
+
+
+@pytest.mark.parametrize(
+    ("inside", "outside", "said"),
+    [
+        (0.9, 0.75, ""),
+        (0.9, None, ""),
+        (None, None, ""),
+        (0.12, 0.0, "in its own model the policy succeeds in 12% of the starts: expected at least"),
+        (0.9, 0.25, "in 90% of the starts in its own model and in 25% of a few trials in a sim"),
+    ],
+)
+def test_a_poor_policy_is_warned_of(inside, outside, said):
+    values = {"in_model.success": inside, "in_world.success_rate": outside}
+    figures = [Figure(name, value, "") for name, value in values.items() if value is not None]
+    assert bool(said) == bool(train.doubts(figures))
+    assert said in " ".join(train.doubts(figures))

@@ -19,13 +19,13 @@ class Door(Model):
     action_shape, observation_shape, observation_units = (1,), (1,), ("rad",)
 
     def step(self, state, action):
-        inertia, damping, friction = (
-            value[..., None] for value in (self.inertia, self.damping, self.friction)
-        )
         (angle, rate), time = state, self.control_period / 4
+        damping = self.damping[..., None]
+        mass = self.inertia[..., None] + time * damping / 2
+        dry = time * self.friction[..., None] / mass  # the most it takes from the rate
         for _ in range(4):
-            after = rate + time * (action - damping * rate) / inertia
-            after = after / (1 + time * friction / inertia / jnp.sqrt(after**2 + 0.01**2))
+            after = rate + time * (action - damping * rate) / mass
+            after = after - dry * jnp.tanh(after / dry)
             angle, rate = angle + time * (rate + after) / 2, after
         return angle, rate
 

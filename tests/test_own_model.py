@@ -262,7 +262,7 @@ def test_the_page_of_the_docs_runs(workshop, tmp_path, monkeypatch, capsys):
         name, *rest = words.split()
         if name == "export":
             continue
-        options = resolve(f"palpate.families.own_model:{name}_options")(rest[0])
+        options = resolve(f"palpate.families.own.options:{name}_options")(rest[0])
         assert parse(options, f"palpate {name}", rest[1:]) is not None, words
     monkeypatch.chdir(tmp_path)
     known: dict[str, Any] = {}

@@ -56,13 +56,13 @@ COMMANDS = {
     "identify": Command(
         "find an object's physical parameters from recordings of it",
         subject="family",
-        own="palpate.families.own_model:identify_options",
+        own="palpate.families.own.options:identify_options",
     ),
     "plan": Command("plan a robot's way, moving what stands in it", subject="problem"),
     "train": Command(
         "train a controller through an identified model",
         subject="task",
-        own="palpate.families.own_model:train_options",
+        own="palpate.families.own.options:train_options",
     ),
     "evaluate": Command("try a controller in a world the model cannot see into", subject="task"),
     "export": Command(

@@ -132,7 +132,7 @@ def test_what_is_recorded_by_default_is_the_default_rope():
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
             "namo-scenarios, namo-scaling, namo-online, calibration, one-shot, cart-online, "
-            "rope-model, rope-stabilization, rope-ablation, rope-rivals, rope-bound, "
+            "own-model, rope-model, rope-stabilization, rope-ablation, rope-rivals, rope-bound, "
             "rope-generalization, rope-tracking, rope-dagger, rope-posterior, rope-residual, "
             "rope-markerless",
         ),

@@ -24,7 +24,11 @@ from palpate.families.rope.robot import servoed
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.parameters import describe
+from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope import stabilization
+from palpate.trials.rope.learned import LearnedController
+from palpate.trials.rope.stabilization import StabilizationTrial
+from palpate.trials.trial import run_trials
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import MINE
 
@@ -152,6 +156,19 @@ def test_the_cable_of_a_file_is_seen_as_ones_own_rope_is(tmp_path):
     assert base.observation_noise == 2e-3
     assert said.startswith("tried in MuJoCo ropes drawn around the cable of ")
     assert options.inputs() == {"world": tmp_path / "mine.xml"}
+
+
+@pytest.mark.parametrize(("markers", "rate"), [(5, 20), (17, 144), (60, 240)])
+def test_any_markers_at_any_rate_are_tried_to_the_end(markers, rate):
+    own = own_rope(nodes=markers, control_period=1 / rate, substeps=max(5, 1000 // rate))
+    policy = rope_policy(markers, period=1 / rate)
+    base, _ = rope_for(policy, manifest(own, {"file": "own.npz"}))
+    trials = [StabilizationTrial(base, "straight", 0)]
+    seen = run_trials(trials, LearnedController(policy, RopeStabilization()), 5, drawn=[0])
+    assert not seen.failures
+    assert seen.markers.shape == (1, 6, markers, 3)
+    apart = np.linalg.norm(np.diff(seen.markers[0], axis=1), axis=-1)
+    assert apart.mean() == pytest.approx(base.length / (markers - 1), rel=0.05)
 
 
 def test_a_training_tries_its_policy_in_the_same_rope(tmp_path, monkeypatch):

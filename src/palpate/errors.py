@@ -20,6 +20,12 @@ class StoppedError(PalpateError):
     status = 3
 
 
+class DoubtfulResultError(PalpateError):
+    """A result that was written, and is not to be trusted: the message says why."""
+
+    status = 4
+
+
 class PalpateWarning(UserWarning):
     """What somebody should know and nothing fails for; the command line prints it as a note."""
 

@@ -26,6 +26,7 @@ RECORDING, MODEL, PLAN, POLICY, REPORT, TABLE = (
     "report.html",
     "table.txt",
 )
+DOUBTS = "doubts"  # in a result and in a model's file: why they are not to be trusted
 _FOR_A_PERSON = (REPORT, EVIDENCE, TABLE, *(f"rendering{suffix}" for suffix in RENDERINGS))
 _WHERE = ("out", "fresh")  # options that do not decide the outcome
 _SUFFIXES = {Path(name).suffix for name in (RECORDING, MODEL, POLICY, REPORT)}

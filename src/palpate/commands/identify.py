@@ -9,10 +9,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from palpate.commands import folders, identify_report
 from palpate.commands.identify_data import Data, read
 from palpate.commands.identify_report import CORRECTION, FitReport
-from palpate.errors import PalpateError
+from palpate.errors import DoubtfulResultError, PalpateError
 from palpate.families.options import Hypotheses, Identify
 from palpate.identification.declarations import with_values_of
 from palpate.identification.gradient.descent import Settings, check_shapes
@@ -45,7 +47,8 @@ def run(options: Identify) -> Path:
     """Identify, print what a person wants to know, and return the folder everything is in.
 
     Raises `PalpateError` for recordings, names, numbers and folders that cannot be used; before
-    anything takes minutes.
+    anything takes minutes. And `DoubtfulResultError` in the end, when all is written, if what was
+    found is not to be trusted: the recording's or the fit's own problems say why.
     """
     _check(options)
     data = read(options)
@@ -69,6 +72,9 @@ def run(options: Identify) -> Path:
     of_a_fit = dataclasses.asdict(_settings(options)) if options.fits else {}
     with folders.begin(options, words, inputs, product, **of_a_fit) as run:
         if not run.finished:
+            problems = options.problems(data.fitted_aligned)
+            for problem in problems:  # at once: the fit that follows takes minutes
+                print(f"warning: {problem}", flush=True)
             hypotheses = options.hypotheses(data.shown, data.fitted_aligned)
             models = {of: _begun(one, options) for of, one in hypotheses.models.items()}
             found = identify(
@@ -85,7 +91,7 @@ def run(options: Identify) -> Path:
             )
             hypotheses = dataclasses.replace(hypotheses, models=models)
             write = _write_fit if options.fits else _write_draws
-            write(run, options, data, hypotheses, found)
+            write(run, options, data, hypotheses, found, problems)
         result = read_result(run.path / RESULT)
         identify_report.show(result)
         if options.arviz is not None:
@@ -95,7 +101,9 @@ def run(options: Identify) -> Path:
         if CORRECTION in result.settings:
             notes.append(identify_report.describe_correction(result.settings[CORRECTION]))
         title = f"What was found out about the {options.family}"
-        folders.hand_over(options, run, title, product, notes)
+        written = folders.hand_over(options, run, title, product, notes)
+        if doubts := result.settings.get(folders.DOUBTS):
+            raise DoubtfulResultError(f"{written} is not to be trusted: {doubts[0]}")
         return run.path
 
 
@@ -148,7 +156,12 @@ def _settings(options: Identify) -> Settings:
 
 
 def _write_fit(
-    run: Run, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
+    run: Run,
+    options: Identify,
+    data: Data,
+    hypotheses: Hypotheses,
+    found: Identified,
+    problems: list[str],
 ) -> None:
     """The model, evidence and result into the run's folder; the result last."""
     (start,) = hypotheses.models.values()
@@ -161,10 +174,12 @@ def _write_fit(
     wall_time = run.elapsed + earlier
     report = FitReport.of(start, found.model, data, correction)
     figures, parameters = report.figures(wall_time), identify_report.fitted_rows(found)
+    doubts = _doubts(problems, options.misfit(data.fitted_aligned, report.scored.mean_absolute))
     save_model(
         run.path / folders.MODEL,
         report.delivered,
         {
+            folders.DOUBTS: doubts,
             "recordings": dict(data.fitted.provenance),
             "figures": {figure.name: figure.value for figure in figures},
             "parameters": [
@@ -174,8 +189,18 @@ def _write_fit(
         },
     )
     write_evidence(run.path, report.evidence())
-    rows = {"parameters": parameters, "warnings": list(found.warnings), "wall_time_s": wall_time}
-    folders.finish(run, figures, report.settings(), identify_report.split(data), **rows)
+    rows = {
+        "parameters": parameters,
+        "warnings": [*doubts, *found.warnings],
+        "wall_time_s": wall_time,
+    }
+    settings = report.settings() | {folders.DOUBTS: doubts}
+    folders.finish(run, figures, settings, identify_report.split(data), **rows)
+
+
+def _doubts(problems: list[str], misfit: str) -> list[str]:
+    """Why a result is not to be trusted: a misfit by itself only where nothing explains it."""
+    return problems or [misfit] * bool(misfit)
 
 
 def _correction(model: Model, data: Data, options: Identify, run: Run) -> tuple[Correction, float]:
@@ -195,7 +220,12 @@ def _correction(model: Model, data: Data, options: Identify, run: Run) -> tuple[
 
 
 def _write_draws(
-    run: Run, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
+    run: Run,
+    options: Identify,
+    data: Data,
+    hypotheses: Hypotheses,
+    found: Identified,
+    problems: list[str],
 ) -> None:
     """Draws, evidence and result into the run's folder; the result last."""
     comparison = found.comparison
@@ -210,7 +240,10 @@ def _write_draws(
     evidence = identify_report.expected_errors(predicted, pieces, model)
     evidence |= identify_report.drawn_motion(predicted, pieces, model)
     write_evidence(run.path, evidence)
+    everything = np.ones(model.observation_shape[-1], bool)
+    doubts = _doubts(problems, options.misfit(data.fitted_aligned, score.pooled(everything)))
     settings = {
+        folders.DOUBTS: doubts,
         "structure": comparison.structure,
         "probability": comparison.probability,
         "by_itself": hypotheses.by_itself,
@@ -223,5 +256,5 @@ def _write_draws(
     figures = identify_report.drawn_figures(posterior, score, model, run.elapsed, data.unit)
     meanings = options.meanings(posterior.models(), posterior.prior)
     parameters = [*identify_report.drawn_rows(posterior), *meanings]
-    rows = {"parameters": parameters, "warnings": list(found.warnings)}
+    rows = {"parameters": parameters, "warnings": [*doubts, *found.warnings]}
     folders.finish(run, figures, settings, identify_report.split(data), **rows)

@@ -38,6 +38,8 @@ def run(options: Train) -> Path:
     file = folders.product_of(options.model, folders.MODEL, "identify")
     task = options.wanted()  # first: its file may bring the model's class
     model, about = load_model(file)
+    for doubt in about.get(folders.DOUBTS, []):
+        print(f"warning: {file} is not to be trusted: {doubt}", flush=True)
     model = options.prepare(model)
     training = settings(options)
     words = f"train {options.task}"

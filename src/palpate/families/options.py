@@ -222,6 +222,20 @@ class Identify(Reading, ABC):
         The first recording is to be fitted and is `aligned`, what follows only to be scored on.
         """
 
+    def problems(self, aligned: Aligned) -> list[str]:
+        """Sentences about what is wrong with a recording that is to be fitted, causes first.
+
+        They do not end the identification: its result is marked, and not to be trusted.
+        """
+        return []
+
+    def misfit(self, aligned: Aligned, error: float) -> str:
+        """The same of a fit that misses the scored recordings by `error`; "" where it may.
+
+        In the observation's unit, of one of its numbers.
+        """
+        return ""
+
     def hypotheses(self, recordings: Sequence[Recording], aligned: Aligned) -> Hypotheses:
         """The models to compare; one is identified without comparison. Arguments as of `reference`.
 

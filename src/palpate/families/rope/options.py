@@ -169,14 +169,27 @@ class IdentifyRope(Identify):
 
     def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Rope:
         from palpate.families.rope.recording import starting_rope
-        from palpate.recordings.recording import resolve_indices
 
-        driven = resolve_indices(self.driven or (0,), aligned.observation.shape[2], "marker")
         one_length = "rest_length" in self.shared
-        rope = starting_rope(aligned, driven, self.mass, one_length=one_length)
+        rope = starting_rope(aligned, self._driven(aligned), self.mass, one_length=one_length)
         if self.substeps is not None:
             rope = dataclasses.replace(rope, substeps=self.substeps).constrain()
         return rope
+
+    def problems(self, aligned: Aligned) -> list[str]:
+        from palpate.families.rope.recording_check import problems
+
+        return problems(aligned, self._driven(aligned), self.mass)
+
+    def misfit(self, aligned: Aligned, error: float) -> str:
+        from palpate.families.rope.recording_check import misfit
+
+        return misfit(aligned, error)
+
+    def _driven(self, aligned: Aligned) -> list[int]:
+        from palpate.recordings.recording import resolve_indices
+
+        return resolve_indices(self.driven or (0,), aligned.observation.shape[2], "marker")
 
     def _thinned(self, recording: Recording) -> Recording:
         if self.nodes is None:

@@ -116,17 +116,20 @@ def test_what_is_recorded_by_default_is_the_default_rope():
         ),
         (
             "identify rpoe R.npz",
-            "unknown family 'rpoe'; did you mean 'rope'? there are: furniture, rope",
+            "unknown family 'rpoe'; did you mean 'rope'? there are: furniture, rope, FILE.py:CLASS",
         ),
-        ("identify", "palpate identify needs a family first; there are: furniture, rope"),
+        (
+            "identify",
+            "palpate identify needs a family first; there are: furniture, rope, FILE.py:CLASS",
+        ),
         (
             "identify --seed 1 rope",
-            "palpate identify needs a family first; there are: furniture, rope",
+            "palpate identify needs a family first; there are: furniture, rope, FILE.py:CLASS",
         ),
         (
             "train rope-stabilisation",
             "unknown task 'rope-stabilisation'; did you mean 'rope-stabilization'? there are: "
-            "rope-stabilization, rope-tracking",
+            "rope-stabilization, rope-tracking, FILE.py:CLASS",
         ),
         (
             "reproduce rope-modle",

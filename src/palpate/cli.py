@@ -17,6 +17,7 @@ from palpate.errors import PalpateError, PalpateWarning
 from palpate.family import check_name, families, options_of, places, resolve
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
+OWN = "FILE.py:CLASS"  # what a subject of somebody's own is called
 
 
 @dataclass(frozen=True)
@@ -115,23 +116,23 @@ def _run(words: list[str]) -> int:
 
     name, *rest = words
     command = COMMANDS[check_name("command", name, COMMANDS)]
-    kind, program = "", f"palpate {name}"
+    kind, own, program = "", False, f"palpate {name}"
     kinds = command.kinds(name)
     if command.optional and (not rest or rest[0].startswith("-")):
         kind = next(iter(kinds))
     elif command.subject:
+        known = [*kinds, *([OWN] if command.own else [])]
         if not rest or rest[0].startswith("-"):
             if rest and rest[0] in ("-h", "--help"):
-                print(_subjects(name, command, kinds))
+                print(_subjects(name, command, known))
                 return 0
-            known = ", ".join(kinds)
+            known = ", ".join(known)
             raise PalpateError(f"{program} needs a {command.subject} first; there are: {known}")
         kind, *rest = rest
         program = f"{program} {kind}"
-    if command.own and re.search(r"\.py(:|$)", kind):
-        of = resolve(command.own)(kind)
-    else:
-        of = resolve(kinds[check_name(command.subject, kind, kinds) if command.subject else kind])
+        if not (own := bool(command.own and re.search(r"\.py(:|$)", kind))):
+            check_name(command.subject, kind, known)
+    of = resolve(command.own)(kind) if own else resolve(kinds[kind])
     options = parse(of, program, rest)
     if options is not None:
         run = resolve(f"palpate.commands.{name}:run")
@@ -177,7 +178,6 @@ def _subjects(name: str, command: Command, kinds: Iterable[str]) -> str:
         f"Each {command.subject} has its own options:",
         "",
         *(f"  palpate {name} {kind} --help" for kind in kinds),
-        *([f"  palpate {name} FILE.py:CLASS --help"] if command.own else []),
     ]
     return "\n".join(lines)
 

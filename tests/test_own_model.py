@@ -20,6 +20,7 @@ from palpate.identification.posterior.files import read_models
 from palpate.models.files import load_model, save_model
 from palpate.models.model import Model, rollout
 from palpate.models.python_files import load_class
+from palpate.recordings.files import read_recording
 from palpate.report import read_evidence
 from palpate.runs.result import read_result
 
@@ -156,6 +157,10 @@ def test_degrees_are_read_as_radians(workshop, tmp_path, capsys):
     how = "--method levenberg-marquardt --iterations 1 1 1"
     do(f"identify door.py:Door degrees.csv {CHANNELS} {how} --out {tmp_path / 'degrees'}")
     assert "was in deg and is in rad" in capsys.readouterr().out
+    both = [read_recording(file, columns=("angle",)) for file in ("degrees.csv", "R.csv")]
+    ours, read = (recording.trials[0]["angle"] for recording in both)
+    np.testing.assert_allclose(ours.values, read.values, atol=1e-9)
+    assert ours.unit == read.unit == "rad"
     record("other.csv", seed=0, header="angle [m]")
     said = refused(f"identify door.py:Door other.csv {CHANNELS} --out no", capsys)
     assert said == "'angle' is in m and Door observes rad: expected the same unit"

@@ -22,7 +22,7 @@ KEPT = Path(__file__).parents[3] / "results" / "quick"  # of quick runs, in a ch
 SAME = 1e-3  # relative: other processors add up in another order
 # What a clock measured, by how experiments name it; another run, another figure.
 CLOCK = re.compile(
-    r"(wall_time|planning|sampling|training)_s($|_)|(decision|cpu)_ms|_per_s_|^seconds$|^speedup|^exponent$"
+    r"(wall_time|planning|sampling|training)_s($|_)|(decision|cpu)_ms|_per_s_|(^|\.)seconds($|[._])|^speedup|^exponent$"
 )
 
 

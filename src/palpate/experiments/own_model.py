@@ -42,7 +42,7 @@ MOVING = 0.3  # rad/s from which on least squares takes dry friction to have its
 FITTED = tuple(method for method in FITS if method != "adam")
 DRAWN = tuple(method for method in get_args(Method) if method not in FITS)
 WRONG, COVERED, COVERED_OVER, LONGEST, LINES = 0.10, 0.80, 0.98, 60.0, 40  # the bars
-DOORS, QUICK, MINUTES = 20, 2, 2  # how many doors, and how long one takes by all methods
+DOORS, QUICK, MINUTES = 20, 2, 1  # how many doors, and how long one takes by all methods
 
 Door = dict[str, float]  # its parameters in SI units
 

@@ -20,11 +20,11 @@ html_title = f"palpate {release}"
 # What a reader has to know beside a table; the result's file does not say it.
 NOTES = {
     "own-model": (
-        "Finite differences and linear least squares, which need no library, are off by 2.8 % on the "
-        "median door: within the bar too. They say nothing of how far to trust them. MuJoCo takes "
-        "steps of 0.1 ms, because with 1 ms its own error is above the noise; the example was "
-        "made to integrate as exactly on doors of other seeds. 59 of 60 intervals of smc hold, one "
-        "more than the bar allows. mujoco.sysid is not beside it yet."
+        "Finite differences and linear least squares, which need no library, are off by 2.8 % on "
+        "the median door: within the bar too. They say nothing of how far to trust them. MuJoCo "
+        "takes steps of 0.1 ms, because with 1 ms its own error is above the noise; the example "
+        "was made to integrate as exactly on doors of other seeds. 59 of 60 intervals "
+        "of smc hold, one more than the bar allows. mujoco.sysid is not beside it yet."
     ),
     "rope-residual": (
         "The ratio is one of mean errors, of which one trial carries a large part; this run did "

@@ -204,6 +204,7 @@ REFUSED = {
     "a subclass of palpate.models.model.Model; there are: Door",
     "raises.py:Door R.csv": "raises.py cannot be loaded: raises.py, line 2: "
     "ZeroDivisionError: division by zero",
+    "ends.py:Door R.csv": "ends.py cannot be loaded: ends.py, line 1: SystemExit: 3",
     "wrong.py:Door R.csv": "wrong.py cannot be loaded: wrong.py, line 1: SyntaxError: invalid "
     "syntax (wrong.py, line 1)",
     "broken.py:Missing R.csv": "Missing.observe fails for one state, float32[1] and float32[1]: "
@@ -228,6 +229,7 @@ REFUSED = {
 def test_what_cannot_be_is_refused_with_a_sentence(words, workshop, capsys):
     Path("broken.py").write_text(BROKEN)
     Path("raises.py").write_text("import os\n1 / 0\n")
+    Path("ends.py").write_text("raise SystemExit(3)\n")
     Path("wrong.py").write_text("def f(:\n")
     Path("headless.csv").write_text("angle,torque\n0,1\n")
     Path("word.csv").write_text("time,angle,torque\n0,0,1\n0.02,open,1\n")

@@ -79,7 +79,7 @@ def named_class(place: str, base: type[Kind]) -> type[Kind] | None:
     return None
 
 
-def blame(error: Exception, file: str | Path) -> str:
+def blame(error: BaseException, file: str | Path) -> str:
     """What an error of somebody's own code says, and at which line of the `file`."""
     ours, here = Path(file).resolve(), Path.cwd()
     file = ours.relative_to(here) if ours.is_relative_to(here) else file
@@ -119,7 +119,7 @@ def _run(path: Path) -> ModuleType:
     sys.path.insert(0, str(whole.parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a script may end itself
         sys.modules.pop(name)
         if earlier is not None:
             sys.modules[name] = earlier

@@ -54,7 +54,7 @@ def no_u_turn(
 ) -> Draws:
     """Sample `draws` of each of `chains`, rounded up to whole blocks, after the warm-up.
 
-    Chains begin at draws of the modes' mixture.  `watch` goes through the blocks.
+    Chains begin at draws of the modes' mixture. `watch` goes through the blocks.
     Raises `PalpateError` when the density is not finite where a chain begins.
     """
     began = time.monotonic()

@@ -331,10 +331,10 @@ def test_the_most_probable_error_of_a_start_is_found_where_the_model_is_not_line
 def test_a_rest_is_averaged_whole_and_not_seen_again():
     """Forty frames at rest, then motion: one start of a fortieth of the noise's variance."""
     rng = np.random.default_rng(0)
-    still = np.zeros((1, 60, 1))
-    still[0, 40:, 0] = 0.1 * np.arange(1, 21)
+    still = np.zeros((1, 90, 1))
+    still[0, 40:, 0] = 0.1 * np.arange(1, 51)
     noise = 1e-3 * rng.standard_normal(still.shape)
-    aligned = Aligned(0.02, still + noise, np.zeros((1, 59, 1)), np.array([60]))
+    aligned = Aligned(0.02, still + noise, np.zeros((1, 89, 1)), np.array([90]))
     (pieces, usual) = (
         cut(aligned, hinge.TRUE, 5.0, at_rest=True, ringing=ringing) for ringing in (True, False)
     )
@@ -366,3 +366,10 @@ def test_starts_that_ring_on_are_not_taken_for_damping():
     assert slope([target.density(side) for side in sides]) == pytest.approx(anew, abs=0.05)
     fixed = eqx.tree_at(lambda t: t.volume_slope, target, jnp.zeros_like(target.volume_slope))
     assert slope([fixed.density(side) for side in sides]) < anew - 0.2
+
+
+def test_a_trial_that_rests_to_its_end_is_not_lost():
+    noise = 1e-3 * np.random.default_rng(1).standard_normal((1, 60, 1))
+    aligned = Aligned(0.02, noise, np.zeros((1, 59, 1)), np.array([60]))
+    pieces = cut(aligned, hinge.TRUE, 5.0, at_rest=True, ringing=True)
+    assert np.asarray(pieces.seen).sum() == 30

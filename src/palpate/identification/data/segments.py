@@ -290,7 +290,8 @@ def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.
 def _rest(observed: np.ndarray, model: Model, spread: np.ndarray, period: float) -> int:
     """For how many frames of a trial that begins at rest nothing moves beyond the noise; or one.
 
-    What moved too little to be seen may have moved in the last frames: they do not count.
+    What moved too little to be seen may have moved in the last frames: they do not count. Nor does
+    the second half of a trial: one that rests to its end shows something, too.
     """
     frames = max(2, round(STILL / period))
     first = observed[:frames].mean(axis=0)
@@ -300,7 +301,7 @@ def _rest(observed: np.ndarray, model: Model, spread: np.ndarray, period: float)
         if not np.all(np.abs(moved) <= MOVED * spread * np.sqrt(2.0 / frames)):
             break
         rest += frames
-    return max(1, rest - frames)
+    return max(1, min(rest - frames, len(observed) // 2))
 
 
 def _mean(

@@ -82,8 +82,8 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
-    0: done; 2: bad input, one sentence on stderr; 3: it was stopped, likewise; 130: interrupted by
-    Ctrl-C.
+    0: done; 2: bad input, one sentence on stderr; 3: it was stopped, and 4: its result is not to be
+    trusted, likewise; 130: interrupted by Ctrl-C.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:

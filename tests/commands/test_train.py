@@ -19,5 +19,5 @@ from palpate.runs import Figure
 def test_a_poor_policy_is_warned_of(inside, outside, said):
     values = {"in_model.success": inside, "in_world.success_rate": outside}
     figures = [Figure(name, value, "") for name, value in values.items() if value is not None]
-    assert bool(said) == bool(train.doubts(figures))
-    assert said in " ".join(train.doubts(figures))
+    assert bool(said) == bool(train.warnings_of(figures))
+    assert said in " ".join(train.warnings_of(figures))

@@ -72,8 +72,7 @@ def run(options: Identify) -> Path:
     of_a_fit = dataclasses.asdict(_settings(options)) if options.fits else {}
     with folders.begin(options, words, inputs, product, **of_a_fit) as run:
         if not run.finished:
-            problems = options.problems(data.fitted_aligned)
-            for problem in problems:  # at once: the fit that follows takes minutes
+            for problem in data.problems:  # at once: the fit that follows takes minutes
                 print(f"warning: {problem}", flush=True)
             hypotheses = options.hypotheses(data.shown, data.fitted_aligned)
             models = {of: _begun(one, options) for of, one in hypotheses.models.items()}
@@ -91,7 +90,7 @@ def run(options: Identify) -> Path:
             )
             hypotheses = dataclasses.replace(hypotheses, models=models)
             write = _write_fit if options.fits else _write_draws
-            write(run, options, data, hypotheses, found, problems)
+            write(run, options, data, hypotheses, found)
         result = read_result(run.path / RESULT)
         identify_report.show(result)
         if options.arviz is not None:
@@ -156,12 +155,7 @@ def _settings(options: Identify) -> Settings:
 
 
 def _write_fit(
-    run: Run,
-    options: Identify,
-    data: Data,
-    hypotheses: Hypotheses,
-    found: Identified,
-    problems: list[str],
+    run: Run, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
 ) -> None:
     """The model, evidence and result into the run's folder; the result last."""
     (start,) = hypotheses.models.values()
@@ -174,7 +168,7 @@ def _write_fit(
     wall_time = run.elapsed + earlier
     report = FitReport.of(start, found.model, data, correction)
     figures, parameters = report.figures(wall_time), identify_report.fitted_rows(found)
-    doubts = _doubts(problems, options.misfit(data.fitted_aligned, report.scored.mean_absolute))
+    doubts = _doubts(options, data, report.scored.mean_absolute)
     save_model(
         run.path / folders.MODEL,
         report.delivered,
@@ -198,9 +192,10 @@ def _write_fit(
     folders.finish(run, figures, settings, identify_report.split(data), **rows)
 
 
-def _doubts(problems: list[str], misfit: str) -> list[str]:
+def _doubts(options: Identify, data: Data, error: float) -> list[str]:
     """Why a result is not to be trusted: a misfit by itself only where nothing explains it."""
-    return problems or [misfit] * bool(misfit)
+    misfit = options.misfit(data.fitted_aligned, error)
+    return [*data.problems] or [misfit] * bool(misfit)
 
 
 def _correction(model: Model, data: Data, options: Identify, run: Run) -> tuple[Correction, float]:
@@ -220,12 +215,7 @@ def _correction(model: Model, data: Data, options: Identify, run: Run) -> tuple[
 
 
 def _write_draws(
-    run: Run,
-    options: Identify,
-    data: Data,
-    hypotheses: Hypotheses,
-    found: Identified,
-    problems: list[str],
+    run: Run, options: Identify, data: Data, hypotheses: Hypotheses, found: Identified
 ) -> None:
     """Draws, evidence and result into the run's folder; the result last."""
     comparison = found.comparison
@@ -241,7 +231,7 @@ def _write_draws(
     evidence |= identify_report.drawn_motion(predicted, pieces, model)
     write_evidence(run.path, evidence)
     everything = np.ones(model.observation_shape[-1], bool)
-    doubts = _doubts(problems, options.misfit(data.fitted_aligned, score.pooled(everything)))
+    doubts = _doubts(options, data, score.pooled(everything))
     settings = {
         folders.DOUBTS: doubts,
         "structure": comparison.structure,

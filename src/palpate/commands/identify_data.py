@@ -23,6 +23,7 @@ class Data:
     validation_aligned: Aligned
     unit: str
     observed: tuple[str, ...]
+    problems: tuple[str, ...]  # of the recording that is fitted, in sentences
 
     @property
     def shown(self) -> list[Recording]:
@@ -56,7 +57,9 @@ def read(options: Identify) -> Data:
     if validation is not None:
         validation = _prepared(validation, options, "validation, ")
         scored = validation.align(period, observed, action)
-    return Data(fitted, validation, aligned, scored, _unit(fitted, observed), observed)
+    problems = tuple(options.problems(aligned))
+    unit = _unit(fitted, observed)
+    return Data(fitted, validation, aligned, scored, unit, observed, problems)
 
 
 def _unit(recording: Recording, observed: tuple[str, ...]) -> str:

@@ -55,7 +55,7 @@ def run(options: Train) -> Path:
             figures = figures_in_model(task, model, policy, options.seed)
             figures += options.in_world(*load_policy(run.path / folders.POLICY))
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
-            folders.finish(run, figures, split=split, warnings=doubts(figures))
+            folders.finish(run, figures, split=split, warnings=warnings_of(figures))
         result = read_result(run.path / RESULT)
         for figure in result.figures:
             print(line_of(figure))
@@ -81,7 +81,7 @@ def trained(
     `command`: what makes it again. `manifest`: what else its file is to say.
     """
     policy = train(task, model, training, seed, run)
-    told = {
+    described = {
         "task": task.name,
         "command": command,
         "seed": seed,
@@ -90,7 +90,7 @@ def trained(
         "machine": machine(),
         "wall_time_s": run.elapsed,
     }
-    save_controller(run.path / folders.POLICY, policy, {**manifest, **told})
+    save_controller(run.path / folders.POLICY, policy, {**manifest, **described})
     return policy
 
 
@@ -132,7 +132,7 @@ def figures_in_model(task: Task, model: Model, policy: Controller, seed: int) ->
     return figures
 
 
-def doubts(figures: Sequence[Figure]) -> list[str]:
+def warnings_of(figures: Sequence[Figure]) -> list[str]:
     """What to say of a policy that succeeds too seldom, in its own model or beyond it."""
     known = {figure.name: figure.value for figure in figures}
     inside, outside = known.get("in_model.success"), known.get("in_world.success_rate")

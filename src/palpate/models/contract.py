@@ -51,15 +51,15 @@ def check_model(model: Model) -> None:
         following = _traced(of, "step", what, state, action)
         if _shapes(following) != _shapes(state):
             raise PalpateError(
-                f"{kind.__name__}.step of {what} gives {_told(following)} and takes {_told(state)}:"
+                f"{kind.__name__}.step of {what} gives {_form(following)} and takes {_form(state)}:"
                 " expected the same, as `initial_state` gives it"
             )
         seen = _traced(of, "observe", what, state)
-        apart = _traced(of, "difference", what, seen, seen)
-        for name, came in (("observe", seen), ("difference", apart)):
-            if _told(came) != _told(frames[..., 0, *(slice(None),) * len(model.observation_shape)]):
+        difference = _traced(of, "difference", what, seen, seen)
+        for name, came in (("observe", seen), ("difference", difference)):
+            if _form(came) != _form(frames[..., 0, *(slice(None),) * len(model.observation_shape)]):
                 raise PalpateError(
-                    f"{kind.__name__}.{name} of {what} gives {_told(came)}: expected an array of "
+                    f"{kind.__name__}.{name} of {what} gives {_form(came)}: expected an array of "
                     f"shape {(*lead, *model.observation_shape)}; batch axes lead, so that a "
                     'parameter "*batch" has to be broadcast as value[..., None]'
                 )
@@ -73,7 +73,7 @@ def _traced(model: Model, name: str, what: str, *arguments: Any) -> Any:
         kind = type(model)
         reason = blame(error, inspect.getfile(kind))
         raise PalpateError(
-            f"{kind.__name__}.{name} fails for {what}, {', '.join(map(_told, arguments))}: {reason}"
+            f"{kind.__name__}.{name} fails for {what}, {', '.join(map(_form, arguments))}: {reason}"
         ) from error
 
 
@@ -82,5 +82,5 @@ def _shapes(tree: Any) -> Any:
     return structure, [(np.shape(leaf), leaf.dtype) for leaf in leaves]
 
 
-def _told(tree: Any) -> str:
+def _form(tree: Any) -> str:
     return " and ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(tree))

@@ -20,7 +20,7 @@ _SI = {  # what a unit is in SI units and radians; others are left as they are c
     **{name: (math.pi / 180, "rad") for name in ("deg", "degree", "degrees", "°")},
     **{name: (math.pi / 180, "rad/s") for name in ("deg/s", "°/s")},
     **{"rpm": (math.pi / 30, "rad/s"), "mm": (1e-3, "m"), "cm": (1e-2, "m")},
-    **{"mm/s": (1e-3, "m/s"), "cm/s": (1e-2, "m/s"), "g": (1e-3, "kg"), "kN": (1e3, "N")},
+    **{"mm/s": (1e-3, "m/s"), "cm/s": (1e-2, "m/s"), "kN": (1e3, "N")},
     **{"mN": (1e-3, "N"), "Nm": (1.0, "N m"), "N mm": (1e-3, "N m"), "Nmm": (1e-3, "N m")},
 }
 

@@ -258,3 +258,15 @@ def test_many_stages_are_counted(tmp_path, count, words):
 def test_no_run_is_refused(tmp_path):
     with pytest.raises(PalpateError, match="at least one run"):
         build_report([], tmp_path / "page.html", "None")
+
+
+def test_columns_in_which_nothing_stands_are_left_out(tmp_path):
+    own = figure("success rate", 0.9, "")
+    held = figure("tip error", 0.02, "m", 0.03)
+    for name, figures in (("own", [own]), ("held", [own, held])):
+        write_run(tmp_path / name, name, figures=figures)
+    for name, columns in (("own", ["", "value"]), ("held", ["", "value", "bar", "verdict"])):
+        page = tmp_path / f"{name}.html"
+        build_report([tmp_path / name], page, "A page")
+        table = page.read_text(encoding="utf-8").partition('<table class="results">')[2]
+        assert re.findall("<th>(.*?)</th>", table.partition("</thead>")[0]) == columns

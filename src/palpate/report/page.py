@@ -130,7 +130,15 @@ def _results(evidence: Evidence, looks: dict[str, int]) -> str:
                 _number(figure.rival, "none"),
             )
         )
-    return _table("results", ("", "value", "bar", "verdict", "seed document", "rival"), rows)
+    names = "", "value", "bar", "verdict", "seed document", "rival"
+    fields = "name", "value", "bar", "met", "seed_document", "rival"
+    # What is empty in every row is left out: a user's own thing has no bar and no seed document.
+    kept = [
+        index
+        for index, field in enumerate(fields)
+        if index < 2 or any(getattr(figure, field) is not None for figure in evidence.figures)
+    ]
+    return _table("results", [names[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
 def _pictures(evidence: Evidence) -> str:

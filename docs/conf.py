@@ -1,17 +1,28 @@
 """Sphinx configuration: Markdown through MyST."""
 
 import json
+import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+from docstrings import without_hints_for_the_command_line
+from reference_pages import STAGES, write_pages
 
 project = "palpate"
 author = "The palpate developers"
 version = release = installed_version("palpate")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "docstrings"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 nb_execution_raise_on_error = True
-exclude_patterns = ["_build", "_generated"]
+exclude_patterns = ["_build", "_generated/results.md", "_generated/reference/calls.md"]
+
+suppress_warnings = ["ref.python"]  # an axis of a shape, "trials", is no name
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 88
 
 html_theme = "furo"
 html_title = f"palpate {release}"
@@ -126,3 +137,7 @@ def _cell(entry: float | str | None) -> str:
 _generated = Path(__file__).parent / "_generated"
 _generated.mkdir(exist_ok=True)
 (_generated / "results.md").write_text(results_page())
+write_pages(_generated / "reference")
+without_hints_for_the_command_line(
+    f"palpate.{name}" for name in STAGES["commands"] if name.endswith(("options", "demo"))
+)

@@ -41,7 +41,9 @@ class Controller(Protocol):
     """
 
     @property
-    def period(self) -> float | None: ...
+    def period(self) -> float | None:
+        """Seconds from one decision to the next; None: any."""
+        ...
 
     def initial_carry(self, command: Any) -> Any:
         """What to carry into the first call.

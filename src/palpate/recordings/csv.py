@@ -67,6 +67,7 @@ class Lines:
 
     @property
     def number(self) -> int:
+        """Of the current line, from 1."""
         return self._reader.line_num
 
     def header(self, what: str) -> list[str]:

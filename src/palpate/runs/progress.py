@@ -1,10 +1,12 @@
 """Loops that take long: they tell how far they are, and end with a whole step when asked to.
 
-with interruptible() as stop:
-    for step in progress(range(1000), "training"):
-        ...
-        if stop:
-            break
+    with interruptible() as stop:
+        for step in progress(range(1000), "training"):
+            ...
+            if stop:
+                break
+
+Ctrl-C ends the loop after the step in which it came.
 """
 
 import contextlib

@@ -99,6 +99,7 @@ class Adam(eqx.Module):
 
     @property
     def transform(self) -> optax.GradientTransformation:
+        """Slopes of a bounded norm, scaled by their moments (Kingma and Ba 2015, ICLR)."""
         return optax.chain(optax.clip_by_global_norm(self.clip), optax.scale_by_adam())
 
     def start(self, free: Free, offset: Array) -> Any:

@@ -149,6 +149,7 @@ class FurnitureWorld(World):
 
     @property
     def kinds(self) -> tuple[PieceKind, ...]:
+        """What each body is like."""
         return self._kinds
 
     @property
@@ -163,6 +164,7 @@ class FurnitureWorld(World):
 
     @property
     def walls(self) -> tuple[np.ndarray, ...]:
+        """Polygons (points, 2) in the world, m."""
         return tuple(self._walls)
 
     def reset(

@@ -131,6 +131,7 @@ class Piece:
 
     @property
     def made_as(self) -> PieceKind:
+        """What the piece is like: its kind, by name or as given."""
         return KINDS[self.kind] if isinstance(self.kind, str) else self.kind
 
 

@@ -233,6 +233,7 @@ class RobotInScene:
         return wrist, effort - inertia * acceleration - wrist[:2]
 
     def truth(self) -> RobotTruth:
+        """Where the robot is and how it moves, without noise."""
         position, velocity = self._position.copy(), self._velocity.copy()
         base = position[:3] + np.array([*self._robot.pose[:2], 0.0])
         return RobotTruth(

@@ -1,0 +1,119 @@
+"""The pages of the reference, made of docstrings: which modules they show, and who is called when.
+
+A stage of the loop is a page. A module is shown with all that is public and defined in it.
+"""
+
+from pathlib import Path
+
+from palpate.cli import COMMANDS, Command
+
+# Paths below palpate, in the order in which somebody needs them; the first gives the page its name.
+STAGES = {
+    "commands": [
+        *(f"commands.{name}" for name in COMMANDS),
+        *("commands.options", "families.options", "families.rope.options", "families.rope.demo"),
+        *("families.furniture.options", "families.own.options"),
+    ],
+    "recordings": [
+        *("recordings.recording", "recordings.trial", "recordings.channel", "recordings.facts"),
+        *("recordings.alignment", "recordings.files", "recordings.npz", "recordings.csv"),
+        *("recordings.columns", "recordings.markers", "recordings.lerobot", "recordings.rerun"),
+        *("recordings.rosbag.bag", "families.rope.recording", "families.furniture.recording"),
+    ],
+    "models": [
+        *("models.model", "models.contract", "models.files", "models.python_files", "parameters"),
+        *("models.residual", "models.rope.rope", "models.rope.parameters"),
+        *("models.planar.planar", "models.planar.parameters", "models.planar.shapes"),
+    ],
+    "identification": [
+        *("identification.identify", "identification.declarations", "identification.verdicts"),
+        *("identification.data.prediction", "identification.gradient.descent"),
+        *("identification.gradient.least_squares", "identification.gradient.residual"),
+        *("identification.posterior.posterior", "identification.posterior.predictive"),
+        *("identification.posterior.comparison", "identification.posterior.calibration"),
+        *("identification.posterior.diagnostics", "identification.posterior.files"),
+        *("identification.samplers.draws", "identification.samplers.target"),
+        *("identification.samplers.hamiltonian", "identification.samplers.metropolis"),
+        *("identification.samplers.local_global", "identification.samplers.tempered"),
+        *("identification.regression.locally_weighted", "identification.regression.model"),
+        "identification.regression.gaussian_process",
+    ],
+    "learning": [
+        *("learning.self_supervised", "learning.closed_loop", "learning.dagger"),
+        *("learning.loss_monitor", "networks.policy", "networks.controller", "networks.channels"),
+        *("tasks.task", "tasks.rope.stabilization", "tasks.rope.tracking", "tasks.rope.paths"),
+        "tasks.furniture.cart",
+    ],
+    "planning": [
+        *("planning.command_curve", "planning.sampling", "planning.gradient", "planning.open_loop"),
+        *("planning.movable_obstacles.maps.files", "planning.movable_obstacles.maps.map"),
+        *("planning.movable_obstacles.search.planner", "planning.movable_obstacles.search.plan"),
+        "planning.movable_obstacles.search.verification",
+        "planning.movable_obstacles.motion.belief",
+    ],
+    "worlds": [
+        *("worlds.world", "worlds.camera", "worlds.excitation", "worlds.rope.configuration"),
+        *("worlds.rope.rope", "worlds.rope.mjcf", "families.rope.counterpart"),
+        *("worlds.furniture.pieces", "worlds.furniture.furniture", "worlds.furniture.robot"),
+        "worlds.furniture.handling",
+    ],
+    "perception": [
+        *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),
+        "perception.rope.marker_observer",
+    ],
+    "trials": [
+        *("trials.trial", "trials.controller", "trials.rope.stabilization", "trials.rope.tracking"),
+        *("trials.rope.learned", "trials.rope.baselines", "trials.rope.planners"),
+        *("trials.furniture.namo_episode", "trials.furniture.cart_trials"),
+    ],
+    "deployment": [
+        *("deployment.deployment", "deployment.supervisor", "deployment.intake"),
+        *("deployment.decision", "deployment.loop", "deployment.transport"),
+        *("deployment.messages", "deployment.plausibility", "deployment.onnx_export"),
+        "deployment.contract",
+    ],
+    "runs": [
+        *("runs.run", "runs.result", "runs.progress", "runs.storage", "report.evidence"),
+        *("report.page", "family", "errors"),
+    ],
+}
+
+
+def calls() -> list[tuple[str, str, str]]:
+    """Each command with what it works on, its module, and where its options are ("module:name")."""
+    rows = []
+    for name, command in COMMANDS.items():
+        kinds = command.kinds(name)
+        if command.options and command.subject:  # of experiments, all with the same options
+            kinds = {command.subject.upper(): next(iter(kinds.values()))}
+        rows += [(f"{name} {kind}".strip(), name, place) for kind, place in kinds.items()]
+        rows += _own_call(name, command)
+    return rows
+
+
+def write_pages(folder: Path) -> None:
+    """A Markdown file for each stage, and the table of calls."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for stage, modules in STAGES.items():
+        title = f"# {stage.capitalize()}\n"
+        sections = map(_section, modules)
+        (folder / f"{stage}.md").write_text("\n".join([title, *sections]))
+    rows = ["| on the command line | in Python | with |", "|---|---|---|"]
+    for words, name, place in calls():
+        module, _, options = place.partition(":")
+        run = f"{{func}}`{name}.run() <palpate.commands.{name}.run>`"
+        made = f"`{options} <{module}.{options}>`"
+        made = f"{{class}}{made}" if options[0].isupper() else f"what {{func}}{made} gives"
+        rows.append(f"| `palpate {words}` | {run} | {made} |")
+    (folder / "calls.md").write_text("\n".join(rows) + "\n")
+
+
+def _section(name: str) -> str:
+    members = ":members: run" if name.removeprefix("commands.") in COMMANDS else ":members:"
+    bases = "   :show-inheritance:\n" if name.endswith("options") else ""
+    shown = f".. automodule:: palpate.{name}\n   {members}\n{bases}"
+    return f"## palpate.{name}\n\n```{{eval-rst}}\n{shown}```\n"
+
+
+def _own_call(name: str, command: Command) -> list[tuple[str, str, str]]:
+    return [(f"{name} FILE.py:CLASS", name, command.own)] if command.own else []

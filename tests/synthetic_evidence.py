@@ -91,7 +91,14 @@ def identification(folder: Path) -> Path:
         parameter("bias", -0.02, "m", "offset of the sensor") | {"lower": -0.05, "upper": 0.01},
         parameter("twist_stiffness", 3e-5, "N m", "torque per radian of twist"),
     ]
-    return write_run(folder, "identify", figures=figures, parameters=parameters)
+    return write_run(
+        folder,
+        "identify",
+        figures=figures,
+        parameters=parameters,
+        settings={"summary": ["It swings as recorded.", "Trust it for 5 s."]},
+        warnings=[f"A long warning {number}" for number in range(4)],
+    )
 
 
 def parameter(name, value, unit, about, **more):

@@ -106,5 +106,5 @@ def test_ones_own_rope_is_tried_to_the_end(tried):
 def test_ropes_are_drawn_around_the_model_that_is_named_and_its_figures_are_said(tried):
     lines, settings = tried("--model model.json --mass 0.2")
     assert "around that of the model: 0.905 m, 200 g" in lines[0]
-    assert any(line.startswith("in model: success ") for line in lines)
+    assert any(line.startswith("success, in the model: ") for line in lines)
     assert settings["world.length"] == pytest.approx(0.9, rel=0.02)

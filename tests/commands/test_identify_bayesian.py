@@ -107,12 +107,11 @@ def test_the_error_of_what_nobody_saw_is_said_to_be_unknown(capsys):
     values = {figure.name: figure.value for figure in figures}
     assert values["rmse_m"] == pytest.approx(np.sqrt((14 * 3**2 + 4 * 6**2) / 18))
     assert values["rmse_rad"] is None
-    settings = {"probability": {"sled": 1.0}, "scored_on": "what was fitted"}
-    result = Result(
-        "x", figures, settings, [0], None, 1.0, parameters=identify_report.drawn_rows(posterior)
-    )
-    identify_report.show(result)
-    assert f"error {values['rmse_m']:.3g} m, unknown rad;" in capsys.readouterr().out
+    settings = {"structure": "sled", "scored_on": "what was fitted", "doubts": []}
+    rows = identify_report.drawn_rows(posterior)
+    settings["summary"] = identify_report.summary_of_draws(figures, settings, rows)
+    identify_report.show(Result("x", figures, settings, [0], None, 1.0, parameters=rows))
+    assert f"within {values['rmse_m']:.4g} m and unknown (root" in capsys.readouterr().out
     horizon = identify_report.expected_errors(predicted, pieces, SLED)
     for name in ("horizon.error", "horizon.expected"):
         assert np.isfinite(horizon[name]).tolist() == [True] * 7 + [False]

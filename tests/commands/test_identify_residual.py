@@ -82,7 +82,7 @@ def test_what_became_of_the_correction_is_handed_over_and_told(recording, tmp_pa
     said = capsys.readouterr().out
     result = read_result(folder / "result.json")
     told = result.settings["correction"]
-    assert f"correction by a network {told['reason']}" in said
+    assert f"Correction by a network {told['reason']}" in said
     assert told["reason"].startswith("kept: " if told["kept"] else "dropped: ")
     assert set(told["held_out"]) < set(result.split["fitted"])
     figures = {figure.name: figure.value for figure in result.figures}

@@ -24,7 +24,7 @@ from synthetic_evidence import (
 
 VOID = {"meta", "br", "img", "input", "link", "base"}
 EVERY_SECTION = [
-    *("Results", "Motion", "Path of the tip", "Error against horizon", "Parameters"),
+    *("Results", "Path of the tip", "Error against horizon", "Parameters"),
     *("Learning", "Energy", "What was run"),
 ]
 
@@ -79,7 +79,7 @@ def report(tmp_path_factory):
         training(folder / "train"),
         evaluation(folder / "evaluate"),
     ]
-    return build_report(runs, folder / "report.html", "From recording to rest", ["A note."])
+    return build_report(runs, folder / "report.html", "From recording to rest")
 
 
 def test_the_page_tells_everything_in_order(report):
@@ -88,7 +88,8 @@ def test_the_page_tells_everything_in_order(report):
     for words in (
         "From recording to rest",
         "2 of 3 bars met",
-        "A note.",
+        "It swings as recorded. Trust it for 5 s.",
+        "A long warning",
         "0.0214",
         "✗ not met",
         "0.0704",
@@ -104,6 +105,16 @@ def test_the_page_tells_everything_in_order(report):
         "0123abc",
     ):
         assert words in page.text, words
+
+
+def test_the_page_opens_with_sentences_a_picture_and_folded_warnings(report):
+    text = report.read_text(encoding="utf-8")
+    marks = ('class="lead"', 'class="player"', "A long warning", ">Results<", "Parameters")
+    places = [text.index(mark) for mark in marks]
+    assert places == sorted(places)
+    notes = text.partition('<section class="notes">')[2].partition("</section>")[0]
+    assert notes.count('<details class="note"><summary>A long warning') == 4
+    assert "<summary>1 more</summary><details" in notes
 
 
 def test_the_page_loads_nothing(report):
@@ -133,7 +144,7 @@ def test_every_chart_is_one_that_plotly_accepts_with_units_on_its_axes(report):
 
 def test_the_same_files_give_the_same_page(report, tmp_path):
     runs = [report.parent / name for name in ("identify", "train", "evaluate")]
-    again = build_report(runs, tmp_path / "again.html", "From recording to rest", ["A note."])
+    again = build_report(runs, tmp_path / "again.html", "From recording to rest")
     assert again.read_bytes() == report.read_bytes()
 
 
@@ -145,7 +156,7 @@ ENERGIES = np.exp(-TIME)[None]
     ("arrays", "metrics", "result", "sections"),
     [
         ({}, [], {}, []),
-        ({"motion.time": TIME, "motion.x": POINTS}, [], {}, ["Motion", "Path of the tip"]),
+        ({"motion.time": TIME, "motion.x": POINTS}, [], {}, ["Path of the tip"]),
         ({"horizon.time": TIME, "horizon.x": TIME}, [], {}, ["Error against horizon"]),
         ({"energy.time": TIME, "energy.x": ENERGIES}, [], {}, ["Energy"]),
         ({}, [{"step": 0, "loss": 1.0}], {}, ["Learning"]),
@@ -209,13 +220,14 @@ def test_nobodys_text_becomes_markup(tmp_path):
     result = {
         "figures": [figure(EVIL, 1.0, EVIL, 2.0, seed_document=EVIL, rival=EVIL)],
         "parameters": [parameter(EVIL, 1.0, EVIL, EVIL, verdict=EVIL)],
-        "settings": {EVIL: EVIL},
+        "settings": {EVIL: EVIL, "summary": [EVIL]},
+        "warnings": [EVIL],
     }
     run = write_run(tmp_path / "run", EVIL, **result)
     write_evidence(run, arrays)
     write_metrics(run, [{"step": 0, f"{EVIL}loss": 1.0}])
     plain = build_report([write_run(tmp_path / "b", "b")], tmp_path / "b.html", "b")
-    page = page_of(build_report([run], tmp_path / "page.html", EVIL, [EVIL]))
+    page = page_of(build_report([run], tmp_path / "page.html", EVIL))
     assert "img" not in page.tags
     assert page.loads == []
     assert page.tags.count("script") - len(page.data) == page_of(plain).tags.count("script")
@@ -232,7 +244,7 @@ def test_a_rendering_is_embedded(tmp_path):
     run = write_run(tmp_path / "run", "one")
     (run / "rendering.webp").write_bytes(b"picture")
     page = page_of(build_report([run], tmp_path / "page.html", "One"))
-    assert page.headings[0] == "Motion"
+    assert page.headings == ["What was run"]  # the page opens with it
     assert page.loads == ["data:image/webp;base64,cGljdHVyZQ=="]
 
 
@@ -241,7 +253,7 @@ def test_pictures_of_the_run_that_the_page_is_about_are_embedded(tmp_path):
     for run in runs:
         (run / "ranks & <more>.png").write_bytes(run.name.encode())
     page = page_of(build_report(runs, tmp_path / "page.html", "One"))
-    assert page.headings[0] == "Pictures"
+    assert page.headings == ["What was run"]
     assert page.loads == ["data:image/png;base64,b25l"]
 
 

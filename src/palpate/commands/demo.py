@@ -44,8 +44,7 @@ def run(options: Demo) -> Path:
         wall_time_s=sum(result.wall_time_s for result in results),
     )
     write_json(out / RESULT, result.to_dict())
-    notes = results[-1].settings["notes"]
-    build_report([out, *stages], out / folders.REPORT, options.title, notes)
+    build_report([out, *stages], out / folders.REPORT, options.title)
     print("\n".join(["", *found.lines]))
     print(f"report: {out / folders.REPORT}")
     return out

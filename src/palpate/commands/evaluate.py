@@ -6,12 +6,13 @@ from pathlib import Path
 import jax
 
 from palpate.commands import folders
-from palpate.commands.train import figures_in_model, line_of, named_task
+from palpate.commands.train import figures_in_model, lines_of, named_task
 from palpate.errors import PalpateError
-from palpate.families.options import Evaluate
+from palpate.families.options import Evaluate, Found
 from palpate.models.files import load_model
 from palpate.models.model import Model
 from palpate.networks import CommandPolicy, load_policy
+from palpate.runs.figure_names import name_in_words, value_in_words
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import write_text
@@ -45,16 +46,26 @@ def run(options: Evaluate) -> Path:
             if model is not None:
                 inside = figures_in_model(task, model, policy, options.seed)
                 figures += inside
-                lines += map(line_of, inside)
+                lines += lines_of(inside)
             write_text(run.path / folders.TABLE, "\n".join(filter(None, lines)) + "\n")
-            settings = found.settings | {"notes": found.notes}
-            folders.finish(run, figures, settings, found.split)
+            settings = found.settings | {folders.SUMMARY: summary_of(found, about)}
+            folders.finish(run, figures, settings, found.split, warnings=[*found.notes])
         print((run.path / folders.TABLE).read_text(encoding="utf-8"), end="")
-        notes = read_result(run.path / RESULT).settings["notes"]
-        for note in notes:
+        for note in read_result(run.path / RESULT).warnings:
             print(f"note: {note}")
         title = f"What a controller does: {options.task}"
-        return folders.hand_over(options, run, title, notes=notes)
+        return folders.hand_over(options, run, title)
+
+
+def summary_of(found: Found, about: str) -> list[str]:
+    """How the policy did beside the others, by what is counted first, and where: two sentences."""
+    first, *others = found.figures
+    beside = [of for of in others if of.name.startswith(f"{first.name}.")]
+    against = [f"{name_in_words(of).split(', ')[-1]} {value_in_words(of)}" for of in beside]
+    said = f"{name_in_words(first)}: {value_in_words(first)} over {found.settings['trials']} trials"
+    said += f" ({', '.join(against)})" if against else ""
+    where = about or "; ".join(f"{what}: {of}" for what, of in found.split.items())
+    return [f"{sentence[0].upper()}{sentence[1:]}." for sentence in (said, where) if sentence]
 
 
 def check_model(policy: CommandPolicy, model: Model, task: Task, described: str) -> None:

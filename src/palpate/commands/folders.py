@@ -26,6 +26,9 @@ RECORDING, MODEL, PLAN, POLICY, REPORT, TABLE = (
     "report.html",
     "table.txt",
 )
+SUMMARY = (
+    "summary"  # in a result: what was found and how far to trust it, which its page opens with
+)
 DOUBTS = "doubts"  # in a result and in a model's file: why they are not to be trusted
 _FOR_A_PERSON = (REPORT, EVIDENCE, TABLE, *(f"rendering{suffix}" for suffix in RENDERINGS))
 _WHERE = ("out", "fresh")  # options that do not decide the outcome
@@ -126,9 +129,7 @@ def deliver(options: Options, run: Run, product: str) -> Path:
     return options.out
 
 
-def hand_over(
-    options: Options, run: Run, title: str, product: str | None = None, notes: Sequence[str] = ()
-) -> Path:
+def hand_over(options: Options, run: Run, title: str, product: str | None = None) -> Path:
     """Deliver the product of a finished run, write its report, and print where both are.
 
     Returns the path of the product, or of the run where there is none.
@@ -136,7 +137,7 @@ def hand_over(
     path = run.path
     report = run.path / REPORT
     if not report.exists() or report.stat().st_mtime < (run.path / RESULT).stat().st_mtime:
-        build_report([run.path], report, title, notes)
+        build_report([run.path], report, title)
     if product is not None:
         path = deliver(options, run, product)
         print(f"{Path(product).stem}: {path}")

@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.commands import folders, identify_report
 from palpate.commands.identify_data import Data, read
-from palpate.commands.identify_report import CORRECTION, FitReport
+from palpate.commands.identify_report import FitReport
 from palpate.errors import DoubtfulResultError, PalpateError
 from palpate.families.options import Hypotheses, Identify
 from palpate.identification.declarations import with_values_of
@@ -96,11 +96,8 @@ def run(options: Identify) -> Path:
         if options.arviz is not None:
             write_bytes(options.arviz, (run.path / NETCDF).read_bytes())
             print(f"for ArviZ: {options.arviz}")
-        notes = list(result.warnings)
-        if CORRECTION in result.settings:
-            notes.append(identify_report.describe_correction(result.settings[CORRECTION]))
         title = f"What was found out about the {options.family}"
-        written = folders.hand_over(options, run, title, product, notes)
+        written = folders.hand_over(options, run, title, product)
         if doubts := result.settings.get(folders.DOUBTS):
             raise DoubtfulResultError(f"{written} is not to be trusted: {doubts[0]}")
         return run.path
@@ -188,7 +185,8 @@ def _write_fit(
         "warnings": [*doubts, *found.warnings],
         "wall_time_s": wall_time,
     }
-    settings = report.settings() | {folders.DOUBTS: doubts}
+    summary = identify_report.summary_of_fit(report, figures, parameters, doubts)
+    settings = report.settings() | {folders.DOUBTS: doubts, folders.SUMMARY: summary}
     folders.finish(run, figures, settings, identify_report.split(data), **rows)
 
 
@@ -247,4 +245,5 @@ def _write_draws(
     meanings = options.meanings(posterior.models(), posterior.prior)
     parameters = [*identify_report.drawn_rows(posterior), *meanings]
     rows = {"parameters": parameters, "warnings": [*doubts, *found.warnings]}
+    settings[folders.SUMMARY] = identify_report.summary_of_draws(figures, settings, parameters)
     folders.finish(run, figures, settings, identify_report.split(data), **rows)

@@ -2,27 +2,30 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from palpate.commands import folders
 from palpate.commands.identify_data import Data
 from palpate.identification.data.prediction import PredictionError, or_nan, prediction_error
 from palpate.identification.data.segments import Segments, difference
 from palpate.identification.gradient.residual import Correction
 from palpate.identification.identify import Identified
 from palpate.identification.posterior.comparison import PIECE
-from palpate.identification.posterior.posterior import Posterior, spread_out
+from palpate.identification.posterior.posterior import MIXED, Posterior, spread_out
 from palpate.identification.posterior.predictive import Predicted, Score
-from palpate.identification.verdicts import verdict
+from palpate.identification.verdicts import uninformed, verdict
 from palpate.models.model import Model
 from palpate.parameters import describe, format_value
 from palpate.report.charts import quantiles
 from palpate.runs import Figure, Result
+from palpate.runs.figure_names import value_in_words
 
 LEVEL = 0.9
 PANELS, FAN = 6, 40  # numbers of an observation, and draws, that the page shows
+_START = "start model "
 CORRECTION = "correction"  # what the result's settings say of it
 UNITS = {"m": (100.0, "cm")}  # a person reads these errors of a fit in another unit
 
@@ -265,7 +268,7 @@ def _listed(value: Any) -> Any:
 def describe_correction(correction: Mapping[str, Any]) -> str:
     """The sentence for a person."""
     size = f"; it is {correction['size']:.1%} of what the physics changes in a control period"
-    return f"correction by a network {correction['reason']}{size if correction['kept'] else ''}"
+    return f"Correction by a network {correction['reason']}{size if correction['kept'] else ''}"
 
 
 # --- draws --------------------------------------------------------------------------------------
@@ -332,7 +335,7 @@ def expected_errors(predicted: Predicted, pieces: Segments, model: Model) -> dic
 
 
 def _rival(value: float, unit: str) -> str:
-    return f"start model {value:.3g} {unit}"
+    return f"{_START}{value:.3g} {unit}"
 
 
 def _known(value: float) -> float | None:
@@ -363,9 +366,8 @@ def show(result: Result) -> None:
             print(f"warning: {row['name']}: {row['verdict']}")
     for warning in result.warnings:
         print(f"warning: {warning}")
-    print(_scored_draws(result) if probability else _scored_fit(result))
-    if CORRECTION in settings:
-        print(describe_correction(settings[CORRECTION]))
+    for sentence in settings.get(folders.SUMMARY, []):
+        print(sentence)
 
 
 def _lines(row: dict[str, Any]) -> list[tuple[str, str, str, str]]:
@@ -387,7 +389,7 @@ def _lines(row: dict[str, Any]) -> list[tuple[str, str, str, str]]:
 
 def _interval(row: dict[str, Any]) -> str:
     """The interval of one value; of several, what is typical relative to their values."""
-    if str(row["verdict"]).startswith("not told by the data:"):
+    if uninformed(row["verdict"]):
         return "not told by the data"
     value, low, high = (np.ravel(row[key]) for key in ("value", "lower", "upper"))
     if low.size == 1 or (row["shared"] and np.ptp(low) <= 1e-6 * abs(low[0])):
@@ -396,32 +398,52 @@ def _interval(row: dict[str, Any]) -> str:
     return f"typically {below:+.0%} to {above:+.0%}"
 
 
-def _scored_fit(result: Result) -> str:
-    settings = result.settings
-    whole = isinstance(result.split, dict) and isinstance(result.split["validation"], str)
-    count, on = settings["scored_trials"], "the fitted trials" if whole else "validation"
-    if whole and count == 1:
-        on = "the fitted trial"
-    errors = ", ".join(
-        "unknown" if figure.value is None else f"{figure.value:.3f} {figure.unit}"
-        for figure in result.figures
-        if figure.name == f"l1_{figure.unit}"
+def summary_of_fit(
+    report: FitReport, figures: Sequence[Figure], rows: Sequence[dict[str, Any]], doubts: list[str]
+) -> list[str]:
+    """What a fit found, and how far to trust it: two sentences."""
+    settings = report.settings()
+    count, held_out = settings["scored_trials"], report.data.validation is not None
+    errors = [figure for figure in figures if figure.name == f"l1_{figure.unit}"]
+    said = " and ".join(map(value_in_words, errors))
+    before = " and ".join(str(figure.rival).removeprefix(_START) for figure in errors)
+    found = (
+        f"The model predicts {count} trial{'' if count == 1 else 's'} of "
+        f"{round(settings['scored_duration_s'], 1):g} s, which it was {'not ' if held_out else ''}"
+        f"fitted to, with a mean error of {said} ({before} before it was fitted)."
     )
-    return (
-        f"mean absolute error (L1) {errors} over {count} {'trial' if count == 1 else 'trials'} of "
-        f"{round(settings['scored_duration_s'], 1):g} s ({on})"
-    )
+    if CORRECTION in settings:
+        found += f" {describe_correction(settings[CORRECTION])}."
+    told = _told(rows)
+    if not held_out:
+        told += " No trial was held out, so the error on other motions is unknown."
+    return [found, _doubted(doubts) or told]
 
 
-def _scored_draws(result: Result) -> str:
-    values = {figure.name: figure for figure in result.figures}
-    errors = ", ".join(
-        f"{'unknown' if figure.value is None else f'{figure.value:.3g}'} {figure.unit}"
-        for name, figure in values.items()
-        if name.startswith("rmse_")
+def summary_of_draws(
+    figures: Sequence[Figure], settings: Mapping[str, Any], rows: Sequence[dict[str, Any]]
+) -> list[str]:
+    """What draws say, and how far to trust them: two sentences."""
+    errors = [figure for figure in figures if figure.name == f"rmse_{figure.unit}"]
+    known = {figure.name: figure for figure in figures}
+    inside, apart = known["coverage_90"], known["rhat_max_predictions"].value
+    found = (
+        f"Draws of the model ({settings['structure']}) predict {settings['scored_on']} {PIECE:g} s "
+        f"ahead within {' and '.join(map(value_in_words, errors))} (root mean square)."
     )
-    return (
-        f"predicted over {PIECE:g} s: root mean square error {errors}; 90 % intervals hold "
-        f"{values['coverage_90'].value or 0.0:.0%} of what was seen "
-        f"({result.settings['scored_on']})"
-    )
+    held = f"Its 90 % intervals hold {value_in_words(inside)} of what was seen. {_told(rows)}"
+    if apart is not None and apart >= MIXED:
+        held += f" Draw more: the chains do not agree yet (R-hat {apart:.3g})."
+    return [found, _doubted(settings[folders.DOUBTS]) or held]
+
+
+def _doubted(doubts: Sequence[str]) -> str:
+    return f"It is not to be trusted: {doubts[0]}." if doubts else ""
+
+
+def _told(rows: Sequence[dict[str, Any]]) -> str:
+    """Of how many free parameters the data tell something, and of which they tell nothing."""
+    free = [row for row in rows if not (row["fixed"] or row.get("derived"))]
+    left = [row["name"].replace("_", " ") for row in free if uninformed(row["verdict"])]
+    said = f"The data tell {len(free) - len(left)} of {len(free)} parameters"
+    return f"{said}; they say nothing of {', '.join(left)}." if left else f"{said}."

@@ -4,7 +4,7 @@ Nothing here knows the task but by its name: `options.prepare` does.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -22,6 +22,7 @@ from palpate.models.model import Model
 from palpate.networks import CommandPolicy, Controller, load_policy, save_controller
 from palpate.parameters import describe
 from palpate.runs import Figure, Run
+from palpate.runs.figure_names import name_in_words, value_in_words
 from palpate.runs.result import machine, read_result
 from palpate.runs.run import RESULT
 from palpate.tasks.task import Task
@@ -55,10 +56,11 @@ def run(options: Train) -> Path:
             figures = figures_in_model(task, model, policy, options.seed)
             figures += options.in_world(*load_policy(run.path / folders.POLICY))
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
-            folders.finish(run, figures, split=split, warnings=warnings_of(figures))
+            warnings = warnings_of(figures)
+            summary = {folders.SUMMARY: summary_of(figures, warnings)}
+            folders.finish(run, figures, summary, split, warnings=warnings)
         result = read_result(run.path / RESULT)
-        for figure in result.figures:
-            print(line_of(figure))
+        print("\n".join(lines_of(result.figures)))
         for warning in result.warnings:
             print(f"warning: {warning}")
         title = f"How a controller was trained for {options.task}"
@@ -153,10 +155,26 @@ def warnings_of(figures: Sequence[Figure]) -> list[str]:
     return []
 
 
-def line_of(figure: Figure) -> str:
-    """For a person."""
-    value = "none" if figure.value is None else f"{figure.value:.4g} {figure.unit}"
-    return f"{figure.name.replace('_', ' ').replace('.', ': ')} {value}".rstrip()
+def summary_of(figures: Sequence[Figure], warnings: Sequence[str]) -> list[str]:
+    """What was trained and how far to trust it: two sentences."""
+    known = {figure.name: figure for figure in figures}
+    inside, outside = known.get("in_model.success"), known.get("in_world.success_rate")
+    said, tried = [], "Nothing but that model was tried"
+    if inside is not None:
+        rate = value_in_words(inside)
+        said.append(
+            f"In the model it was trained in, the policy succeeds from {rate} of the starts"
+        )
+    if outside is not None:
+        tried = f"In a few trials in a simulated world it succeeds in {value_in_words(outside)}"
+    said.append(f"{tried}; it is not to be trusted yet" if warnings else tried)
+    return [f"{sentence}." for sentence in said]
+
+
+def lines_of(figures: Iterable[Figure]) -> list[str]:
+    """For a person: what never came is said once, not in each unit."""
+    lines = (f"{name_in_words(figure)}: {value_in_words(figure)}" for figure in figures)
+    return list(dict.fromkeys(lines))
 
 
 def constants(task: Task) -> dict[str, Any]:

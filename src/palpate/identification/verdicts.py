@@ -9,6 +9,8 @@ SHARE = (
     0.7  # of the prior's width: an interval that is as wide, about the prior's centre, says nothing
 )
 
+_UNINFORMED = "not told by the data:"
+
 
 def undecided(share: Any, shift: Any) -> Any:
     """Whether the data said next to nothing, by width and place of what is believed after them.
@@ -34,5 +36,10 @@ def verdict(undecided: Bool[np.ndarray, " elements"]) -> str | None:
     if count == 0:
         return None
     if count == undecided.size:
-        return "not told by the data: the interval is the prior's"
+        return f"{_UNINFORMED} the interval is the prior's"
     return f"not told by the data for {count} of {undecided.size} elements"
+
+
+def uninformed(verdict: str | None) -> bool:
+    """Whether a verdict says that the data told nothing of any element."""
+    return str(verdict).startswith(_UNINFORMED)

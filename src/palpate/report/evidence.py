@@ -36,6 +36,7 @@ from numpy.typing import ArrayLike
 
 from palpate.errors import PalpateError
 from palpate.family import places, resolve
+from palpate.identification.verdicts import uninformed
 from palpate.runs import Figure
 from palpate.runs.run import CONFIGURATION, ENVIRONMENT, METRICS, RESULT, read_metrics
 from palpate.runs.storage import DamagedFileError, read_json, write_bytes
@@ -107,14 +108,14 @@ class Parameter:
     @property
     def uninformed(self) -> bool:
         """Whether the data left all of it where the prior had it."""
-        return str(self.verdict).startswith("not told by the data:")
+        return uninformed(self.verdict)
 
 
 @dataclass(frozen=True)
 class Evidence:
     """All that a run's folder holds for a report; what is not there is empty or None.
 
-    `unit` is that of `horizon`; `prediction` is one motion beside what was observed; `pieces` are
+    `prediction` is one motion beside what was observed; `pieces` are
     the curves that families add, by name. `metrics` are the run's logged lines. `rendering` is a
     moving picture of the scene, `rendering.webp`, `.gif` or `.png`, where the machine could render
     one; `pictures` are all others that it drew, PNGs.
@@ -124,7 +125,6 @@ class Evidence:
     name: str
     motions: tuple[Motion, ...] = ()
     horizon: Curves | None = None
-    unit: str = "m"
     prediction: Curves | None = None
     pieces: dict[str, Curves] = field(default_factory=dict)
     parameters: tuple[Parameter, ...] = ()
@@ -135,6 +135,17 @@ class Evidence:
     result: dict[str, Any] = field(default_factory=dict)
     rendering: Path | None = None
     pictures: tuple[Path, ...] = ()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Those in the result; none where it has none."""
+        settings = self.result.get("settings")
+        return settings if isinstance(settings, dict) else {}
+
+    @property
+    def unit(self) -> str:
+        """Of `horizon`."""
+        return str(self.settings.get("observation_unit", "m"))
 
 
 def write_evidence(run: str | Path, arrays: Mapping[str, ArrayLike]) -> Path:
@@ -174,15 +185,12 @@ def read_evidence(run: str | Path) -> Evidence:
         raise PalpateError(f"{run} holds no run: expected {', '.join(known)} or some of them")
     motions, horizon, prediction, added = _arrays(run / EVIDENCE)
     result = _object(run / RESULT)
-    settings = result.get("settings")
-    unit = settings.get("observation_unit", "m") if isinstance(settings, dict) else "m"
     renderings = (run / f"rendering{suffix}" for suffix in RENDERINGS)
     return Evidence(
         path=run,
         name=str(result.get("name") or run.resolve().name),
         motions=motions,
         horizon=horizon,
-        unit=str(unit),
         prediction=prediction,
         pieces=added,
         parameters=tuple(_rows(run / RESULT, result, "parameters", _parameter)),

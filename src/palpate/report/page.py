@@ -9,7 +9,7 @@ import html
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.resources import files
 from itertools import chain
@@ -31,50 +31,42 @@ from palpate.report.evidence import (
 from palpate.report.parameter_chart import number, parameters
 from palpate.report.player import scene
 from palpate.report.style import STYLES, numbered
+from palpate.runs.figure_names import name_in_words, number_in_words, value_in_words
+from palpate.runs.result import Figure
 from palpate.runs.storage import write_text
 
 Section = tuple[str, str]  # title, HTML
 NAMED = 5  # stages that a page names; more are counted
+_OPEN_NOTES = 3
 _FEW = 4  # elements of a parameter that are told one by one
 _OBSERVED = "observed"  # the label that predictions are held against
 
 
-def build_report(
-    runs: Sequence[str | Path], out: str | Path, title: str, notes: Sequence[str] = ()
-) -> Path:
+def build_report(runs: Sequence[str | Path], out: str | Path, title: str) -> Path:
     """Write one page about `runs` (their folders, in the order to be told) to the file `out`.
 
-    A section appears where some run left evidence for it: results, pictures (of the first run,
-    which the page is about), motion, tip path, error against horizon, parameters, learning,
-    what families add, and what was run. `notes` are sentences shown on top.
-    The same files give the same page.
+    It opens with what the first run says of itself, the sentences in "summary" of its settings, and
+    a picture: pictures (of the first run, which the page is about), motion, or a prediction beside
+    what was observed, whichever there is first. Below them are warnings, then results, and what
+    else some run left evidence for: tip path, error against horizon, parameters, learning, what
+    families add, and what was run. The same files give the same page.
 
     Raises `PalpateError` for a folder without a run, a damaged file, or an `out` that is refused.
     """
     if not runs:
         raise PalpateError("a report needs at least one run: give the folder of one")
     found = [read_evidence(run) for run in runs]
-    body = "".join(_header(found, title, notes))
-    for index, (heading, content) in enumerate(_sections(found)):
+    opening, sections = _sections(found)
+    body = "".join(_header(found, title)) + opening + _notes(found)
+    for index, (heading, content) in enumerate(sections):
         body += f'<section id="section-{index}"><h2>{_text(heading)}</h2>{content}</section>\n'
     out = Path(out)
     write_text(out, _page(title, body))
     return out
 
 
-def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
-    """Every section that has evidence, in the order a reader asks."""
-    parts = (
-        ("Results", _results),
-        ("Pictures", lambda e, looks: _pictures(e) if e is found[0] else ""),
-        ("Motion", _motion),
-        ("Observed and predicted", _prediction),
-        ("Path of the tip", _tips),
-        ("Error against horizon", _horizon),
-        ("Parameters", _parameters),
-        ("Learning", _learning),
-        *((piece.heading, partial(_piece, name, piece)) for name, piece in pieces().items()),
-    )
+def _sections(found: Sequence[Evidence]) -> tuple[str, list[Section]]:
+    """The view that the page opens with, and every other section that has evidence, in order."""
     looks = []
     for evidence in found:
         curves = [
@@ -84,53 +76,92 @@ def _sections(found: Sequence[Evidence]) -> Iterator[Section]:
         ]
         labelled = (*(motion.chains for motion in evidence.motions), *(c.values for c in curves))
         looks.append(numbered(chain.from_iterable(labelled)))
-    for heading, part in parts:
-        contents = [(e.name, part(e, look)) for e, look in zip(found, looks, strict=True)]
-        contents = [(name, content) for name, content in contents if content]
-        if len(contents) > 1:
-            contents = [(name, f"<h3>{_text(name)}</h3>{content}") for name, content in contents]
-        if contents:
-            yield heading, "".join(content for _, content in contents)
-    yield "What was run", "".join(map(_provenance, found))
+
+    def sections(parts: Iterable[tuple[str, Callable[..., str]]]) -> Iterator[Section]:
+        for heading, part in parts:
+            contents = [(e.name, part(e, look)) for e, look in zip(found, looks, strict=True)]
+            contents = [(name, content) for name, content in contents if content]
+            if len(contents) > 1:
+                contents = [(name, f"<h3>{_text(name)}</h3>{inner}") for name, inner in contents]
+            if contents:
+                yield heading, "".join(content for _, content in contents)
+
+    views = (
+        ("Pictures", lambda e, looks: _pictures(e) if e is found[0] else ""),
+        ("Motion", _motion),
+        ("Observed and predicted", _prediction),
+    )
+    rest = (
+        ("Path of the tip", _tips),
+        ("Error against horizon", _horizon),
+        ("Parameters", _parameters),
+        ("Learning", _learning),
+        *((piece.heading, partial(_piece, name, piece)) for name, piece in pieces().items()),
+    )
+    (_, opening), *others = [*sections(views)] or [("", "")]
+    if opening:
+        opening = f'<section class="opening">{opening}</section>\n'
+    results = *sections([("Results", _results)]), *others, *sections(rest)
+    return opening, [*results, ("What was run", "".join(map(_provenance, found)))]
 
 
 # --- sections ---------------------------------------------------------------------------------
 
 
-def _header(found: Sequence[Evidence], title: str, notes: Sequence[str]) -> Iterator[str]:
+def _header(found: Sequence[Evidence], title: str) -> Iterator[str]:
     names = " → ".join(_text(evidence.name) for evidence in found[:NAMED])
     names += f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     dates = sorted(str(e.environment["date"])[:10] for e in found if "date" in e.environment)
     when = f", {_text(dates[-1])}" if dates else ""
     yield f"<header><h1>{_text(title)}</h1><p>{names}{when}</p>"
+    summary = " ".join(map(_text, _listed(found[0].settings, "summary")))
+    yield f'<p class="lead">{summary}</p>' if summary else ""
     figures = [figure for evidence in found for figure in evidence.figures]
     verdicts = [figure.met for figure in figures if figure.met is not None]
     if verdicts:
         spread = any(figure.spread is not None for figure in figures)
         yield f"<p><strong>{sum(verdicts)} of {len(verdicts)} bars met.</strong>"
         yield " ± is what other seeds are expected to change.</p>" if spread else "</p>"
-    yield "".join(f'<p class="note">{_text(note)}</p>' for note in notes) + "</header>\n"
+    yield "</header>\n"
+
+
+def _notes(found: Sequence[Evidence]) -> str:
+    """Warnings, one line each until it is opened; those beyond the first few are folded, too."""
+    notes = dict.fromkeys(chain.from_iterable(_listed(e.result, "warnings") for e in found))
+    lines = [f'<details class="note"><summary>{_text(note)}</summary></details>' for note in notes]
+    content = "".join(lines[:_OPEN_NOTES])
+    if rest := lines[_OPEN_NOTES:]:
+        content += f'<details class="note"><summary>{len(rest)} more</summary>'
+        content += "".join(rest) + "</details>"
+    return content and f'<section class="notes">{content}</section>\n'
+
+
+def _listed(document: Mapping[str, Any], key: str) -> list[str]:
+    found = document.get(key) or []
+    return [str(item) for item in found] if isinstance(found, list) else []
 
 
 def _results(evidence: Evidence, looks: dict[str, int]) -> str:
     rows = []
     for figure in evidence.figures:
         sign = "≤" if figure.better == "lower" else "≥"
-        value = f"<b>{_number(figure.value)}</b> {_text(figure.unit)}"
+        number, _, unit = _text(value_in_words(figure)).partition(" ")
+        value = f"<b>{number}</b> {unit}"
         if figure.spread is not None:
-            value += f" <small>± {figure.spread:.2g}</small>"
+            value += f" <small>± {number_in_words(figure, float(f'{figure.spread:.2g}'))}</small>"
         met = {True: "✓ met", False: "✗ not met", None: "–"}[figure.met]
         rows.append(
             (
-                f'<span title="{_text(figure.name)}">{_readable(figure.name)}</span>',
+                _text(name_in_words(figure)),
                 value,
-                "none" if figure.bar is None else f"{sign} {_number(figure.bar)}",
+                "none" if figure.bar is None else f"{sign} {number_in_words(figure, figure.bar)}",
                 f'<span class="{met[2:].replace(" ", "-")}">{met}</span>',
-                _number(figure.seed_document, "not printed"),
-                _number(figure.rival, "none"),
+                _known(figure, figure.seed_document, "not printed"),
+                _known(figure, figure.rival, "–"),
             )
         )
-    names = "", "value", "bar", "verdict", "seed document", "rival"
+    rows = list(dict.fromkeys(rows))  # what never came is said once, not in each unit
+    names = "", "value", "bar", "verdict", "seed document", "compared with"
     fields = "name", "value", "bar", "met", "seed_document", "rival"
     # What is empty in every row is left out: a user's own thing has no bar and no seed document.
     kept = [
@@ -139,6 +170,12 @@ def _results(evidence: Evidence, looks: dict[str, int]) -> str:
         if index < 2 or any(getattr(figure, field) is not None for figure in evidence.figures)
     ]
     return _table("results", [names[i] for i in kept], [[row[i] for i in kept] for row in rows])
+
+
+def _known(figure: Figure, value: int | float | str | None, missing: str) -> str:
+    if isinstance(value, int | float):
+        return number_in_words(figure, value)
+    return missing if value is None else _text(value)
 
 
 def _pictures(evidence: Evidence) -> str:
@@ -164,7 +201,8 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
         content += f'<div class="player">{_data(scene(evidence.motions, looks))}</div>'
     if evidence.rendering is not None:
         kind = RENDERINGS[evidence.rendering.suffix]
-        content += _caption("The same scene as its simulator renders it.")
+        rendered = "The same scene as its simulator renders it." if content else "What happened."
+        content += _caption(rendered)
         source = f"data:{kind};base64,{_encoded(evidence.rendering)}"
         content += f'<img alt="The scene in motion" src="{source}">'
     return content
@@ -189,11 +227,11 @@ def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
 
 
 def _prediction(evidence: Evidence, looks: dict[str, int]) -> str:
-    curves, settings = evidence.prediction, evidence.result.get("settings") or {}
+    curves = evidence.prediction
     if curves is None:
         return ""
     (count,) = {values.shape[1] for values in curves.values.values()}
-    names = [str(name) for name in settings.get("predicted", [])]
+    names = [str(name) for name in evidence.settings.get("predicted", [])]
     names += [f"number {index + 1}" for index in range(len(names), count)]
     fans = [label for label, values in curves.values.items() if values.shape[2] > 1]
     caption = "One motion, predicted from its first moment alone beside what was observed"
@@ -264,10 +302,11 @@ def _piece(name: str, piece: Piece, evidence: Evidence, looks: dict[str, int]) -
 def _provenance(evidence: Evidence) -> str:
     known = ("command", "date", "commit", "machine", "versions")
     shown = {name: evidence.environment[name] for name in known if name in evidence.environment}
-    for name in ("seeds", "split", "wall_time_s", "settings", *known):
+    for name in ("seeds", "split", "wall_time_s", *known):
         if name in evidence.result and name not in shown:
             shown[name] = evidence.result[name]
-    shown["configuration"] = evidence.configuration
+    # Settings hold what is in the configuration, too.
+    shown["settings"] = {**evidence.configuration, **evidence.settings}
     rows = ""
     for name, value in shown.items():
         if value not in (None, {}, []):
@@ -341,12 +380,6 @@ def _text(text: str) -> str:
 
 def _readable(name: str) -> str:
     return _text(name.replace("_", " ").replace(".", " · "))
-
-
-def _number(value: float | int | str | None, missing: str = "none") -> str:
-    if value is None:
-        return missing
-    return _text(value) if isinstance(value, str) else f"{value:.4g}"
 
 
 def _elements(values: np.ndarray) -> str:

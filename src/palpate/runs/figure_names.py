@@ -1,0 +1,53 @@
+"""What figures are called when a person reads them; `result.json` keeps their own names."""
+
+from palpate.runs.result import Figure
+
+# Of each part of a name ("in_model.success"), without the unit that it ends in ("time_to_1pct_s").
+NAMES = {
+    "l1": "mean error",
+    "l1_fitted_trials": "mean error on the trials it was fitted to",
+    "l1_physics": "mean error without the correction",
+    "l1_ratio_to_physics": "mean error as a share of that without the correction",
+    "correction_size": "size of the correction as a share of the physics",
+    "rmse": "error (root mean square)",
+    "rmse_at_end": "error at the end (root mean square)",
+    "tip_rmse": "error of the tip (root mean square)",
+    "tip_rmse_per_length": "error of the tip per length",
+    "coverage_90": "observations inside the 90 % intervals",
+    "log_score": "log score",
+    "rhat_max_predictions": "disagreement of the chains (R-hat; 1 is none)",
+    "ess_min": "effective draws, at least",
+    "wall_time": "time it took",
+    "success_rate": "success",
+    "reached_rate": "goal reached",
+    "time_to_1pct": "time to 1 % energy",
+    "settling_time": "time until at rest",
+    "settling": "time until at rest",
+    "lost_share": "frames in which it was lost",
+    "onnx_difference": "difference from the policy",
+}
+PLACES = {"in_model": "in the model", "in_world": "in a simulated world"}
+_SHARES = ("success", "coverage_90", "_rate", "_share")  # how the name of a percentage ends
+
+
+def name_in_words(figure: Figure) -> str:
+    """Its name as a person would say it: "time to 1 % energy, held still"."""
+    parts = [part.removesuffix(f"_{figure.unit}") for part in figure.name.split(".")]
+    known = next((part for part in parts if part in NAMES), None)
+    if known is None:
+        known = next(part for part in (*parts, parts[0]) if part not in PLACES)
+    others = [PLACES.get(part, part) for part in parts if part != known]
+    return ", ".join([NAMES.get(known, known), *others]).replace("_", " ")
+
+
+def value_in_words(figure: Figure) -> str:
+    """Its value with the unit: "1.21 s", "98 %"; "never" of a time that did not come."""
+    if figure.value is None:
+        return "never" if name_in_words(figure).startswith("time") else "unknown"
+    return f"{number_in_words(figure, figure.value)} {figure.unit}".rstrip()
+
+
+def number_in_words(figure: Figure, number: int | float) -> str:
+    """A number that is one of this figure's, such as its bar: four digits, or percent to three."""
+    share = not figure.unit and any(part.endswith(_SHARES) for part in figure.name.split("."))
+    return f"{100 * number:.3g} %" if share else f"{number:.4g}"

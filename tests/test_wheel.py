@@ -1,6 +1,7 @@
 """The wheel that users get works from an empty folder, without the source tree beside it."""
 
 import os
+import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -91,3 +92,62 @@ def test_command_line_helps_from_an_empty_folder(python, installed: Path) -> Non
     told = python(str(installed / "bin" / "palpate"), "--help")
     assert "usage: palpate" in told
     assert "identify" in told
+
+
+# The examples, each with the least work that it can be asked for; later ones take up what earlier
+# ones left in their folders.
+WORK = {
+    "01_rope_model": "trials=2, nodes=6, iterations=(1, 1, 1)",
+    "02_rope_controller": "model=out / '01_rope_model' / 'identified', iterations=2, batch=4, "
+    "starts=16, ropes=1",
+    "03_own_rope": "fit=(4, 4, 4), training={'iterations': 2, 'batch': 4, 'starts': 16}, ropes=1",
+    "04_own_model": "iterations=2, batch=4",
+    "05_furniture": "duration=4.0, method='metropolis', draws=20, chains=2",
+    "06_robot": "trained=out / '02_rope_controller' / 'trained', seconds=1.5",
+}
+TOLD = {  # among what the last of them says
+    "06_robot": ["the tip, 4.0 s ahead", "at rest in", "running", "braking", "the gripper moves"],
+    "04_own_model": ["inertia: 0.", "simulated with 0.8", "in model: angle"],
+    "03_own_rope": ["tried in MuJoCo ropes drawn around that of the model", "8 markers"],
+    "05_furniture": ["pushed with 60 N: x (m)", "to be moved: box"],
+}
+BRIEF = """
+import importlib
+from pathlib import Path
+
+from palpate.commands import train
+from palpate.families.rope import options
+from palpate.trials.rope import stabilization
+
+stabilization.TRIAL_PERIODS, options.RENDERED, train.EPISODES = 0.2, 0.1, 8
+out = Path("out")
+"""
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["01_rope_model", "02_rope_controller", "06_robot"],
+        ["04_own_model"],
+        pytest.param(["03_own_rope"], marks=pytest.mark.slow),
+        pytest.param(["05_furniture"], marks=pytest.mark.slow),
+    ],
+    ids=" ".join,
+)
+def test_examples_run_with_the_wheel_alone(python, tmp_path: Path, names: list[str]) -> None:
+    for file in (ROOT / "examples").glob("*.py"):
+        shutil.copy(file, tmp_path)
+    calls = [
+        f"importlib.import_module('{name}').main(out=out / '{name}', {WORK[name]})"
+        for name in names
+    ]
+    (tmp_path / "drive.py").write_text("\n".join([BRIEF, *calls]))
+    told = python("drive.py")
+    for word in TOLD[names[-1]]:
+        assert word in told
+
+
+def test_examples_are_short_and_each_is_run() -> None:
+    files = sorted((ROOT / "examples").glob("[0-9]*.py"))
+    assert [file.stem for file in files] == list(WORK)
+    assert max(len(file.read_text().splitlines()) for file in files) <= 100

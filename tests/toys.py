@@ -53,6 +53,17 @@ class Cart(Model):
         return CartState(*_at_last(observations, self.control_period))
 
 
+class TwoPoints(Cart):
+    """Two points, or what else their three numbers are in `units`."""
+
+    units: tuple[str, ...] = eqx.field(static=True, default=())
+    observation_shape = (2, 3)
+
+    @property
+    def observation_units(self):
+        return self.units
+
+
 class PendulumState(eqx.Module):
     """Angle from hanging (rad) and its rate (rad/s)."""
 

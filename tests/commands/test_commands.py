@@ -10,7 +10,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.commands import demo, folders, identify, identify_data, reproduce, train
-from palpate.commands.identify_report import FitReport
+from palpate.commands.identify_fit import FitReport
 from palpate.commands.options import Reproduce
 from palpate.errors import PalpateError
 from palpate.families.options import Identify, Train
@@ -32,7 +32,7 @@ from palpate.runs.run import read_metrics
 from palpate.runs.storage import read_json, write_json
 from palpate.trials.rope import stabilization
 from palpate.worlds.rope.rope import RopeWorld
-from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
+from toys import Cart, CartToOrigin, Pendulum, PendulumDamping, TwoPoints
 
 TRUTH = {"cart": Cart(mass=2.0, friction=0.3), "pendulum": Pendulum(length=0.7, damping=0.4)}
 START = {"cart": Cart(mass=1.0, friction=0.5), "pendulum": Pendulum(length=1.0, damping=0.2)}
@@ -117,7 +117,7 @@ def test_a_toy_is_identified_trained_for_and_reported(tmp_path, capsys):
     assert folder.name == f"identify-{name}-001"
     said = capsys.readouterr().out
     assert "90 % interval" in said
-    assert f"over 1 trial of {LASTS[name]} s (validation)" in said
+    assert f"predicts 1 trial of {LASTS[name]} s, which it was not fitted to" in said
     model, about = load_model(folder / folders.MODEL)
     result = read_result(folder / "result.json")
     unit = {"cart": "cm", "pendulum": "rad"}[name]
@@ -168,7 +168,7 @@ def test_a_toy_is_identified_trained_for_and_reported(tmp_path, capsys):
 def test_the_only_trial_is_fitted_and_said_to_be(tmp_path, capsys):
     recording = recorded("cart", tmp_path / "toy.npz", trials=1)
     folder = identify.run(IdentifyToy(recordings=(recording,), iterations=(1, 1, 1)))
-    assert "(the fitted trial)" in capsys.readouterr().out
+    assert "1 trial of 4 s, which it was fitted to" in capsys.readouterr().out
     assert "none" in read_json(folder / "result.json")["split"]["validation"]
 
 
@@ -198,7 +198,8 @@ def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap(tmp_path):
     data = identify_data.read(IdentifyToy(recordings=(file,)))
     metres, newtons = (
         FitReport(
-            START["cart"], error, error, error, error, dataclasses.replace(data, unit=unit), None
+            TwoPoints(1.0, 0.5, units=(unit,) * 3),
+            *(error, error, error, error, dataclasses.replace(data, unit=unit), None),
         ).evidence()
         for unit in ("m", "N")
     )

@@ -161,6 +161,16 @@ def test_looks_differ_without_colour_and_references_are_broad():
     looks = numbered(["predicted", "observed", "a", "predicted", "b"])
     assert looks == {"observed": 0, "predicted": 1, "a": 2, "b": 3}
     assert numbered("abcdefg")["g"] == 2
+    assert numbered(["identified", "start model", "a"]) == {
+        "identified": 1,
+        "start model": 2,
+        "a": 3,
+    }
+    assert numbered(["controlled", "held still", "true"]) == {
+        "controlled": 1,
+        "held still": 0,
+        "true": 2,
+    }
 
 
 def test_quantiles_leave_gaps_out():

@@ -6,7 +6,8 @@ from pathlib import Path
 import jax
 
 from palpate.commands import folders
-from palpate.commands.train import figures_in_model, lines_of, named_task
+from palpate.commands.in_model import tried_in_model
+from palpate.commands.train import lines_of, named_task
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate, Found
 from palpate.models.files import load_model
@@ -44,7 +45,7 @@ def run(options: Evaluate) -> Path:
             found = options.evaluate(policy, run, base)
             figures, lines = [*found.figures], [about, *found.lines]
             if model is not None:
-                inside = figures_in_model(task, model, policy, options.seed)
+                inside, _ = tried_in_model(task, model, policy, options.seed)
                 figures += inside
                 lines += lines_of(inside)
             write_text(run.path / folders.TABLE, "\n".join(filter(None, lines)) + "\n")

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.commands import folders, identify_report
+from palpate.commands import folders, identify_draws, identify_fit, identify_report
 from palpate.commands.identify_data import Data, read
-from palpate.commands.identify_report import FitReport
 from palpate.errors import DoubtfulResultError, PalpateError
 from palpate.families.options import Hypotheses, Identify
 from palpate.identification.declarations import with_values_of
@@ -163,15 +162,18 @@ def _write_fit(
         _correction(found.model, data, options, run) if options.residual else (None, 0.0)
     )
     wall_time = run.elapsed + earlier
-    report = FitReport.of(start, found.model, data, correction)
-    figures, parameters = report.figures(wall_time), identify_report.fitted_rows(found)
+    report = identify_fit.FitReport.of(start, found.model, data, correction)
+    figures, parameters = report.figures(wall_time), identify_fit.fitted_rows(found)
     doubts = _doubts(options, data, report.scored.mean_absolute)
+    summary = identify_fit.summary_of_fit(report, figures, parameters, doubts)
+    settings = report.settings() | {folders.DOUBTS: doubts, folders.SUMMARY: summary}
     save_model(
         run.path / folders.MODEL,
         report.delivered,
         {
             folders.DOUBTS: doubts,
             "recordings": dict(data.fitted.provenance),
+            "observed": settings["predicted"],
             "figures": {figure.name: figure.value for figure in figures},
             "parameters": [
                 {key: row[key] for key in ("name", "lower", "upper", "verdict")}
@@ -185,8 +187,6 @@ def _write_fit(
         "warnings": [*doubts, *found.warnings],
         "wall_time_s": wall_time,
     }
-    summary = identify_report.summary_of_fit(report, figures, parameters, doubts)
-    settings = report.settings() | {folders.DOUBTS: doubts, folders.SUMMARY: summary}
     folders.finish(run, figures, settings, identify_report.split(data), **rows)
 
 
@@ -225,8 +225,8 @@ def _write_draws(
     model = posterior.target.coordinates.reference
     pieces = cut_pieces(data.validation_aligned, model, *_cut(options))
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
-    evidence = identify_report.expected_errors(predicted, pieces, model)
-    evidence |= identify_report.drawn_motion(predicted, pieces, model)
+    evidence = identify_draws.expected_errors(predicted, pieces, model)
+    evidence |= identify_draws.drawn_motion(posterior, predicted, pieces)
     write_evidence(run.path, evidence)
     everything = np.ones(model.observation_shape[-1], bool)
     doubts = _doubts(options, data, score.pooled(everything))
@@ -241,9 +241,9 @@ def _write_draws(
         "observation_unit": identify_report.units_of(data.unit, model)[0],
         "predicted": identify_report.predicted_names(data, model),
     }
-    figures = identify_report.drawn_figures(posterior, score, model, run.elapsed, data.unit)
+    figures = identify_draws.drawn_figures(posterior, score, model, run.elapsed, data.unit)
     meanings = options.meanings(posterior.models(), posterior.prior)
-    parameters = [*identify_report.drawn_rows(posterior), *meanings]
+    parameters = [*identify_draws.drawn_rows(posterior), *meanings]
     rows = {"parameters": parameters, "warnings": [*doubts, *found.warnings]}
-    settings[folders.SUMMARY] = identify_report.summary_of_draws(figures, settings, parameters)
+    settings[folders.SUMMARY] = identify_draws.summary_of_draws(figures, settings, parameters)
     folders.finish(run, figures, settings, identify_report.split(data), **rows)

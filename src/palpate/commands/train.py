@@ -9,25 +9,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 from palpate.commands import folders
+from palpate.commands.in_model import EPISODES, tried_in_model
 from palpate.families.options import Train
 from palpate.family import find
-from palpate.learning import Training, simulate, train
+from palpate.learning import Training, train
 from palpate.models.files import load_model
 from palpate.models.model import Model
-from palpate.networks import CommandPolicy, Controller, load_policy, save_controller
+from palpate.networks import CommandPolicy, load_policy, save_controller
 from palpate.parameters import describe
+from palpate.report import write_evidence
 from palpate.runs import Figure, Run
 from palpate.runs.figure_names import name_in_words, value_in_words
 from palpate.runs.result import machine, read_result
 from palpate.runs.run import RESULT
 from palpate.tasks.task import Task
 
-EPISODES = 256  # from start states that were not trained on, for the figures
 POOR = 0.5  # share of successes below which a policy is warned of
 
 
@@ -53,12 +50,14 @@ def run(options: Train) -> Path:
             policy = trained(
                 task, model, training, options.seed, run, command=command, manifest=more
             )
-            figures = figures_in_model(task, model, policy, options.seed)
+            figures, evidence = tried_in_model(task, model, policy, options.seed)
+            write_evidence(run.path, evidence)
             figures += options.in_world(*load_policy(run.path / folders.POLICY))
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
             warnings = warnings_of(figures)
-            summary = {folders.SUMMARY: summary_of(figures, warnings)}
-            folders.finish(run, figures, summary, split, warnings=warnings)
+            shown = {folders.SUMMARY: summary_of(figures, warnings)}
+            shown["predicted"] = about.get("observed", [])
+            folders.finish(run, figures, shown, split, warnings=warnings)
         result = read_result(run.path / RESULT)
         print("\n".join(lines_of(result.figures)))
         for warning in result.warnings:
@@ -106,32 +105,6 @@ def settings(options: Train) -> Training:
     names = ("iterations", "batch", "starts", "observation_noise")
     asked = {name: getattr(options, name) for name in names}
     return Training(**{name: value for name, value in asked.items() if value is not None})
-
-
-def figures_in_model(task: Task, model: Model, policy: Controller, seed: int) -> list[Figure]:
-    """Means over episodes in the model, from start states of another seed than the training's.
-
-    They last twice as long as those trained on, for what has to stay as it is in the end.
-    An outcome that some episodes do not have is averaged over those that do.
-    """
-    key = jax.random.fold_in(jax.random.key(seed), 1)
-    steps = round(2 * task.duration / model.control_period)
-
-    @jax.jit
-    def outcome() -> dict[str, jax.Array]:
-        start = task.starts(model, key, EPISODES)
-        models = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (EPISODES, *leaf.shape)), model)
-        states, actions = simulate(task, models, policy, start, steps)
-        return task.outcome(models, start, states, actions)
-
-    figures = []
-    for name, values in outcome().items():
-        known = np.asarray(values)[np.isfinite(values)]
-        value = float(known.mean()) if known.size else None
-        better = "higher" if name == "success" else "lower"
-        unit = task.outcome_units.get(name, "")
-        figures.append(Figure(f"in_model.{name}", value, unit, better=better))
-    return figures
 
 
 def warnings_of(figures: Sequence[Figure]) -> list[str]:

@@ -59,6 +59,15 @@ class Model(eqx.Module):
     def observe(self, state: Any) -> Array:
         """What a sensor would show in this state."""
 
+    def drawing(self, observation: Array) -> dict[str, Array]:
+        """Lines that show an observation in space, by what they show; none where nothing would.
+
+        Points (*batch, points, 3) in m that are joined in their order, NaN between one line and
+        the next. What could be seen is called "", what the model believes of it by its name.
+        """
+        places = len(self.observation_shape) == 2 and self.observation_units == ("m", "m", "m")
+        return {"": observation} if places else {}
+
     def difference(self, predicted: Array, observed: Array) -> Array:
         """What separates two observations: predicted minus observed, angles the short way round."""
         return predicted - observed
@@ -123,6 +132,9 @@ class Wrapper(Model):
 
     def observe(self, state: Any) -> Array:
         return self.inner.observe(state)
+
+    def drawing(self, observation: Array) -> dict[str, Array]:
+        return self.inner.drawing(observation)
 
     def difference(self, predicted: Array, observed: Array) -> Array:
         return self.inner.difference(predicted, observed)

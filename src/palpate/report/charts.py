@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.report.evidence import Curves, Motion
+from palpate.report.evidence import Curves
 from palpate.report.style import STYLES
 
 Chart = dict[str, Any]
@@ -22,21 +22,6 @@ _BAND = 0.16  # opacity
 
 
 # --- the object -------------------------------------------------------------------------------
-
-
-def tip(motion: Motion, looks: Mapping[str, int], height: int) -> Chart:
-    """Each coordinate of a motion's last point over time, one panel an axis; metres, seconds."""
-    data, layout = [], empty_layout(height)
-    for row, axis in enumerate("xyz"):
-        for label, chain in motion.chains.items():
-            line = curve_line(label, looks, motion.time, chain[:, -1, row], "%{y:.3f} m")
-            data.append(line | _panel(row) | {"showlegend": row == 0})
-        top = 1.0 - row * 0.345
-        layout[f"yaxis{row + 1 if row else ''}"] = titled_axis(f"{axis} (m)") | {
-            "domain": [top - 0.31, top]
-        }
-    layout["xaxis"] = titled_axis("time (s)") | {"anchor": "y3"}
-    return {"data": data, "layout": layout}
 
 
 def horizon(curves: Curves, looks: Mapping[str, int], unit: str) -> Chart:
@@ -55,9 +40,11 @@ def horizon(curves: Curves, looks: Mapping[str, int], unit: str) -> Chart:
 def prediction(curves: Curves, looks: Mapping[str, int], names: Sequence[str]) -> Chart:
     """Predicted numbers over time, a panel for each; several lines of a label are a fan."""
     data, count = [], curves.values[next(iter(curves.values))].shape[1]
-    layout, height = empty_layout(90 + 200 * count), 1.0 / count
+    layout = empty_layout(100 + 120 * count)
+    # A fan beneath what is held against it, which it would hide.
+    ordered = sorted(curves.values.items(), key=lambda item: -item[1].shape[2])
     for row in range(count):
-        for label, values in curves.values.items():
+        for label, values in ordered:
             line = curve_line(label, looks, curves.time, values[:, row, 0], "%{y:.4g}")
             if values.shape[2] > 1:
                 every = max(1, math.ceil(values.shape[0] * values.shape[2] / (4 * _MOST_POINTS)))
@@ -69,12 +56,9 @@ def prediction(curves: Curves, looks: Mapping[str, int], names: Sequence[str]) -
                 line |= {"hoverinfo": "skip"}
                 del line["hovertemplate"]
             data.append(line | _panel(row) | {"showlegend": row == 0})
-        top = 1.0 - row * height
-        layout[f"yaxis{row + 1 if row else ''}"] = titled_axis(plain_text(names[row])) | {
-            "domain": [top - 0.86 * height, top]
-        }
+        _place_panel(layout, row, plain_text(names[row]), 1.0 - row / count, 1.0 / count)
     last = f"y{count}" if count > 1 else "y"
-    layout["xaxis"] = titled_axis("time since the prediction began (s)") | {"anchor": last}
+    layout["xaxis"] = titled_axis("time (s)") | {"anchor": last}
     return {"data": data, "layout": layout}
 
 
@@ -113,26 +97,22 @@ def learning(metrics: Sequence[Mapping[str, Any]]) -> Chart | None:
             data.append(raw | {"showlegend": False})
         line = curve_line(name, looks, steps[::every], smooth, "%{y:.4g}")
         data.append(line | {"line": line["line"] | {"dash": "solid"}} if index == 1 else line)
-    layout = empty_layout(300 + 110 * len(panels))
-    bottom = 1.0 - 190 / (220 + 110 * len(panels)) if panels else 0.0
+    layout = empty_layout(300 + 140 * len(panels))
+    share = 140 / (220 + 140 * len(panels))  # of one panel below the loss
+    bottom = share * len(panels)
     layout["yaxis"] = titled_axis("loss (as minimised)") | {
         "type": "log" if least > 0 else "linear",
         "exponentformat": "power",
         "tickfont": {"size": 11},
-        "domain": [bottom, 1.0],
+        "domain": [bottom + 0.2 * share * bool(panels), 1.0],
         "dtick": 1 if least > 0 and most / least > 100 else None,  # within two decades finer
     }
-    share = bottom / len(panels) if panels else 0.0
     for row, name in enumerate(panels, start=1):
         line = curve_line(name, {name: 3 + row}, steps, columns[name], "%{y:.4g}")
         line["line"] |= {"shape": "hv", "dash": "solid"}
         data.append(line | _panel(row) | {"showlegend": False})
-        top = bottom - (row - 1) * share
-        layout[f"yaxis{row + 1}"] = titled_axis(_PANELS[name]) | {
-            "domain": [top - share, top - 0.3 * share],
-            "rangemode": "tozero",
-            "nticks": 4,
-        }
+        _place_panel(layout, row, _PANELS[name], bottom - (row - 1) * share, share)
+        layout[f"yaxis{row + 1}"] |= {"rangemode": "tozero", "nticks": 4}
     last = f"y{len(panels) + 1}" if panels else "y"
     layout["xaxis"] = titled_axis("step") | {"anchor": last}
     if "horizon" in panels:
@@ -241,6 +221,12 @@ def titled_axis(title: str) -> dict[str, Any]:
 
 def _panel(row: int) -> dict[str, str]:
     return {"xaxis": "x", "yaxis": f"y{row + 1}" if row else "y"}
+
+
+def _place_panel(layout: dict[str, Any], row: int, title: str, top: float, height: float) -> None:
+    """The axis of panel `row` (0 is the first) from `top` down, of so much of the chart."""
+    domain = {"domain": [top - 0.82 * height, top]}
+    layout[f"yaxis{row + 1}" if row else "yaxis"] = titled_axis(title) | domain
 
 
 def note(text: str, **place: Any) -> dict[str, Any]:

@@ -5,6 +5,7 @@ HTML, cannot end a script element, and the page's own policy forbids every load.
 """
 
 import base64
+import dataclasses
 import html
 import json
 import math
@@ -22,7 +23,9 @@ from palpate.errors import PalpateError
 from palpate.report import charts
 from palpate.report.evidence import (
     RENDERINGS,
+    Curves,
     Evidence,
+    Motion,
     Parameter,
     Piece,
     pieces,
@@ -193,10 +196,11 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
     content = ""
     if evidence.motions:
         labels = list(dict.fromkeys(label for m in evidence.motions for label in m.chains))
-        caption = f"The object {' and '.join(filter(None, [', '.join(labels[:-1]), labels[-1]]))}"
+        caption = f"The motion: {', '.join(labels)}"
         if _OBSERVED in labels and len(labels) > 1:
-            caption += ": where the lines part, the prediction is wrong"
-        caption += "; the trail is the path of its tip. Drag to look from another side."
+            caption += "; where the lines part, the prediction is wrong"
+        caption += "; the trail is the path of its tip" * any(map(_tipped, evidence.motions))
+        caption += ". Drag to look from another side."
         content = _caption(caption)
         content += f'<div class="player">{_data(scene(evidence.motions, looks))}</div>'
     if evidence.rendering is not None:
@@ -208,9 +212,15 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
     return content
 
 
+def _tipped(motion: Motion) -> Motion | None:
+    """The chains of a motion whose last point is their tip; lines that a gap ends have none."""
+    chains = {of: p for of, p in motion.chains.items() if np.isfinite(p[:, -1]).any()}
+    return dataclasses.replace(motion, chains=chains) if chains else None
+
+
 def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
-    content, height = "", 400 if len(evidence.motions) == 1 else 300
-    for motion in evidence.motions:
+    content = ""
+    for motion in filter(None, map(_tipped, evidence.motions)):
         caption = "where the object's last point is over time"
         observed, distances = motion.chains.get(_OBSERVED), []
         for label, points in motion.chains.items():
@@ -222,7 +232,9 @@ def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
         if distances:
             caption += f"; root-mean-square distance from what was observed: {', '.join(distances)}"
         caption = f"{motion.group}: {caption}" if motion.group else caption[0].upper() + caption[1:]
-        content += _caption(f"{caption}.") + _chart(charts.tip(motion, looks, height))
+        tips = {label: points[:, -1, :, None] for label, points in motion.chains.items()}
+        chart = charts.prediction(Curves(motion.time, tips), looks, ("x (m)", "y (m)", "z (m)"))
+        content += _caption(f"{caption}.") + _chart(chart)
     return content
 
 
@@ -235,6 +247,8 @@ def _prediction(evidence: Evidence, looks: dict[str, int]) -> str:
     names += [f"number {index + 1}" for index in range(len(names), count)]
     fans = [label for label, values in curves.values.items() if values.shape[2] > 1]
     caption = "One motion, predicted from its first moment alone beside what was observed"
+    if _OBSERVED not in curves.values:
+        caption = f"One motion, {' and '.join(curves.values)}"
     caption += f"; each thin line is one of the {fans[0]}." if fans else "."
     return _caption(caption) + _chart(charts.prediction(curves, looks, names))
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from palpate.report.evidence import Motion
-from palpate.report.style import STYLES
+from palpate.report.style import FANS, STYLES
 
 _RATE = 50.0  # pictures a second; the player interpolates between them
 _MOST_FRAMES = 1000
@@ -35,7 +35,7 @@ def _group(motion: Motion, looks: Mapping[str, int]) -> dict[str, Any]:
     known = np.concatenate([*finite, [0.0] * (not any(map(np.size, finite)))])
     low, high = float(known.min()), float(known.max())
     step = max(high - low, 1e-6) / 65534
-    chains = []
+    chains, fan = [], any(label in FANS for label in motion.chains)
     for label, chain in motion.chains.items():
         scaled = np.round((chain[frames] - (low + high) / 2) / step)
         numbers = np.where(np.isfinite(scaled), scaled, _GAP).astype("<i2")
@@ -47,6 +47,8 @@ def _group(motion: Motion, looks: Mapping[str, int]) -> dict[str, Any]:
                 "dash": style.dash,
                 "width": style.width,
                 "points": chain.shape[1],
+                "lines": not np.isfinite(chain[:, -1]).any(),  # which a gap ends
+                "faint": fan and looks[label] > 0,  # one of many lines
                 "data": base64.b64encode(numbers.tobytes()).decode(),
             }
         )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from palpate.models.planar.checks import coupled
+from palpate.models.planar.drawing import drawing
 from palpate.models.planar.integration import advance
 from palpate.models.planar.links import allowed, turn
 from palpate.models.planar.parameters import PlanarParameters, PlanarState
@@ -68,6 +69,10 @@ class Planar(PlanarParameters):
     def observe(self, state: PlanarState) -> Float[Array, "*batch bodies 3"]:
         """Poses of the bodies."""
         return state.pose
+
+    def drawing(self, observation: Float[Array, "*batch bodies 3"]) -> dict[str, Array]:
+        """See `palpate.models.planar.drawing`."""
+        return drawing(self, observation)
 
     def difference(
         self,

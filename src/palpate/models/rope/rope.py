@@ -75,6 +75,9 @@ class Rope(RopeParameters):
         """Marker positions, m."""
         return state.position
 
+    def drawing(self, observation: Float[Array, "*batch nodes 3"]) -> dict[str, Array]:
+        return {"": observation}
+
     def initial_state(self, observations: Float[Array, "*batch frames nodes 3"]) -> RopeState:
         """The state at the last frame; velocity from the last two, zero with one frame."""
         position = observations[..., -1, :, :]

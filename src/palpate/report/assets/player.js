@@ -25,6 +25,7 @@
     group.low = [0, 1, 2].map((axis) => extreme(group, axis, Math.min));
     group.high = [0, 1, 2].map((axis) => extreme(group, axis, Math.max));
     group.centre = group.low.map((low, axis) => (low + group.high[axis]) / 2);
+    group.flat = group.high[2] - group.low[2] < 1e-6;
     group.radius = Math.max(Math.hypot(...group.low.map((low, axis) => group.high[axis] - low)) / 2, 1e-3);
     return group;
   }
@@ -92,6 +93,7 @@
 
     function choose(next) {
       group = next;
+      if (group.flat) [yaw, pitch] = [0, Math.PI / 2]; // from above
       slider.min = group.time[0];
       slider.max = group.time[group.time.length - 1];
       legend();
@@ -121,7 +123,7 @@
     // --- drawing
     function projection(column, columns, width, height) {
       const [sy, cy, sp, cp] = [Math.sin(yaw), Math.cos(yaw), Math.sin(pitch), Math.cos(pitch)];
-      const scale = Math.min(0.5 * width / columns, 0.56 * height) / group.radius;
+      const scale = Math.min(0.5 * width / columns, 0.47 * height) / group.radius;
       return (x, y, z) => {
         x -= group.centre[0]; y -= group.centre[1]; z -= group.centre[2];
         const [right, away] = [cy * x - sy * y, sy * x + cy * y];
@@ -215,7 +217,13 @@
     }
 
     function object(chain, project, now) {
-      const at = points(chain, now);
+      const at = points(chain, now), seen = at.map((point) => project(...point));
+      if (chain.lines) { // no chain with a tip, but outlines, or many of them
+        context.globalAlpha = chain.faint ? 0.35 : 1;
+        stroke(context, chain.faint ? { ...chain, dash: [], width: 1 } : chain, seen);
+        context.globalAlpha = 1;
+        return;
+      }
       context.globalAlpha = 0.18; // the shadow, which tells how high it hangs
       context.strokeStyle = variable("ink");
       context.lineWidth = 3;
@@ -238,7 +246,6 @@
       }
       context.globalAlpha = 1;
 
-      const seen = at.map((point) => project(...point));
       stroke(context, chain, seen);
       const every = Math.max(1, Math.round(seen.length / 12));
       seen.forEach(([x, y], i) => { if ((seen.length - 1 - i) % every === 0) marker(context, chain, x, y, chain.width > 3 ? 4 : 3); });

@@ -71,6 +71,14 @@ def test_every_command_explains_itself_and_takes_a_seed(words, capsys):
     assert "None" not in page  # a default that only a programmer understands
 
 
+@pytest.mark.parametrize("kind", ["furniture", "door.py:Door"])
+def test_options_that_cannot_apply_are_not_listed(kind, capsys):
+    assert main(["identify", kind, "--help"]) == 0
+    page = capsys.readouterr().out
+    assert "--rate" in page
+    assert not any(f"--{option} " in page for option in ("unit", "up", "topics", "driven"))
+
+
 def test_a_command_without_its_family_lists_those_there_are(capsys):
     assert main(["identify", "--help"]) == 0
     assert "palpate identify rope --help" in capsys.readouterr().out

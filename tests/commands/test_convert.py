@@ -39,6 +39,7 @@ def test_a_log_becomes_a_recording(log, tmp_path, capsys):
     assert list(trial.channels) == ["markers", "gripper"]
     np.testing.assert_array_equal(trial["markers"].values, CHAIN)
     assert "is there already" in refused(capsys, log, "--out", out)
+    assert "cannot write" in refused(capsys, log, "--out", out / "within.npz")
     words = [str(log), "--out", str(out), "--fresh", "--topics", MARKERS]
     assert main(["convert", *words]) == 0
     assert list(read_recording(out).trials[0].channels) == ["markers"]

@@ -57,6 +57,16 @@ def test_out_is_a_folder_or_the_file_that_is_wanted(tmp_path):
         folders.open_run(Options(out=tmp_path / "model.json"), "work", {})
 
 
+def test_an_out_that_cannot_be_written_is_refused_before_the_work(tmp_path):
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file" / "model.json", tmp_path / "file" / "deeper" / "model.json"):
+        with pytest.raises(PalpateError, match=r"cannot write .*model\.json: Not a directory"):
+            folders.open_run(Options(out=out), "work", {}, folders.MODEL)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    with folders.open_run(Options(out=tmp_path / "new" / "model.json"), "work", {}, folders.MODEL):
+        assert not (tmp_path / "new").exists()  # it is only tried
+
+
 def test_an_input_that_changes_is_another_configuration(tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(b"one")

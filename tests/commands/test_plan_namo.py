@@ -75,6 +75,7 @@ def test_what_stands_beside_a_map_decides_whether_a_plan_is_another(tmp_path):
 def test_what_was_refused_can_be_asked_again_in_the_same_folder(tmp_path, map_file, wrong, says):
     with pytest.raises(PalpateError, match=says):
         run(PlanNamo(map=map_file, out=tmp_path / "out", **wrong))
+    assert not (tmp_path / "out").exists()
     assert read_plan(run(PlanNamo(map=map_file, out=tmp_path / "out"))).transfers == 1
 
 

@@ -77,7 +77,10 @@ def test_a_run_that_is_refused_before_it_wrote_anything_leaves_no_trace(tmp_path
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(PalpateError, match="no way"), Run.open(tmp_path, CONFIGURATION):
         raise PalpateError("no way")
-    assert not (tmp_path / "configuration.json").exists()
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]  # and no lock
+    with pytest.raises(PalpateError, match="no way"), Run.open(tmp_path / "a/b", CONFIGURATION):
+        raise PalpateError("no way")
+    assert not (tmp_path / "a").exists()
     with Run.open(tmp_path, {"seed": 7}):
         pass  # it may be of use to whoever goes on
     with pytest.raises(PalpateError, match="no way"), Run.open(tmp_path, {"seed": 7}):

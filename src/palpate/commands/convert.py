@@ -7,6 +7,7 @@ from palpate.errors import PalpateError
 from palpate.recordings.files import read_recording, write_recording
 from palpate.recordings.lerobot import INFO, write_lerobot
 from palpate.recordings.rerun import write_rerun
+from palpate.runs.storage import check_writable
 
 FILES = {".npz": write_recording, ".rrd": write_rerun}
 
@@ -61,4 +62,6 @@ def _checked(options: Convert) -> Path:
         raise PalpateError(
             f"{out} is something else, which --fresh would remove: give another --out"
         )
+    if not options.lerobot:
+        check_writable(out)
     return out

@@ -9,7 +9,7 @@ from palpate.deployment.onnx_export import difference, write_onnx
 from palpate.errors import PalpateError
 from palpate.networks import load_policy
 from palpate.runs import Figure
-from palpate.runs.storage import write_bytes
+from palpate.runs.storage import check_writable, write_bytes
 
 AGREES = 5e-6  # of the limit of a command
 STEPS = 50  # of 64 episodes each, through which the file is compared
@@ -28,6 +28,7 @@ def run(options: Export) -> Path:
         raise PalpateError(f"--onnx {target} has to end in .onnx")
     if beside.exists():
         _check_contract(beside)
+    check_writable(target)
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_policy(file)
     with folders.begin(options, "export", {"policy": file}) as run:

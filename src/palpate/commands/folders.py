@@ -15,7 +15,7 @@ from palpate.report import build_report
 from palpate.report.evidence import EVIDENCE, RENDERINGS
 from palpate.runs import Figure, Result, Run
 from palpate.runs.run import CONFIGURATION, ENVIRONMENT, RESULT
-from palpate.runs.storage import plain, read_json, write_bytes
+from palpate.runs.storage import check_writable, plain, read_json, write_bytes
 
 RUNS = Path("runs")
 RECORDING, MODEL, PLAN, POLICY, REPORT, TABLE = (
@@ -72,8 +72,8 @@ def open_run(
     newest that has this configuration and was not finished, else a new one. `product` is the file
     in it that `deliver` copies if `out` is a file.
 
-    Raises `PalpateError` for an `out` that is neither a folder nor a file of the product's kind,
-    and as `Run.open`.
+    Raises `PalpateError` for an `out` that is neither a folder nor a file of the product's kind, or
+    that cannot be written, and as `Run.open`.
     """
     if options.out is not None and not _is_file(options.out, product):
         again = options.fresh and (options.out / CONFIGURATION).exists()
@@ -81,6 +81,8 @@ def open_run(
         if again:
             _remove(run.path, (product, *_FOR_A_PERSON) if product else _FOR_A_PERSON)
         return run
+    if options.out is not None:
+        check_writable(options.out)
     numbered = sorted(_numbered(name))
     if not options.fresh:
         asked = plain(configuration, "configuration")

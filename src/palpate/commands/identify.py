@@ -35,7 +35,7 @@ from palpate.report import write_evidence
 from palpate.runs import Run
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
-from palpate.runs.storage import write_bytes
+from palpate.runs.storage import check_writable, write_bytes
 
 DRAWS, NETCDF = "posterior.npz", "posterior.nc"
 RESIDUAL = "residual"  # the folder of its run
@@ -118,6 +118,8 @@ def _check(options: Identify) -> None:
         )
     if options.arviz is not None and importlib.util.find_spec("arviz") is None:
         raise PalpateError("--arviz needs the extra 'bayes': pip install 'palpate[bayes]'")
+    if options.arviz is not None:
+        check_writable(options.arviz)
 
 
 def _begun(model: Model, options: Identify) -> Model:

@@ -71,9 +71,7 @@ def _unit(recording: Recording, observed: tuple[str, ...]) -> str:
 
 
 def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
-    how = {"rate": options.rate, "unit": options.unit, "up": options.up}
-    what = {"topics": options.topics or (), "columns": options.columns}
-    return join([read_recording(path, **what, **how) for path in paths])
+    return join([read_recording(path, **options.reading()) for path in paths])
 
 
 def _prepared(recording: Recording, options: Identify, where: str) -> Recording:

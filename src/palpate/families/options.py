@@ -95,11 +95,17 @@ class Track(Options, ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading(Options):
-    """What recordings that others have made do not say themselves."""
+class Timing(Options):
+    """When the frames of a recording were taken, where it does not say so itself."""
 
     rate: Number = None
     """Hz, for files that carry no time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading(Timing):
+    """What recordings of markers that others have made do not say themselves."""
+
     unit: Annotated[
         Literal["m", "cm", "mm"] | None,
         arg(metavar="{m,cm,mm}", help_behavior_hint="(default: what the file says, else m)"),
@@ -136,7 +142,7 @@ Method = Literal[
 
 
 @dataclass(frozen=True, kw_only=True)
-class Identify(Reading, ABC):
+class Identify(Timing, ABC):
     """Identification from recordings; each family says which channels, and which models."""
 
     family: ClassVar[str]
@@ -193,10 +199,9 @@ class Identify(Reading, ABC):
         """The channels that are predicted, side by side."""
         return (self.observation,)
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Of a CSV file, by name, where it holds no markers."""
-        return ()
+    def reading(self) -> dict[str, Any]:
+        """Options of `palpate.recordings.files.read_recording`."""
+        return {"rate": self.rate}
 
     @property
     def fits(self) -> bool:

@@ -26,7 +26,7 @@ import re
 import shlex
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
@@ -63,9 +63,15 @@ class Run:
     """
 
     def __init__(
-        self, path: Path, configuration: dict[str, Any], lock: TextIO, before: set[str] | None
+        self,
+        path: Path,
+        configuration: dict[str, Any],
+        lock: TextIO,
+        before: set[str] | None,
+        made: Sequence[Path] = (),
     ):
         self.path = path
+        self._made = made  # for it by this process: its lock, folders, innermost first
         self.configuration = configuration
         self._lock = lock
         self._before = before  # names in the folder when this process began the run in it
@@ -93,6 +99,7 @@ class Run:
         """
         path = Path(path)
         asked = plain(configuration, "configuration")
+        made = [one for one in (path / _LOCK, path, *path.parents) if not one.exists()]
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -137,7 +144,7 @@ class Run:
         except BaseException:
             lock.close()
             raise
-        return cls(path, asked, lock, before)
+        return cls(path, asked, lock, before, made)
 
     def __enter__(self) -> "Run":
         return self
@@ -146,6 +153,9 @@ class Run:
         refused = kind is not None and issubclass(kind, PalpateError)
         if refused and self._before is not None and _names(self.path) <= self._before | _BEGUN:
             _remove_run(self.path)
+            with contextlib.suppress(OSError):  # something of somebody else's is in it by now
+                for one in self._made:
+                    one.rmdir() if one.is_dir() else one.unlink()
         self.close()
 
     def close(self) -> None:

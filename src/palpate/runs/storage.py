@@ -5,9 +5,11 @@ renamed over it, so that a reader finds the old content or the new, whatever kil
 """
 
 import dataclasses
+import errno
 import json
 import math
 import os
+import tempfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -55,6 +57,18 @@ def write_bytes(path: str | Path, data: bytes) -> None:
                 os.fsync(folder)
             finally:
                 os.close(folder)
+    except OSError as error:
+        raise PalpateError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def check_writable(path: Path) -> None:
+    """Raise `PalpateError` unless `write_bytes` could put a file at `path`; nothing is left there."""
+    above = next(one for one in path.absolute().parents if one.exists())
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        with tempfile.TemporaryFile(dir=above):
+            pass
     except OSError as error:
         raise PalpateError(f"cannot write {path}: {error.strerror or error}") from error
 

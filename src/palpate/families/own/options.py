@@ -54,9 +54,8 @@ class IdentifyOwnModel(Identify):
     def observed(self) -> tuple[str, ...]:
         return self.observe
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        return (*self.observe, *self.act)
+    def reading(self) -> dict[str, Any]:
+        return {**super().reading(), "columns": (*self.observe, *self.act)}
 
     def check(self) -> None:
         start_of(self._kind(), 1.0)

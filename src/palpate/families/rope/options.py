@@ -16,6 +16,7 @@ from palpate.families.options import (
     Found,
     Identify,
     Number,
+    Reading,
     Record,
     Track,
     Tracked,
@@ -108,7 +109,7 @@ class TrackRope(Track):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IdentifyRope(Identify):
+class IdentifyRope(Identify, Reading):
     """Identify a rope: stiffness, damping and drag from recorded markers.
 
     A recording of `palpate record` says itself how the gripper moved. In any other, one or more
@@ -145,6 +146,10 @@ class IdentifyRope(Identify):
         int | None, arg(metavar="N", help_behavior_hint="(default: of about 1 ms)")
     ] = None
     """Steps of the model in a control period; few are fast and bound the stiffness."""
+
+    def reading(self) -> dict[str, Any]:
+        topics = self.topics or ()
+        return {**super().reading(), "unit": self.unit, "up": self.up, "topics": topics}
 
     def prepare(self, recording: Recording) -> Recording:
         """Keep the markers that are nodes, and make those that are gripped a driven channel."""

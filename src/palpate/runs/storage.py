@@ -62,7 +62,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise `PalpateError` unless `write_bytes` could put a file at `path`; nothing is left there."""
+    """Raise `PalpateError` unless `write_bytes` could put a file at `path`; nothing stays there."""
     above = next(one for one in path.absolute().parents if one.exists())
     try:
         if path.is_dir():

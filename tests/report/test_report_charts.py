@@ -166,10 +166,8 @@ def test_looks_differ_without_colour_and_references_are_broad():
         "start model": 2,
         "a": 3,
     }
-    assert numbered(["controlled", "held still", "true"]) == {
-        "controlled": 1,
-        "held still": 0,
-        "true": 2,
+    assert numbered(["true", "controlled", "held still", "swing damper"]) == {
+        **{"true": 0, "controlled": 1, "held still": 2, "swing damper": 3}
     }
 
 

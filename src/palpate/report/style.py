@@ -30,7 +30,7 @@ class Style:
 
 
 # The first is drawn broad and pale beneath the others, so that what agrees with it can be seen. It
-# is kept for what the others are held against.
+# is kept for what was seen.
 STYLES = (
     Style("#8a94a0", "#8d97a4", (), "circle", "o", 5.0),
     Style("#0062a8", "#5cb8f0", (9, 4), "diamond", "D", 2.0),
@@ -39,30 +39,25 @@ STYLES = (
     Style("#98447b", "#e3a0c9", (16, 5), "cross", "P", 2.0),
     Style("#7a5c00", "#e2cc55", (2, 4), "x", "X", 2.0),
 )
-# What has the same look on every chart: what is held against, what was found, what was before it.
+# What has the same look on every chart: what was seen, what was found, and what is without it.
 _ROLES = {
-    **dict.fromkeys(("observed", "true", "held still", "left alone"), 0),
+    **dict.fromkeys(("observed", "true"), 0),
     **dict.fromkeys(("predicted", "identified", "controlled", "draws", "tracked", "error"), 1),
-    **dict.fromkeys(("start model", "expected"), 2),
+    **dict.fromkeys(("start model", "expected", "held still", "left alone"), 2),
     "physics alone": 3,
 }
 FANS = ("draws",)  # of which there are many lines
 
 
 def numbered(labels: Iterable[str]) -> dict[str, int]:
-    """The index into `STYLES` of each label: that of its role, else one that is left.
+    """The index into `STYLES` of each label: that of its role, else one that is left, never 0.
 
     Those are taken in order of first appearance, and anew where there are more. One mapping for
-    all charts of a run keeps a label's look; a reference that is not the first one there (0) is as
-    any other.
+    all charts of a run keeps a label's look.
     """
     distinct = list(dict.fromkeys(labels))
-    looks: dict[str, int] = {}
-    for label in distinct:
-        look = _ROLES.get(label)
-        if look is not None and not (look == 0 and 0 in looks.values()):
-            looks[label] = look
-    left = [index for index in range(1, len(STYLES)) if index not in looks.values()]
+    looks = {label: _ROLES[label] for label in distinct if label in _ROLES}
+    every = range(1, len(STYLES))
+    left = [index for index in every if index not in looks.values()] or list(every)
     others = [label for label in distinct if label not in looks]
-    left = left or list(range(1, len(STYLES)))
     return looks | {label: left[index % len(left)] for index, label in enumerate(others)}

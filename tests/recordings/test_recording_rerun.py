@@ -79,6 +79,21 @@ def test_clouds_and_images_are_drawn_when_they_were_taken(tmp_path):
     assert any("DepthImage:buffer" in batch for batch in chunks(tmp_path / "r.rrd", "/depth"))
 
 
+def test_a_viewer_plays_from_the_start_and_ends_with_something_in_view(tmp_path):
+    from rerun.blueprint.components import PlayState
+    from rerun.chunk import RrdReader
+
+    write_rerun(tmp_path / "r.rrd", sample())
+    reader = RrdReader(tmp_path / "r.rrd")
+    (blueprint,) = reader.blueprints()
+    found = [c for c in reader.store(store=blueprint).stream() if c.entity_path == "/time_panel"]
+    told = {k: v for chunk in found for k, v in chunk.to_record_batch().to_pydict().items()}
+    assert told["TimePanelBlueprint:play_state"] == [[PlayState.Playing.value]]
+    assert told["TimePanelBlueprint:timeline"] == [["time"]]
+    cleared = [b["time"] for b in chunks(tmp_path / "r.rrd", "/markers") if len(b["time"]) == 1]
+    np.testing.assert_allclose(cleared, [[TIME[-1] - TIME[0]]], atol=1e-6)  # between the two trials
+
+
 def test_a_file_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(PalpateError, match=r"cannot write .*r\.rrd"):

@@ -21,7 +21,7 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
     Trials follow one another on the timeline "time", half a second apart. A channel of points, in
     metres, is an entity of 3D points that has its name; what was not seen is not drawn. Any other
     channel is a plot. Events are clouds of points, if (points, 3) in metres, or images. The entity
-    "trial" says which trial runs.
+    "trial" says which trial runs. A viewer plays it from its start.
 
     Raises `PalpateError` when rerun-sdk is missing or the file cannot be written.
     """
@@ -29,6 +29,9 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
     stream = rerun.RecordingStream("palpate")
     memory = stream.memory_recording()
     stream.set_log_time_enabled(False)  # when the file was written is of no interest
+    # A viewer would follow a recording to its end: this one plays, from the start, again and again.
+    panel = rerun.blueprint.TimePanel(timeline=TIMELINE, play_state="playing", loop_mode="all")
+    stream.send_blueprint(rerun.blueprint.Blueprint(panel, auto_layout=True, auto_views=True))
     stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for part in recording.trials[0].parts:
         if _is_points(part):
@@ -43,11 +46,11 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
             for time, array in zip(events.time - trial.start + begin, events.values, strict=True):
                 stream.set_time(TIMELINE, duration=time)
                 stream.log(_entity(events), _drawn(events, array))
-        begin += trial.duration
-        stream.set_time(TIMELINE, duration=begin)
-        for part in trial.parts:
-            stream.log(_entity(part), rerun.Clear(recursive=False))
-        begin += PAUSE
+        begin += trial.duration + PAUSE
+        if trial is not recording.trials[-1]:  # the last stays in view
+            stream.set_time(TIMELINE, duration=begin - PAUSE)
+            for part in trial.parts:
+                stream.log(_entity(part), rerun.Clear(recursive=False))
     write_bytes(path, memory.drain_as_bytes())
 
 

@@ -218,7 +218,7 @@ class EvaluatePendulumDamping(Evaluate):
         lengths = np.random.default_rng(self.seed).uniform(0.6, 0.8, self.pendulums)
         return [SwingTrial(seed, float(length)) for seed, length in enumerate(lengths)]
 
-    def controllers(self, policy: Any, base: None) -> dict[str, Controller]:
+    def controllers(self, policy: Any, manifest: Any, base: None) -> dict[str, Controller]:
         return {"controlled": Damper(policy), "held still": HeldStill()}
 
     def show(self, run: Run, trials: Any, evaluated: Mapping[str, Swings]) -> None:

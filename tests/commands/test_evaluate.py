@@ -7,8 +7,8 @@ import pytest
 from deployed import rope_policy
 from palpate.cli import main
 from palpate.commands import train
-from palpate.families.rope import options as rope_options
-from palpate.families.rope.options import EvaluateRopeStabilization
+from palpate.families.rope import control_options as rope_options
+from palpate.families.rope.control_options import EvaluateRopeStabilization
 from palpate.models.files import save_model
 from palpate.models.rope import Rope
 from palpate.networks import Channel, CommandPolicy, save_controller

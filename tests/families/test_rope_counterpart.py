@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from deployed import rope_policy
 from palpate.errors import PalpateError
+from palpate.families.rope.control_options import EvaluateRopeStabilization, TrainRopeStabilization
 from palpate.families.rope.counterpart import (
     adapted,
     counterpart,
@@ -18,7 +19,6 @@ from palpate.families.rope.counterpart import (
     rope_for,
     with_markers,
 )
-from palpate.families.rope.options import EvaluateRopeStabilization, TrainRopeStabilization
 from palpate.families.rope.recording import record_rope
 from palpate.families.rope.robot import servoed
 from palpate.models.model import rollout

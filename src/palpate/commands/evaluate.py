@@ -42,7 +42,7 @@ def run(options: Evaluate) -> Path:
     options.check(policy, base)
     with folders.begin(options, f"evaluate {options.task}", inputs) as run:
         if not run.finished:
-            found = options.evaluate(policy, run, base)
+            found = options.evaluate(policy, manifest, run, base)
             figures, lines = [*found.figures], [about, *found.lines]
             if model is not None:
                 inside, _ = tried_in_model(task, model, policy, options.seed)

@@ -38,6 +38,7 @@ def run(options: Train) -> Path:
     model, about = load_model(file)
     for doubt in about.get(folders.DOUBTS, []):
         print(f"warning: {file} is not to be trusted: {doubt}", flush=True)
+    options = options.completed(about)
     model = options.prepare(model)
     training = settings(options)
     words = f"train {options.task}"

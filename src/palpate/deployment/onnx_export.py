@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from palpate.errors import extra_module
+from palpate.errors import PalpateError, extra_module
 from palpate.networks import Channel, CommandPolicy
 from palpate.runs.storage import write_bytes
 
@@ -75,6 +75,35 @@ def write_onnx(path: str | Path, policy: CommandPolicy) -> None:
     write_bytes(path, onnx_model(policy).SerializeToString(deterministic=True))
 
 
+class OnnxNetwork:
+    """An exported file that decides as the policy does it was made of.
+
+    Raises `PalpateError` for a file that is none of such a policy, and without the extra `deploy`.
+    """
+
+    def __init__(self, path: str | Path, policy: CommandPolicy):
+        runtime = extra_module("onnxruntime", EXTRA)
+        self._shape = (1, *policy.action_shape)
+        try:
+            self._session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+            self(np.zeros(policy.mean.shape, np.float32), np.zeros(self._shape, np.float32))
+        except Exception as error:  # ONNX Runtime has a class for each kind of failure
+            raise PalpateError(
+                f"{path} cannot decide for this policy: expected what `palpate export` makes of it "
+                f"({' '.join(str(error).split())})"
+            ) from error
+
+    def run(self, features: np.ndarray, carry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Commands and the next carry, (batch, *action_shape), of features (batch, features)."""
+        given = {"features": features, "carry": carry}
+        command, carry = self._session.run(["command", "carry_out"], given)
+        return command, carry
+
+    def __call__(self, features: np.ndarray, command: np.ndarray) -> np.ndarray:
+        """As `palpate.deployment.decision.NetworkDecision`."""
+        return self.run(features[None], command.reshape(self._shape))[0].reshape(-1)
+
+
 def difference(path: str | Path, policy: CommandPolicy, steps: int, seed: int) -> float:
     """The largest difference of any command between the file, run by ONNX Runtime, and the policy.
 
@@ -83,8 +112,7 @@ def difference(path: str | Path, policy: CommandPolicy, steps: int, seed: int) -
 
     Raises `PalpateError` without the extra `deploy`.
     """
-    runtime = extra_module("onnxruntime", EXTRA)
-    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    network = OnnxNetwork(path, policy)
     random, batch = np.random.default_rng(seed), 64
     mean, scale = np.asarray(policy.mean), np.asarray(policy.scale)
     spread = scale * np.where(np.arange(batch) < batch // 2, 1.0, 10.0)[:, None]
@@ -94,9 +122,7 @@ def difference(path: str | Path, policy: CommandPolicy, steps: int, seed: int) -
     for _ in range(steps):
         features = (mean + spread * random.normal(size=spread.shape)).astype(np.float32)
         ours = np.asarray(decide(policy, ours, features))
-        command, theirs = session.run(
-            ["command", "carry_out"], {"features": features, "carry": theirs}
-        )
+        command, theirs = network.run(features, theirs)
         worst = max(worst, float((np.abs(command - ours).reshape(batch, -1) / limits).max()))
     return worst
 

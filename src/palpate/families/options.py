@@ -281,8 +281,12 @@ class Train(Options, ABC):
     """Episodes in each of them."""
     starts: Whole = None
     """Start states to draw from."""
-    observation_noise: float = 0.0
+    observation_noise: float | None = 0.0
     """Standard deviation of what the policy will see, in the observation's unit."""
+
+    def completed(self, about: Mapping[str, Any]) -> Train:
+        """These options, with what was left open taken from what the model's file says."""
+        return self
 
     @abstractmethod
     def prepare(self, model: Model) -> Model:
@@ -348,7 +352,9 @@ class Evaluate(Options, ABC):
         """What is tried, drawn by the seed around the `base`."""
 
     @abstractmethod
-    def controllers(self, policy: CommandPolicy, base: Any) -> Mapping[str, Controller]:
+    def controllers(
+        self, policy: CommandPolicy, manifest: Mapping[str, Any], base: Any
+    ) -> Mapping[str, Controller]:
         """Who decides, by name: the policy, and then what it is held against."""
 
     def show(self, run: Run, trials: Sequence[Any], evaluated: Mapping[str, Any]) -> None:
@@ -362,16 +368,17 @@ class Evaluate(Options, ABC):
         """Raise `PalpateError` where some world is controlled at another rate."""
         from palpate.trials.controller import check_period
 
-        for controller in self.controllers(policy, base).values():
-            for trial in self.trials(base):
-                check_period(controller, trial.control_period)
+        for trial in self.trials(base):
+            check_period(policy, trial.control_period)
 
-    def evaluate(self, policy: CommandPolicy, run: Run, base: Any) -> Found:
+    def evaluate(
+        self, policy: CommandPolicy, manifest: Mapping[str, Any], run: Run, base: Any
+    ) -> Found:
         """Let each controller decide in the same trials; the figures of each."""
         from palpate.trials.trial import evaluate_trials, table
 
         trials = self.trials(base)
-        evaluated = evaluate_trials(self.controllers(policy, base), trials, run)
+        evaluated = evaluate_trials(self.controllers(policy, manifest, base), trials, run)
         self.show(run, trials, evaluated)
         ends = ["", *(f".{name.replace(' ', '_')}" for name in [*evaluated][1:])]
         figures = [

@@ -2,7 +2,8 @@
 
 from palpate.family import Family
 
-_OPTIONS, _EXPERIMENTS = "palpate.families.rope.options", "palpate.experiments.rope"
+_OPTIONS, _CONTROL = "palpate.families.rope.options", "palpate.families.rope.control_options"
+_EXPERIMENTS = "palpate.experiments.rope"
 
 FAMILY = Family(
     name="rope",
@@ -20,12 +21,12 @@ FAMILY = Family(
         "track": {"rope": f"{_OPTIONS}:TrackRope"},
         "identify": {"rope": f"{_OPTIONS}:IdentifyRope"},
         "train": {
-            "rope-stabilization": f"{_OPTIONS}:TrainRopeStabilization",
-            "rope-tracking": f"{_OPTIONS}:TrainRopeTracking",
+            "rope-stabilization": f"{_CONTROL}:TrainRopeStabilization",
+            "rope-tracking": f"{_CONTROL}:TrainRopeTracking",
         },
         "evaluate": {
-            "rope-stabilization": f"{_OPTIONS}:EvaluateRopeStabilization",
-            "rope-tracking": f"{_OPTIONS}:EvaluateRopeTracking",
+            "rope-stabilization": f"{_CONTROL}:EvaluateRopeStabilization",
+            "rope-tracking": f"{_CONTROL}:EvaluateRopeTracking",
         },
     },
     experiments={
@@ -38,6 +39,7 @@ FAMILY = Family(
         "rope-tracking": f"{_EXPERIMENTS}.tracking:reproduce",
         "rope-dagger": f"{_EXPERIMENTS}.dagger:reproduce",
         "rope-posterior": f"{_EXPERIMENTS}.posterior:reproduce",
+        "own-rope": f"{_EXPERIMENTS}.own_rope:reproduce",
         "rope-residual": f"{_EXPERIMENTS}.residual:reproduce",
         "rope-markerless": f"{_EXPERIMENTS}.markerless:reproduce",
     },

@@ -8,12 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from palpate.families.options import Demo, Found
-from palpate.families.rope.options import (
-    EvaluateRopeStabilization,
-    IdentifyRope,
-    RecordRope,
-    TrainRopeStabilization,
-)
+from palpate.families.rope.control_options import EvaluateRopeStabilization, TrainRopeStabilization
+from palpate.families.rope.options import IdentifyRope, RecordRope
 
 PICTURE = "picture.png"  # the README's
 INSTANTS = (0.8, 1.6, 2.4, 3.2)  # s, of the motion in the picture

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from palpate.perception.velocity import VelocityEstimator
 from palpate.runs import Figure
 from palpate.trials.rope.stabilization import settling_time
 
+Network = Callable[[np.ndarray, np.ndarray], np.ndarray]  # features and command to a command
+
 
 class RopeDecision:
     """A rope's policy, fed as in training: node positions relative to the gripper and velocities.
@@ -29,13 +31,14 @@ class RopeDecision:
     Args:
         policy: trained for `palpate.tasks.RopeStabilization`.
         markers: how many a state has.
+        network: decides in the policy's stead, as `NetworkDecision` does.
 
     Raises:
         PalpateError: the policy observes something else, or its nodes do not fall on so many
             markers.
     """
 
-    def __init__(self, policy: CommandPolicy, markers: int):
+    def __init__(self, policy: CommandPolicy, markers: int, network: Network | None = None):
         nodes = nodes_of(policy)
         self._every, rest = divmod(markers - 1, nodes - 1)
         if rest or not self._every:
@@ -43,7 +46,7 @@ class RopeDecision:
                 f"a policy for {nodes} nodes needs a multiple of {nodes - 1} markers and one more, "
                 f"not {markers}"
             )
-        self._network = NetworkDecision(policy)
+        self._network = network or NetworkDecision(policy)
         self._weights = np.asarray(VelocityEstimator(policy.period).weights, np.float32)
         self._window = np.zeros((len(self._weights), nodes, 3), np.float32)
         self._features = np.empty((2, nodes - 1, 3), np.float32)

@@ -3,41 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
-from abc import abstractmethod
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import arg
 
 from palpate.errors import PalpateError
 from palpate.families.options import (
-    Evaluate,
-    Found,
     Identify,
     Number,
     Reading,
     Record,
     Track,
     Tracked,
-    Train,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from palpate.models.model import Model
     from palpate.models.rope import Rope
-    from palpate.networks import CommandPolicy, Controller
     from palpate.recordings import Aligned, Recording
-    from palpate.runs import Figure, Run
-    from palpate.trials.rope.stabilization import StabilizationTrial
-    from palpate.trials.rope.tracking import PathTrial
-    from palpate.worlds.rope.configuration import RopeConfiguration
+    from palpate.runs import Run
 
 NOISE = 5e-4  # m, standard deviation of a marker's coordinate in the simulated world
-RENDERED = 3.0  # s of a trial in the moving picture
 GRIP = "grip"  # the channel that is made of gripped markers
+# Parameters of which each segment, or each joint, of a rope has its own.
+ALONG = ("rest_length", "stretch_stiffness", "stretch_damping", "bend_stiffness", "bend_damping",
+         "twist_stiffness")  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +113,7 @@ class IdentifyRope(Identify, Reading):
                                                     --validate eval.npz
                                                     --driven 0 1 -2 -1 --rate 100
     3. A rope that was weighed, 120 g:          palpate identify rope R.npz --mass 0.12
-    4. One bending stiffness for all joints:    palpate identify rope R.npz
-                                                    --shared bend_stiffness
+    4. A rope that is the same all along:       palpate identify rope R.npz --uniform
     5. Draws of a posterior, of few nodes:      palpate identify rope R.npz --nodes 6
                                                     --substeps 8 --method local-global
     """
@@ -146,6 +138,13 @@ class IdentifyRope(Identify, Reading):
         int | None, arg(metavar="N", help_behavior_hint="(default: of about 1 ms)")
     ] = None
     """Steps of the model in a control period; few are fast and bound the stiffness."""
+    uniform: bool = False
+    """The rope is the same all along: all its segments share their parameters, all its joints."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.uniform:
+            object.__setattr__(self, "shared", tuple(dict.fromkeys((*self.shared, *ALONG))))
 
     def reading(self) -> dict[str, Any]:
         topics = self.topics or ()
@@ -219,239 +218,3 @@ class IdentifyRope(Identify, Reading):
             channels = {**trial.channels, self.observation: kept}
             trials.append(dataclasses.replace(trial, channels=channels))
         return dataclasses.replace(recording, trials=tuple(trials))
-
-
-def _driven_by_velocity(rope: Rope) -> Rope:
-    from palpate.models.rope import Rope as Physics
-
-    if not isinstance(rope, Physics):
-        raise PalpateError(
-            "a policy is trained and tried through the physics of a rope: expected a model "
-            "identified without --residual"
-        )
-    return dataclasses.replace(rope, drive="velocity")
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainRope(Train):
-    """Training of a rope's gripper."""
-
-    observation_noise: float = NOISE
-    """Standard deviation of a marker's coordinate as the policy will see it, m."""
-
-    def prepare(self, model: Rope) -> Rope:
-        """The rope moved by its gripper's velocity; refused if it could not be tried in MuJoCo."""
-        from palpate.families.rope.counterpart import counterpart
-
-        prepared = _driven_by_velocity(model)
-        counterpart(prepared, self.observation_noise)
-        return prepared
-
-    @abstractmethod
-    def evaluation(self) -> EvaluateRope:
-        """A small one, of the policy."""
-
-    def in_world(self, policy: CommandPolicy, manifest: Mapping[str, Any]) -> list[Figure]:
-        """See `Train.in_world`: what `palpate evaluate` finds with one rope."""
-        from palpate.trials.trial import run_trials
-
-        small = self.evaluation()
-        base, _ = small.base(policy, manifest, None)
-        trials, (controller, *_) = small.trials(base), small.controllers(policy, base).values()
-        figures = type(trials[0]).figures(trials, run_trials(trials, controller))
-        return [dataclasses.replace(one, name=f"in_world.{one.name}") for one in figures]
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainRopeStabilization(TrainRope):
-    """Train a controller that brings a swinging rope to rest by moving its gripper.
-
-    1. After `palpate identify rope R.npz`:     palpate train rope-stabilization
-                                                    --model runs/identify-rope-001
-    """
-
-    task: ClassVar[str] = "rope-stabilization"
-
-    def evaluation(self) -> EvaluateRopeStabilization:
-        """One rope from each pose."""
-        return EvaluateRopeStabilization(policy=self.model, seed=self.seed, ropes=1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainRopeTracking(TrainRope):
-    """Train a controller that leads the tip of a hanging rope along a path by moving its gripper.
-
-    It is trained on random smooth paths and follows any.
-
-    1. After `palpate identify rope R.npz`:     palpate train rope-tracking
-                                                    --model runs/identify-rope-001
-    """
-
-    task: ClassVar[str] = "rope-tracking"
-
-    def evaluation(self) -> EvaluateRopeTracking:
-        """One rope on each path."""
-        return EvaluateRopeTracking(policy=self.model, seed=self.seed, ropes=1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateRope(Evaluate):
-    """Evaluation in MuJoCo ropes, drawn around one's own or the one that was recorded."""
-
-    ropes: int
-    length: Number = None
-    """Of the rope that the others are drawn around, m; this and the next change single constants
-    of it."""
-    mass: Number = None
-    """Without tip mass, kg."""
-    tip_mass: Number = None
-    """A point at its end, kg."""
-    bending_stiffness: Number = None
-    """E I, N m^2."""
-    joint_damping: Number = None
-    """Against bending, N m s/rad at each of 40 joints."""
-    world: Annotated[Path | None, arg(metavar="FILE.xml", help_behavior_hint="(default: none)")] = (
-        None
-    )
-    """An MJCF file with a cable to draw the ropes around."""
-
-    def inputs(self) -> dict[str, Path]:
-        """See `Evaluate.inputs`."""
-        return {} if self.world is None else {"world": self.world}
-
-    def prepare(self, model: Rope) -> Rope:
-        """The rope moved by its gripper's velocity."""
-        return _driven_by_velocity(model)
-
-    def check(self, policy: CommandPolicy, base: RopeConfiguration) -> None:
-        """See `Evaluate.check`; there has to be a rope, too."""
-        if self.ropes < 1:
-            raise PalpateError(f"an evaluation has at least one rope, not {self.ropes}")
-        super().check(policy, base)
-
-    def base(
-        self, policy: CommandPolicy, manifest: Mapping[str, Any], model: Rope | None
-    ) -> tuple[RopeConfiguration, str]:
-        """See `Evaluate.base` and `palpate.families.rope.counterpart`."""
-        from palpate.families.rope.counterpart import adapted, described, rope_for
-
-        around, whose = rope_for(policy, manifest, model)
-        names = "length", "mass", "tip_mass", "bending_stiffness", "joint_damping"
-        given = {name: getattr(self, name) for name in names}
-        if self.world is not None:
-            from palpate.worlds.rope.mjcf import read_cable
-
-            around, whose = adapted(around, read_cable(self.world)), f"the cable of {self.world}"
-        around = adapted(around, {name: n for name, n in given.items() if n is not None})
-        return around, f"tried in MuJoCo ropes drawn around {whose}: {described(around)}"
-
-    def constants(self, base: RopeConfiguration) -> dict[str, Any]:
-        """Of the rope that the others are drawn around."""
-        from palpate.families.rope.recording import constants
-
-        return constants(base)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateRopeStabilization(EvaluateRope):
-    """Try a controller in MuJoCo ropes it was not trained for, from four start poses.
-
-    Beside it, in the same trials: a gripper held still, and a tuned swing damper.
-
-    The ropes are drawn around that of --model; else around the one that the policy's recordings
-    were made of, as far as its file says so.
-
-    1. After `palpate train`:                   palpate evaluate rope-stabilization
-                                                    --policy runs/train-rope-stabilization-001
-    2. In ropes like another model's:           palpate evaluate rope-stabilization
-                                                    --policy P --model runs/identify-rope-002
-    3. Twice as heavy as that:                  palpate evaluate rope-stabilization
-                                                    --policy P --mass 0.11
-    4. Like a cable in MuJoCo:                  palpate evaluate rope-stabilization
-                                                    --policy P --world rope.xml
-    """
-
-    task: ClassVar[str] = "rope-stabilization"
-
-    ropes: int = 10
-    """How many; each from four poses."""
-
-    def trials(self, base: RopeConfiguration) -> list[StabilizationTrial]:
-        """Each rope from each pose, for four first periods of the longest."""
-        from palpate.trials.rope.stabilization import evaluation_trials
-
-        return evaluation_trials(base, self.ropes, self.seed)
-
-    def controllers(self, policy: CommandPolicy, base: RopeConfiguration) -> dict[str, Controller]:
-        from palpate.tasks.rope import RopeStabilization
-        from palpate.trials.rope.baselines import baselines
-        from palpate.trials.rope.learned import LearnedController
-
-        controlled = LearnedController(policy, RopeStabilization())
-        return {"controlled": controlled, **baselines(base)}
-
-    def show(
-        self, run: Run, trials: Sequence[StabilizationTrial], evaluated: Mapping[str, Any]
-    ) -> None:
-        """The energy left, and motions."""
-        from palpate.trials.rope.stabilization import write_trial_evidence
-
-        write_trial_evidence(run, trials, evaluated, ("controlled", "held still"))
-
-    def evaluate(self, policy: CommandPolicy, run: Run, base: RopeConfiguration) -> Found:
-        """See `Evaluate.evaluate`; one trial is rendered, too."""
-        from palpate.trials.rope.rendering import render_trial
-
-        found, (first, *_) = super().evaluate(policy, run, base), self.trials(base)
-        controller = self.controllers(policy, base)["controlled"]
-        try:
-            render_trial(run.path / "rendering.webp", first, controller, RENDERED)
-        except PalpateError as error:  # a machine without OpenGL: the page draws the ropes itself
-            notes = (f"the rope is drawn, not rendered: {error}",)
-            return dataclasses.replace(found, notes=notes)
-        return found
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateRopeTracking(EvaluateRope):
-    """Try a controller on paths and in MuJoCo ropes that it was not trained for.
-
-    Beside it, in the same trials: a gripper held still, one that moves as the path does, and one
-    that moves as would suit a limp chain.
-
-    1. After `palpate train`:                   palpate evaluate rope-tracking
-                                                    --policy runs/train-rope-tracking-001
-    2. Along a path of your own (time,x,y,z):   palpate evaluate rope-tracking
-                                                    --policy P --paths mine.csv
-    """
-
-    task: ClassVar[str] = "rope-tracking"
-
-    ropes: int = 5
-    """How many; each on every path."""
-    paths: Annotated[tuple[str, ...], arg(metavar="NAME|FILE.csv ...")] = (
-        "lemniscate",
-        "egg",
-        "sine",
-    )
-    """Of these three, of random size, speed and direction, or from files, as they stand there."""
-
-    def trials(self, base: RopeConfiguration) -> list[PathTrial]:
-        """Each rope on each path."""
-        from palpate.trials.rope.tracking import path_trials
-
-        return path_trials(base, self.ropes, self.seed, self.paths)
-
-    def controllers(self, policy: CommandPolicy, base: RopeConfiguration) -> dict[str, Controller]:
-        from palpate.tasks.rope import RopeTracking
-        from palpate.trials.rope.learned import LearnedController
-        from palpate.trials.rope.tracking import blind_controllers
-
-        controlled = LearnedController(policy, RopeTracking())
-        return {"controlled": controlled, **blind_controllers(base)}
-
-    def show(self, run: Run, trials: Sequence[PathTrial], evaluated: Mapping[str, Any]) -> None:
-        """Motions, and a picture of all tips."""
-        from palpate.trials.rope.tracking import write_path_evidence
-
-        write_path_evidence(run, trials, evaluated)

@@ -31,6 +31,7 @@ UPRIGHT = 0.7  # of a unit vector: the least downward part of the mean direction
 LONGEST, SHORTEST = 10.0, 0.05  # m, of a rope that is shaken by hand or arm
 HEAVIEST, LIGHTEST = 3.0, 5e-4  # kg/m
 MISSED = 0.04  # of a rope's length
+FEW = 10  # markers, between which a rope is not straight
 JUMP_RATIO, JUMP_LENGTH = 8.0, 0.1  # over what nine in ten frames stay below; of the rope's length
 
 
@@ -44,9 +45,10 @@ def problems(aligned: Aligned, driven: Sequence[int], mass: float | None) -> lis
     length = _length(seen)
     at_both_ends = {0, seen.shape[2] - 1} <= set(driven)
     # What is wrong first makes the rest meaningless.
-    first = _order(seen) or _unit(length) or _spliced(seen, length)
+    first = _order(seen) or _unit(length)
     if not first:
-        first = _direction(seen, at_both_ends, aligned.period)
+        seen = _filled(seen, max(3, round(SMOOTHED / aligned.period)))
+        first = _spliced(seen, length) or _direction(seen, at_both_ends, aligned.period)
     if not first and not at_both_ends:
         first = _rate(gravity(seen, aligned.period))
     weighed = "" if mass is None or _unit(length) else _mass(mass, length)
@@ -107,6 +109,31 @@ def gravity(
     ):
         return None
     return np.linalg.solve(normal, right)[:3]
+
+
+def _filled(
+    seen: Float[np.ndarray, "trials frames markers 3"], longest: int
+) -> Float[np.ndarray, "trials frames markers 3"]:
+    """Gaps of up to `longest` frames filled in time, others along the rope between its neighbours.
+
+    Linearly: of many markers some are always lost, and a check needs all of them at once.
+    """
+    filled = np.array(seen)
+    for trial in filled:
+        for axis, gaps in ((0, longest), (1, 1 if trial.shape[1] > FEW else 0)):
+            for line in np.swapaxes(trial, 0, 1) if axis == 0 else trial:
+                lost = np.isnan(line[:, 0])
+                known = np.flatnonzero(~lost)
+                if not lost.any() or len(known) < 2:
+                    continue
+                between = np.stack(
+                    [np.interp(np.arange(len(line)), known, line[known, k]) for k in range(3)], 1
+                )
+                for first, last in _runs(lost, 1):
+                    inside = first > 0 and last < len(line)
+                    if inside and last - first <= gaps:
+                        line[first:last] = between[first:last]
+    return filled
 
 
 def _order(seen: Float[np.ndarray, "trials frames markers 3"]) -> str:

@@ -1,6 +1,7 @@
 """The textbook swing damper, which learned controllers of a rope are compared with."""
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from palpate.runs.progress import progress
 from palpate.trials.controller import FeedbackController, HeldStill
 from palpate.trials.rope.stabilization import StabilizationTrial, settling_time
 from palpate.trials.trial import run_trials
+from palpate.worlds.rope.configuration import in_step
 from palpate.worlds.rope.rope import (
     START_POSES,
     RopeConfiguration,
@@ -20,7 +22,7 @@ from palpate.worlds.rope.rope import (
     sample_configurations,
 )
 
-TUNING_STEPS = 500  # control periods of each trial: 5 s
+TUNING = 5.0  # s of each trial that gains of a rope of 1 m are tuned in
 
 
 @dataclass(frozen=True)
@@ -100,22 +102,35 @@ def _shortened(vectors: np.ndarray, limit: float) -> np.ndarray:
     return vectors * np.minimum(1.0, limit / np.maximum(length, 1e-12))
 
 
-def baselines(base: RopeConfiguration) -> dict[str, Controller]:
+def baselines(base: RopeConfiguration, gains: Gains = TUNED) -> dict[str, Controller]:
     """What a controller that is to bring ropes like this one to rest is held against."""
-    gains = TUNED.alike(base.length)  # they were tuned for 1 m
     return {"held still": HeldStill(), "swing damper": SwingDamper(base, gains)}
 
 
-def coarse(configuration: RopeConfiguration) -> RopeConfiguration:
+@functools.cache
+def tuned(base: RopeConfiguration) -> Gains:
+    """Gains for ropes like this one: it takes a minute but for the rope that palpate records."""
+    if base == RopeConfiguration():
+        return TUNED
+    return tune(coarse(base), TUNED.alike(base.length), ropes=2, candidates=40)
+
+
+def coarse(base: RopeConfiguration) -> RopeConfiguration:
     """The same rope of 10 bodies, which is simulated thirty times as fast: to tune in.
 
     A joint of longer bodies bends more, so that the same damping of the rope is less of each.
     """
     bodies = 10
-    damping = configuration.joint_damping * bodies / configuration.bodies
-    return dataclasses.replace(
-        configuration, bodies=bodies, markers=bodies + 1, joint_damping=damping, time_step=1e-3
-    )
+    constants = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
+    if base.marker_places is None:
+        constants["markers"] = bodies + 1
+    if not isinstance(base.mass_distribution, str):
+        middles = (np.arange(bodies) + 0.5) / bodies * base.bodies - 0.5
+        weights = np.interp(middles, np.arange(base.bodies), base.body_masses())
+        constants["mass_distribution"] = tuple(weights.tolist())
+    constants |= {"bodies": bodies, "joint_damping": base.joint_damping * bodies / base.bodies}
+    del constants["time_step"]
+    return in_step(constants.pop("control_period"), longest=1e-3, **constants)
 
 
 def tune(
@@ -127,6 +142,8 @@ def tune(
     and shrinking otherwise. A trial that never settles counts with its length.
     """
     random = np.random.default_rng(seed)
+    lasting = TUNING * math.sqrt(base.length)
+    steps = round(lasting / base.control_period)
     trials = [
         StabilizationTrial(configuration, pose, seed + index)
         for index, configuration in enumerate(sample_configurations(base, ropes, seed))
@@ -136,18 +153,15 @@ def tune(
     for index in progress(candidates, "tuning the swing damper"):
         point = best + width * random.standard_normal(len(best)) * (index > 0)
         gains = Gains(*np.exp(point).tolist())
-        episodes = run_trials(trials, SwingDamper(base, gains), TUNING_STEPS)
+        episodes = run_trials(trials, SwingDamper(base, gains), steps)
         time = settling_time(episodes.energy, episodes.gripper_speed, base.control_period)
-        mean = float(np.nan_to_num(time, nan=TUNING_STEPS * base.control_period).mean())
+        mean = float(np.nan_to_num(time, nan=lasting).mean())
         width *= 1.2 if mean < least else 0.96
         if mean < least:
             best, least = point, mean
-            print(f"{mean:.3f} s: {gains}", flush=True)
     return Gains(*np.exp(best).tolist())
 
 
 if __name__ == "__main__":  # it starts where an earlier such walk, from the whole rope, had ended
-    tune(
-        coarse(RopeConfiguration()),
-        start=Gains(offset=1.3, rate=18.5, position=0.023, velocity=1.2, part=0.19),
-    )
+    start = Gains(offset=1.3, rate=18.5, position=0.023, velocity=1.2, part=0.19)
+    print(tune(coarse(RopeConfiguration()), start))

@@ -206,17 +206,19 @@ class RopeConfiguration:
         return self.mass * weights / weights.sum()
 
 
-def in_step(period: float, **constants: Any) -> RopeConfiguration:
+def in_step(
+    period: float, longest: float = RopeConfiguration.time_step, **constants: Any
+) -> RopeConfiguration:
     """A rope of these constants, controlled every `period` s, whose simulation keeps step with it.
 
-    Its time step is the longest that divides the period, is no longer than the default, and is
+    Its time step is the longest that divides the period, is no longer than `longest` (s), and is
     half of what the stiffness allows, so that ropes drawn around it can be simulated as well.
 
     Raises `PalpateError` where that is below 20 microseconds, and as `RopeConfiguration`.
     """
     instant = {"time_step": 1e-6, "control_period": 1e-6}
     quickest = max(RopeConfiguration(**{**constants, **instant}).fastest().values())
-    longest = min(RopeConfiguration.time_step, 1 / quickest)
+    longest = min(longest, 1 / quickest)
     if longest < SHORTEST_STEP:
         raise PalpateError(
             f"this rope would be simulated in steps of {longest:.2g} s, too slow to wait for: "

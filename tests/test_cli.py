@@ -144,8 +144,8 @@ def test_what_is_recorded_by_default_is_the_default_rope():
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
             "namo-scenarios, namo-scaling, namo-online, calibration, one-shot, cart-online, "
             "own-model, rope-model, rope-stabilization, rope-ablation, rope-rivals, rope-bound, "
-            "rope-generalization, rope-tracking, rope-dagger, rope-posterior, rope-residual, "
-            "rope-markerless",
+            "rope-generalization, rope-tracking, rope-dagger, rope-posterior, own-rope, "
+            "rope-residual, rope-markerless",
         ),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),
         (

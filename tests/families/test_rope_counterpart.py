@@ -19,7 +19,8 @@ from palpate.families.rope.counterpart import (
     rope_for,
     with_markers,
 )
-from palpate.families.rope.recording import record_rope
+from palpate.families.rope.options import ALONG, IdentifyRope
+from palpate.families.rope.recording import constants, record_rope
 from palpate.families.rope.robot import servoed
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
@@ -213,3 +214,30 @@ def test_single_constants_are_changed_and_the_time_step_follows():
     assert stiff.time_step < base.time_step
     assert adapted(base, {}) is base
     assert adapted(RopeConfiguration(), {"length": 0.9}) == RopeConfiguration(length=0.9)
+
+
+def test_a_policy_decides_on_every_second_frame_of_a_fast_camera(tmp_path, capsys):
+    fast = Rope.uniform(0.5, 0.05, 5, drive="position", control_period=1 / 200, substeps=4)
+    options = TrainRopeStabilization(model=tmp_path, observation_noise=1e-3)
+    prepared = options.prepare(fast)
+    assert (prepared.control_period, prepared.substeps) == (0.01, 8)
+    assert "one in 2 of the recording's frames" in capsys.readouterr().out
+    usual = dataclasses.replace(fast, control_period=1 / 120)
+    assert options.prepare(usual).control_period == 1 / 120
+
+
+def test_a_policy_is_trained_with_the_noise_of_its_recording(tmp_path):
+    open_noise = TrainRopeStabilization(model=tmp_path)
+    assert open_noise.completed({"observation_noise": 2e-3}).observation_noise == 2e-3
+    assert open_noise.completed({}).observation_noise == 5e-4
+    recorded = constants(RopeConfiguration(observation_noise=1e-3)) | {"source": "MuJoCo rope"}
+    about = {"recordings": recorded, "observation_noise": 1.1e-3}
+    assert open_noise.completed(about).observation_noise == 1e-3  # as it was simulated
+    said = TrainRopeStabilization(model=tmp_path, observation_noise=0.0)
+    assert said.completed(about).observation_noise == 0.0
+
+
+def test_a_uniform_rope_shares_what_its_segments_have():
+    options = IdentifyRope(recordings=(), uniform=True, shared=("node_mass",))
+    assert options.shared == ("node_mass", *ALONG)
+    assert IdentifyRope(recordings=()).shared == ()

@@ -114,8 +114,8 @@ def summary_of_draws(
     known = {figure.name: figure for figure in figures}
     inside, apart = known["coverage_90"], known["rhat_max_predictions"].value
     found = (
-        f"Draws of the model ({settings['structure']}) predict {settings['scored_on']} {PIECE:g} s "
-        f"ahead within {' and '.join(map(value_in_words, errors))} (root mean square)."
+        f"Draws of the model ({settings['structure']}) predict {settings['scored_on']}, "
+        f"{PIECE:g} s ahead, within {' and '.join(map(value_in_words, errors))} (root mean square)."
     )
     held = f"Its 90 % intervals hold {value_in_words(inside)} of what was seen. {told(rows)}"
     if apart is not None and apart >= MIXED:

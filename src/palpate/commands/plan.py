@@ -19,7 +19,9 @@ def run(options: Plan) -> Path:
     words = f"plan {options.problem}"
     with folders.begin(options, words, product=folders.PLAN, **problem.inputs) as run:
         if not run.finished:
-            folders.finish(run, problem.solve(run))
+            figures = problem.solve(run)
+            *_, whole = problem.describe(run.path / folders.PLAN)
+            folders.finish(run, figures, {folders.SUMMARY: [f"{whole}."]})
         print("\n".join(problem.describe(run.path / folders.PLAN)))
         path = folders.hand_over(options, run, problem.title, folders.PLAN)
         for picture in sorted(run.path.glob("*.png")):

@@ -26,10 +26,9 @@ def run(options: Track) -> Path:
             write_recording(run.path / folders.RECORDING, tracked.recording)
             frames, share = len(tracked.lost), float(tracked.lost.mean())
             figures = [Figure("frames", float(frames), ""), Figure("lost_share", share, "")]
-            folders.finish(run, figures)
-            print(
-                f"{frames} frames followed; the {options.family} was lost in {100 * share:.0f} % "
-                "of them"
-            )
+            said = f"{frames} frames followed; the {options.family} was lost in "
+            said += f"{100 * share:.0f} % of them"
+            folders.finish(run, figures, {folders.SUMMARY: [f"{said}."]})
+            print(said)
         title = f"A {options.family}, seen by a camera"
         return folders.hand_over(options, run, title, folders.RECORDING)

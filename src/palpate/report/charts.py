@@ -40,7 +40,7 @@ def horizon(curves: Curves, looks: Mapping[str, int], unit: str) -> Chart:
 def prediction(curves: Curves, looks: Mapping[str, int], names: Sequence[str]) -> Chart:
     """Predicted numbers over time, a panel for each; several lines of a label are a fan."""
     data, count = [], curves.values[next(iter(curves.values))].shape[1]
-    layout = empty_layout(100 + 120 * count)
+    layout = empty_layout(max(300, 100 + 120 * count))
     # A fan beneath what is held against it, which it would hide.
     ordered = sorted(curves.values.items(), key=lambda item: -item[1].shape[2])
     for row in range(count):

@@ -35,13 +35,17 @@ from palpate.report.parameter_chart import number, parameters
 from palpate.report.player import scene
 from palpate.report.style import STYLES, numbered
 from palpate.runs.figure_names import name_in_words, number_in_words, value_in_words
-from palpate.runs.result import Figure
 from palpate.runs.storage import write_text
 
 Section = tuple[str, str]  # title, HTML
 NAMED = 5  # stages that a page names; more are counted
 _OPEN_NOTES = 3
 _FEW = 4  # elements of a parameter that are told one by one
+_VERDICTS = {
+    True: '<span class="met">✓ met</span>',
+    False: '<span class="not-met">✗ not met</span>',
+    None: "–",
+}
 _OBSERVED = "observed"  # the label that predictions are held against
 
 
@@ -152,44 +156,23 @@ def _results(evidence: Evidence, looks: dict[str, int]) -> str:
         value = f"<b>{number}</b> {unit}"
         if figure.spread is not None:
             value += f" <small>± {number_in_words(figure, float(f'{figure.spread:.2g}'))}</small>"
-        met = {True: "✓ met", False: "✗ not met", None: "–"}[figure.met]
-        rows.append(
-            (
-                _text(name_in_words(figure)),
-                value,
-                "none" if figure.bar is None else f"{sign} {number_in_words(figure, figure.bar)}",
-                f'<span class="{met[2:].replace(" ", "-")}">{met}</span>',
-                _known(figure, figure.seed_document, "not printed"),
-                _known(figure, figure.rival, "–"),
-            )
-        )
+        met = _VERDICTS[figure.met]
+        bar = "–" if figure.bar is None else f"{sign} {number_in_words(figure, figure.bar)}"
+        others = (_text(number_in_words(figure, of)) for of in (figure.seed_document, figure.rival))
+        rows.append((_text(name_in_words(figure)), value, bar, met, *others))
     rows = list(dict.fromkeys(rows))  # what never came is said once, not in each unit
-    names = "", "value", "bar", "verdict", "seed document", "compared with"
-    fields = "name", "value", "bar", "met", "seed_document", "rival"
-    # What is empty in every row is left out: a user's own thing has no bar and no seed document.
-    kept = [
-        index
-        for index, field in enumerate(fields)
-        if index < 2 or any(getattr(figure, field) is not None for figure in evidence.figures)
-    ]
-    return _table("results", [names[i] for i in kept], [[row[i] for i in kept] for row in rows])
-
-
-def _known(figure: Figure, value: int | float | str | None, missing: str) -> str:
-    if isinstance(value, int | float):
-        return number_in_words(figure, value)
-    return missing if value is None else _text(value)
+    columns = "", "value", "bar", "verdict", "seed document", "compared with"
+    return _table("results", columns, rows)
 
 
 def _pictures(evidence: Evidence) -> str:
-    return "".join(
-        f'<img alt="{_readable(path.stem)}" src="data:image/png;base64,{_encoded(path)}">'
-        for path in evidence.pictures
-    )
+    return "".join(_image(path, path.stem) for path in evidence.pictures)
 
 
-def _encoded(path: Path) -> str:
-    return base64.b64encode(path.read_bytes()).decode()
+def _image(path: Path, shows: str) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    kind = RENDERINGS[path.suffix]
+    return f'<img alt="{_readable(shows)}" src="data:{kind};base64,{data}">'
 
 
 def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
@@ -204,11 +187,8 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
         content = _caption(caption)
         content += f'<div class="player">{_data(scene(evidence.motions, looks))}</div>'
     if evidence.rendering is not None:
-        kind = RENDERINGS[evidence.rendering.suffix]
         rendered = "The same scene as its simulator renders it." if content else "What happened."
-        content += _caption(rendered)
-        source = f"data:{kind};base64,{_encoded(evidence.rendering)}"
-        content += f'<img alt="The scene in motion" src="{source}">'
+        content += _caption(rendered) + _image(evidence.rendering, "The scene in motion")
     return content
 
 
@@ -246,9 +226,9 @@ def _prediction(evidence: Evidence, looks: dict[str, int]) -> str:
     names = [str(name) for name in evidence.settings.get("predicted", [])]
     names += [f"number {index + 1}" for index in range(len(names), count)]
     fans = [label for label, values in curves.values.items() if values.shape[2] > 1]
-    caption = "One motion, predicted from its first moment alone beside what was observed"
-    if _OBSERVED not in curves.values:
-        caption = f"One motion, {' and '.join(curves.values)}"
+    caption = f"One motion, {' and '.join(curves.values)}"
+    if _OBSERVED in curves.values:
+        caption = "One motion, predicted from its first moment alone beside what was observed"
     caption += f"; each thin line is one of the {fans[0]}." if fans else "."
     return _caption(caption) + _chart(charts.prediction(curves, looks, names))
 
@@ -372,9 +352,14 @@ def _data(content: Any) -> str:
 
 
 def _table(kind: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows of HTML under `columns`, or nothing; a narrow screen shows the heading in each cell."""
+    """Rows of HTML under those `columns` in which something stands, or nothing.
+
+    A narrow screen shows the heading in each cell.
+    """
     if not rows:
         return ""
+    kept = [index for index in range(len(columns)) if any(row[index] != "–" for row in rows)]
+    columns, rows = [columns[i] for i in kept], [[row[i] for i in kept] for row in rows]
     headings, tags = [_text(name) for name in columns], ["th", *["td"] * (len(columns) - 1)]
     head = "".join(f"<th>{name}</th>" for name in headings)
     body = ""

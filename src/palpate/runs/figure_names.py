@@ -24,6 +24,10 @@ NAMES = {
     "settling_time": "time until at rest",
     "settling": "time until at rest",
     "lost_share": "frames in which it was lost",
+    "late_over_1ms": "deadlines missed by more than 1 ms",
+    "decision_p99": "slowest decisions (99th percentile)",
+    "turnaround_p99": "slowest answers to a state (99th percentile)",
+    "brakes": "times it braked",
     "onnx_difference": "difference from the policy",
 }
 PLACES = {"in_model": "in the model", "in_world": "in a simulated world"}
@@ -47,7 +51,12 @@ def value_in_words(figure: Figure) -> str:
     return f"{number_in_words(figure, figure.value)} {figure.unit}".rstrip()
 
 
-def number_in_words(figure: Figure, number: int | float) -> str:
-    """A number that is one of this figure's, such as its bar: four digits, or percent to three."""
+def number_in_words(figure: Figure, number: int | float | str | None) -> str:
+    """One of this figure's numbers, such as its bar: four digits, or percent to three.
+
+    What is said in words stays as it is; "–" where there is nothing.
+    """
+    if not isinstance(number, int | float):
+        return number or "–"
     share = not figure.unit and any(part.endswith(_SHARES) for part in figure.name.split("."))
     return f"{100 * number:.3g} %" if share else f"{number:.4g}"

@@ -92,18 +92,17 @@ class DemoRope(Demo):
         rest = ": never; a longer training would help"
         if seconds is not None:
             rest = f" {seconds:.2f} s, {periods:.2f} periods"
+        said = [
+            f"Tip error {error}, {self.size.duration:g} s ahead, unseen motions",
+            f"Time to 1 % energy{rest}",
+            f"At rest in {success:.0%} of the trials; with the gripper held still in {still:.0%}",
+        ]
         return Found(
             figures=figures,
-            settings=dataclasses.asdict(self.size),
+            settings={**dataclasses.asdict(self.size), "summary": [f"{line}." for line in said]},
             split={
                 "tip error": "motions of the recorded rope that were not fitted",
                 "time to 1 %": f"{self.size.ropes} other ropes from four poses each",
             },
-            lines=[
-                f"tip error {error}, {self.size.duration:g} s ahead, unseen motions",
-                f"time to 1 % energy{rest}",
-                f"at rest in {success:.0%} of the trials; with the gripper held still in "
-                f"{still:.0%}",
-                f"picture: {out / PICTURE}",
-            ],
+            lines=[*said, f"picture: {out / PICTURE}"],
         )

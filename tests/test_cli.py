@@ -1,6 +1,7 @@
 """What the command line says: to those who ask for help, and to those who made a mistake."""
 
 import dataclasses
+import shutil
 import subprocess
 import sys
 import time
@@ -111,6 +112,32 @@ def test_what_is_recorded_by_default_is_the_default_rope():
             assert field.default == getattr(rope, field.name), field.name
 
 
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, capsys):
+    assert main(["--completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    asked = {
+        "palpate ide": {"identify"},
+        "palpate identify r": {"rope"},
+        "palpate identify rope --dr": {"--driven", "--draws"},
+        "palpate plan n": {"namo"},
+        "palpate demo --se": {"--seed"},
+        "palpate reproduce rope-mo": {"rope-model"},
+        "palpate identify rope R.n": set(),  # a file's name, as the shell completes it
+    }
+    for words in asked:
+        count = len(words.split())
+        script += f"COMP_WORDS=({words}); COMP_CWORD={count - 1}; COMPREPLY=()\n"
+        script += "_tyro_palpate; echo ${COMPREPLY[@]}\n"
+    (tmp_path / "completion.bash").write_text(script + "complete -p palpate\n")
+    done = subprocess.run(
+        ["bash", "completion.bash"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    *replies, how = done.stdout.splitlines()
+    assert [set(reply.split()) for reply in replies] == list(asked.values())
+    assert "-o default" in how
+
+
 # --- names and options ------------------------------------------------------------------------
 
 
@@ -147,6 +174,7 @@ def test_what_is_recorded_by_default_is_the_default_rope():
             "rope-generalization, rope-tracking, rope-dagger, rope-posterior, own-rope, "
             "rope-residual, rope-markerless",
         ),
+        ("--completion fish", "unknown shell 'fish'; there are: bash, zsh"),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),
         (
             "identify rope R.npz --drivn 0",

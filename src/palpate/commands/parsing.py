@@ -1,14 +1,21 @@
-"""Words on a command line become a dataclass, or one sentence that says why they cannot."""
+"""Words on a command line become a dataclass, or one sentence that says why they cannot.
+
+And what completes them in a shell.
+"""
 
 import contextlib
 import io
 import itertools
 import re
-from typing import TypeVar
+from collections.abc import Mapping
+from dataclasses import make_dataclass
+from typing import Annotated, Any, TypeVar, Union
 
 import tyro
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
 from palpate.errors import PalpateError
+from palpate.family import check_name
 
 Options = TypeVar("Options")
 _TAKES = {
@@ -28,11 +35,36 @@ def parse(kind: type[Options], program: str, words: list[str]) -> Options | None
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(kind, prog=program, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+            return tyro.cli(kind, prog=program, args=words, config=(FlagCreatePairsOff,))
     except SystemExit as left:
         if not left.code:
             return None
         raise PalpateError(sentence(said.getvalue(), program, words)) from left
+
+
+def completion(shell: str, options: Mapping[str, Mapping[str, Any]]) -> str:
+    """A script by which a shell completes commands, what they work on, and options.
+
+    `options` of each subject of each command, "" where a command has none. Raises `PalpateError`
+    for another shell than bash or zsh.
+    """
+    check_name("shell", shell, ("bash", "zsh"))
+    commands = {
+        name: subjects[""] if "" in subjects else make_dataclass(name, [("of", _one_of(subjects))])
+        for name, subjects in options.items()
+    }
+    said, words = io.StringIO(), ["--tyro-print-completion", shell]
+    how = (FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes)
+    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        tyro.cli(_one_of(commands), prog="palpate", args=words, config=how)
+    # What is no word of ours may be a file's name.
+    return said.getvalue().replace("complete -F", "complete -o default -F")
+
+
+def _one_of(kinds: Mapping[str, Any]) -> Any:
+    """A choice among them by name; of a single one there is none, so that help stands beside it."""
+    named = [Annotated[kind, subcommand(name)] for name, kind in kinds.items()]
+    return Union[(*named, Annotated[None, subcommand("--help")])]
 
 
 def sentence(box: str, program: str, words: list[str]) -> str:

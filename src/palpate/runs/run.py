@@ -26,7 +26,7 @@ import re
 import shlex
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
@@ -63,15 +63,10 @@ class Run:
     """
 
     def __init__(
-        self,
-        path: Path,
-        configuration: dict[str, Any],
-        lock: TextIO,
-        before: set[str] | None,
-        made: Sequence[Path] = (),
+        self, path: Path, configuration: dict[str, Any], lock: TextIO, before: set[str] | None
     ):
         self.path = path
-        self._made = made  # for it by this process: its lock, folders, innermost first
+        self._made: list[Path] = []  # by this process: its lock, and folders, innermost first
         self.configuration = configuration
         self._lock = lock
         self._before = before  # names in the folder when this process began the run in it
@@ -144,7 +139,9 @@ class Run:
         except BaseException:
             lock.close()
             raise
-        return cls(path, asked, lock, before, made)
+        run = cls(path, asked, lock, before)
+        run._made = made
+        return run
 
     def __enter__(self) -> "Run":
         return self

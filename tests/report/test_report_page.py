@@ -24,7 +24,7 @@ from synthetic_evidence import (
 
 VOID = {"meta", "br", "img", "input", "link", "base"}
 EVERY_SECTION = [
-    *("Results", "Path of the tip", "Error against horizon", "Parameters"),
+    *("Results", "Motion", "Path of the tip", "Error against horizon", "Parameters"),
     *("Learning", "Energy", "What was run"),
 ]
 
@@ -246,6 +246,18 @@ def test_a_rendering_is_embedded(tmp_path):
     page = page_of(build_report([run], tmp_path / "page.html", "One"))
     assert page.headings == ["What was run"]  # the page opens with it
     assert page.loads == ["data:image/webp;base64,cGljdHVyZQ=="]
+
+
+def test_a_page_of_many_runs_opens_with_one_picture(tmp_path):
+    runs = [write_run(tmp_path / name, name) for name in ("plain", "one", "two", "three")]
+    for run in runs[1:]:
+        write_evidence(run, {"motion.time": TIME, "motion.observed": POINTS})
+    text = build_report(runs, tmp_path / "page.html", "Many").read_text(encoding="utf-8")
+    opening, _, rest = text.partition("<h2>Motion</h2>")
+    assert opening.count('class="player"') == 1
+    assert "<h3>one</h3>" in opening
+    motion = rest.partition("<h2>")[0]
+    assert re.findall("<h3>(.*?)</h3>", motion) == ["two", "three"]
 
 
 def test_pictures_of_the_run_that_the_page_is_about_are_embedded(tmp_path):

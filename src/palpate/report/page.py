@@ -10,7 +10,7 @@ import html
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.resources import files
 from itertools import chain
@@ -38,6 +38,7 @@ from palpate.runs.figure_names import name_in_words, number_in_words, value_in_w
 from palpate.runs.storage import write_text
 
 Section = tuple[str, str]  # title, HTML
+Part = Callable[[Evidence, dict[str, int]], str]
 NAMED = 5  # stages that a page names; more are counted
 _OPEN_NOTES = 3
 _FEW = 4  # elements of a parameter that are told one by one
@@ -84,32 +85,31 @@ def _sections(found: Sequence[Evidence]) -> tuple[str, list[Section]]:
         labelled = (*(motion.chains for motion in evidence.motions), *(c.values for c in curves))
         looks.append(numbered(chain.from_iterable(labelled)))
 
-    def sections(parts: Iterable[tuple[str, Callable[..., str]]]) -> Iterator[Section]:
-        for heading, part in parts:
-            contents = [(e.name, part(e, look)) for e, look in zip(found, looks, strict=True)]
-            contents = [(name, content) for name, content in contents if content]
-            if len(contents) > 1:
-                contents = [(name, f"<h3>{_text(name)}</h3>{inner}") for name, inner in contents]
-            if contents:
-                yield heading, "".join(content for _, content in contents)
+    def contents(part: Part) -> list[str]:
+        """Of each run that has evidence for it, under its name where there are several."""
+        each = [(e.name, part(e, look)) for e, look in zip(found, looks, strict=True)]
+        named = len(found) > 1
+        return [f"<h3>{_text(name)}</h3>" * named + content for name, content in each if content]
 
-    views = (
+    views: tuple[tuple[str, Part], ...] = (
         ("Pictures", lambda e, looks: _pictures(e) if e is found[0] else ""),
         ("Motion", _motion),
         ("Observed and predicted", _prediction),
     )
-    rest = (
+    rest: tuple[tuple[str, Part], ...] = (
+        ("Results", _results),
         ("Path of the tip", _tips),
         ("Error against horizon", _horizon),
         ("Parameters", _parameters),
         ("Learning", _learning),
         *((piece.heading, partial(_piece, name, piece)) for name, piece in pieces().items()),
     )
-    (_, opening), *others = [*sections(views)] or [("", "")]
+    shown, told = ([(of, contents(part)) for of, part in parts] for parts in (views, rest))
+    opening = next((of.pop(0) for _, of in shown if of), "")  # one picture, and the rest below
     if opening:
         opening = f'<section class="opening">{opening}</section>\n'
-    results = *sections([("Results", _results)]), *others, *sections(rest)
-    return opening, [*results, ("What was run", "".join(map(_provenance, found)))]
+    ordered = [(of, "".join(content)) for of, content in (told[0], *shown, *told[1:]) if content]
+    return opening, [*ordered, ("What was run", "".join(map(_provenance, found)))]
 
 
 # --- sections ---------------------------------------------------------------------------------

@@ -13,7 +13,8 @@ NAMES = {
     "rmse_at_end": "error at the end (root mean square)",
     "tip_rmse": "error of the tip (root mean square)",
     "tip_rmse_per_length": "error of the tip per length",
-    "coverage_90": "observations inside the 90 % intervals",
+    "coverage_90": "coverage of the 90 % intervals",
+    "coverage_90_over": "coverage of the 90 % intervals, at most",
     "log_score": "log score",
     "rhat_max_predictions": "disagreement of the chains (R-hat; 1 is none)",
     "ess_min": "effective draws, at least",
@@ -31,7 +32,13 @@ NAMES = {
     "onnx_difference": "difference from the policy",
 }
 PLACES = {"in_model": "in the model", "in_world": "in a simulated world"}
-_SHARES = ("success", "coverage_90", "_rate", "_share")  # how the name of a percentage ends
+_SHARES = (
+    "success",
+    "coverage_90",
+    "coverage_90_over",
+    "_rate",
+    "_share",
+)  # how the name of a percentage ends
 
 
 def name_in_words(figure: Figure) -> str:

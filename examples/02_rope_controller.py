@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 
 from palpate.commands import evaluate, train
-from palpate.families.rope.options import EvaluateRopeStabilization, TrainRopeStabilization
+from palpate.families.rope.control_options import EvaluateRopeStabilization, TrainRopeStabilization
 from palpate.networks import load_policy
 from palpate.runs.result import read_result
 

@@ -12,12 +12,11 @@ import numpy as np
 
 from palpate.commands import evaluate, identify, train
 from palpate.errors import DoubtfulResultError
-from palpate.families.rope.options import (
+from palpate.families.rope.control_options import (
     EvaluateRopeStabilization,
-    IdentifyRope,
-    RecordRope,
     TrainRopeStabilization,
 )
+from palpate.families.rope.options import IdentifyRope, RecordRope
 
 MASS = 0.055  # kg, of the rope on a kitchen scale
 

@@ -6,6 +6,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from palpate.errors import PalpateError
 from palpate.identification.gradient.least_squares import _undecided, intervals
 from palpate.models.model import Model, rollout
 from palpate.parameters import FreeParameters, LogNormal, parameter
@@ -60,6 +61,17 @@ def test_a_combination_is_named_whatever_else_is_undecided(push, together):
     found = intervals(coordinates, coordinates.initial, aligned)
     assert (found.verdict["gear"] is None) == (push > 0.0)
     assert [named(warning) for warning in found.warnings] == [together]
+
+
+def test_a_trial_that_jumps_out_of_all_bounds_is_named():
+    cart = GearedCart(gear=1.0, mass=1e-3, friction=1e-3)
+    moving = np.tile(np.linspace(0.0, 1.0, 61, dtype=np.float32)[:, None], (4, 1, 1))
+    acting = np.ones((4, 60, 1), np.float32)
+    acting[2, 30:] = 1e38
+    aligned = Aligned(0.05, moving, acting, np.full(4, 61))
+    coordinates = FreeParameters(cart)
+    with pytest.raises(PalpateError, match=r"trial 2 cannot be predicted .* cut it where it jumps"):
+        intervals(coordinates, coordinates.initial, aligned)
 
 
 def named(warning):

@@ -18,6 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from palpate.errors import PalpateError
 from palpate.identification.data.prediction import observation_scale, predict, residuals
 from palpate.identification.data.segments import Segments, SegmentSource
 from palpate.identification.verdicts import undecided, verdict
@@ -211,18 +212,21 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     A^-1 (sum g_b g_b^T + 1) A^-1 (Huber 1967; White 1982): residuals next to each other in time are
     not counted as independent evidence. Never below the covariance A^-1 of independent noise. The
     Gauss-Newton step that a descent has left to go widens them as an error of its size.
+
+    Raises `PalpateError` for a trial that cannot be predicted to its end.
     """
     segments = SegmentSource.of(aligned, coordinates.reference).whole()
     offset = jnp.zeros((segments.count, 2, *segments.pose.shape[1:]))
     objective = Objective(coordinates, observation_scale(aligned, coordinates.reference), KNEE)
     flat, unravel = ravel_pytree(free)
     # The best starts first: about others the parameters' slope is a small difference of large sums.
-    alone = objective.products(free, offset, segments, False).sum(axis=1, dtype=np.float64)
+    alone = _finite(objective.products(free, offset, segments, False))
+    alone = alone.sum(axis=1, dtype=np.float64)
     freedom = int(np.sum(segments.seen)) - flat.size
     nowhere = np.zeros((segments.count, offset[0].size))
     own = _eliminated(alone, 0, _noise(alone, freedom), nowhere).start
     offset = jnp.asarray(own.reshape(offset.shape), offset.dtype)
-    products = objective.products(free, offset, segments).astype(np.float64)
+    products = _finite(objective.products(free, offset, segments)).astype(np.float64)
     total = products.sum(axis=1)
     noise = _noise(total[:, flat.size :, flat.size :], freedom)
     reduced = _eliminated(total, flat.size, noise, own)
@@ -251,6 +255,17 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
         share, shift = (np.asarray(of[path]).ravel() for of in (deviation, free))
         verdicts[path] = verdict(undecided(share, shift))
     return Intervals(lower, upper, verdicts, _undecided(information, unravel))
+
+
+def _finite(products: np.ndarray) -> np.ndarray:
+    """Products of the trials, in which every number is one."""
+    lost = ~np.isfinite(products).reshape(len(products), -1).all(axis=1)
+    if lost.any():
+        raise PalpateError(
+            f"trial {np.argmax(lost)} cannot be predicted from its start to its end: errors or "
+            "their slopes are no finite numbers; cut it where it jumps, or leave it out"
+        )
+    return products
 
 
 def _noise(products: Float[np.ndarray, "segments columns columns"], freedom: int) -> float:

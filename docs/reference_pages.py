@@ -11,7 +11,8 @@ from palpate.cli import COMMANDS, Command
 STAGES = {
     "commands": [
         *(f"commands.{name}" for name in COMMANDS),
-        *("commands.options", "families.options", "families.rope.options", "families.rope.demo"),
+        *("commands.options", "families.options", "families.rope.options"),
+        *("families.rope.control_options", "families.rope.demo"),
         *("families.furniture.options", "families.own.options"),
     ],
     "recordings": [

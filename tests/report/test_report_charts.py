@@ -9,7 +9,8 @@ from palpate.families.rope.energy import chart as energy_chart
 from palpate.report import Curves, Motion
 from palpate.report.charts import horizon, learning, quantiles
 from palpate.report.evidence import Parameter
-from palpate.report.parameter_chart import number, parameters
+from palpate.report.parameter_chart import parameters
+from palpate.report.parameter_words import number
 from palpate.report.player import scene
 from palpate.report.style import STYLES, numbered
 

@@ -10,8 +10,9 @@ from palpate.commands import folders
 from palpate.commands.identify_data import Data
 from palpate.identification.verdicts import uninformed
 from palpate.models.model import Model
-from palpate.parameters import format_value
+from palpate.report.evidence import parameter_of
 from palpate.report.motion import PANELS
+from palpate.report.parameter_words import elements, interval
 from palpate.runs import Result
 
 
@@ -66,14 +67,14 @@ def show(result: Result) -> None:
             likely = max(of, key=of.__getitem__)
             print(f"{what}{alone}: {likely} (probability of each: {shares})")
     cells = [("parameter", "identified", "90 % interval", "")]
-    cells += [line for row in result.parameters if not row["fixed"] for line in _lines(row)]
+    cells += [_cells(row) for row in result.parameters if not row["fixed"]]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for line in cells:
         print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
     if fixed := [row["name"] for row in result.parameters if row["fixed"]]:
         print(f"not identified: {', '.join(fixed)} (as given)")
     for row in result.parameters:
-        if row["verdict"]:
+        if row["verdict"] and not uninformed(row["verdict"]):
             print(f"warning: {row['name']}: {row['verdict']}")
     for warning in result.warnings:
         print(f"warning: {warning}")
@@ -81,32 +82,11 @@ def show(result: Result) -> None:
         print(sentence)
 
 
-def _lines(row: dict[str, Any]) -> list[tuple[str, str, str, str]]:
-    """What is printed of a parameter: of draws a line for each element, of a fit one for all."""
-    if isinstance(row["value"], list) and ("elements" in row or row.get("derived")):
-        several = len(row["value"]) > 1
-        names = [
-            f"{row['name']}[{i}]" if several else row["name"] for i in range(len(row["value"]))
-        ]
-        names = row.get("elements", names)
-        values = zip(names, row["value"], row["lower"], row["upper"], strict=True)
-        return [
-            (name, format_value(value, row["unit"]), f"{low:.3g} to {high:.3g}", "")
-            for name, value, low, high in values
-        ]
+def _cells(row: dict[str, Any]) -> tuple[str, str, str, str]:
+    known = parameter_of(row)
+    within = "not told by the data" if known.uninformed else interval(known)
     note = "one value for all elements" if row["shared"] and np.size(row["value"]) > 1 else ""
-    return [(row["name"], format_value(row["value"], row["unit"]), _interval(row), note)]
-
-
-def _interval(row: dict[str, Any]) -> str:
-    """The interval of one value; of several, what is typical relative to their values."""
-    if uninformed(row["verdict"]):
-        return "not told by the data"
-    value, low, high = (np.ravel(row[key]) for key in ("value", "lower", "upper"))
-    if low.size == 1 or (row["shared"] and np.ptp(low) <= 1e-6 * abs(low[0])):
-        return f"{low[0]:.3g} to {high[0]:.3g}"
-    below, above = (np.median((edge - value) / np.abs(value)) for edge in (low, high))
-    return f"typically {below:+.0%} to {above:+.0%}"
+    return known.name, f"{elements(known)} {known.unit}".rstrip(), within, note
 
 
 def doubted(doubts: Sequence[str]) -> str:

@@ -193,7 +193,7 @@ def read_evidence(run: str | Path) -> Evidence:
         horizon=horizon,
         prediction=prediction,
         pieces=added,
-        parameters=tuple(_rows(run / RESULT, result, "parameters", _parameter)),
+        parameters=tuple(_rows(run / RESULT, result, "parameters", parameter_of)),
         metrics=tuple(read_metrics(run)),
         figures=tuple(_rows(run / RESULT, result, "figures", _figure)),
         configuration=_object(run / CONFIGURATION),
@@ -337,7 +337,8 @@ def _figure(row: dict[str, Any]) -> Figure:
     return Figure(**{item.name: row[item.name] for item in fields(Figure) if item.name in row})
 
 
-def _parameter(row: dict[str, Any]) -> Parameter:
+def parameter_of(row: dict[str, Any]) -> Parameter:
+    """A row of `result.json`; raises `ValueError` for an interval of other elements."""
     value = np.ravel(np.asarray(row["value"], dtype=float))
     edges = {}
     for name in ("lower", "upper"):

@@ -26,12 +26,12 @@ from palpate.report.evidence import (
     Curves,
     Evidence,
     Motion,
-    Parameter,
     Piece,
     pieces,
     read_evidence,
 )
-from palpate.report.parameter_chart import number, parameters
+from palpate.report.parameter_chart import parameters
+from palpate.report.parameter_words import elements, interval, number
 from palpate.report.player import scene
 from palpate.report.style import STYLES, numbered
 from palpate.runs.figure_names import name_in_words, number_in_words, value_in_words
@@ -41,7 +41,6 @@ Section = tuple[str, str]  # title, HTML
 Part = Callable[[Evidence, dict[str, int]], str]
 NAMED = 5  # stages that a page names; more are counted
 _OPEN_NOTES = 3
-_FEW = 4  # elements of a parameter that are told one by one
 _VERDICTS = {
     True: '<span class="met">✓ met</span>',
     False: '<span class="not-met">✗ not met</span>',
@@ -265,8 +264,8 @@ def _parameters(evidence: Evidence, looks: dict[str, int]) -> str:
         cells.append(
             (
                 f"{_readable(row.name)}<br><small>{_text(row.about)}</small>",
-                f"{_elements(row.value)} {_text(row.unit)}",
-                "–" if row.fixed else _interval(row),
+                f"{elements(row)} {_text(row.unit)}",
+                "–" if row.fixed else interval(row),
                 "derived" if row.derived else status,
                 _text(row.verdict or "–"),
             )
@@ -379,26 +378,3 @@ def _text(text: str) -> str:
 
 def _readable(name: str) -> str:
     return _text(name.replace("_", " ").replace(".", " · "))
-
-
-def _elements(values: np.ndarray) -> str:
-    if 1 < values.size <= _FEW:
-        return "; ".join(number(float(value)) for value in values.ravel())
-    known = values[np.isfinite(values)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (math.nan, math.nan)
-    if not known.size or math.isclose(low, high, rel_tol=5e-4):
-        return number(low)
-    return f"{number(low)} to {number(high)}"
-
-
-def _interval(row: Parameter) -> str:
-    """The interval, or what is typical of the elements' intervals relative to their values."""
-    known = np.isfinite(row.lower) & np.isfinite(row.upper) & (row.value != 0)
-    if not known.any():
-        return "–"
-    if row.value.size <= _FEW:
-        edges = zip(row.lower.ravel(), row.upper.ravel(), strict=True)
-        return "; ".join(f"{number(low)} to {number(high)}" for low, high in edges)
-    value = row.value[known]
-    sides = (np.median((edge[known] - value) / np.abs(value)) for edge in (row.lower, row.upper))
-    return "typically " + " to ".join(f"{side:+.0%}" for side in sides).replace("-", "−")

@@ -1,4 +1,4 @@
-"""What was identified, as dots with whiskers; numbers with as many figures as mean something."""
+"""What was identified, as dots with whiskers."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate.report.charts import Chart, empty_layout, plain_text, titled_axis
 from palpate.report.evidence import Parameter
+from palpate.report.parameter_words import number
 
 _SURE, _UNINFORMED = "identified, 90 % interval", "not told by the data"
 _FIXED, _UNSURE = "fixed", "no interval"
@@ -76,22 +77,6 @@ def parameters(rows: Sequence[Parameter]) -> Chart | None:
         data += _markers("beyond", symbol, beyond, legend=False)
     limits = [0.8, 1.25, *(dot.value for dot in dots), *(end for ends in shown for end in ends)]
     return {"data": data, "layout": _layout(drawn, ticks, top, min(limits), max(limits))}
-
-
-def number(value: float) -> str:
-    """To three figures, or all digits before the point: "1430", "0.0123", "2.2×10⁻⁴"."""
-    if math.isnan(value):
-        return "unknown"
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        digits = max(3, math.floor(math.log10(abs(value) or 1)) + 1)
-        text = np.format_float_positional(value, precision=digits, fractional=False, trim="-")
-    else:
-        mantissa, exponent = f"{value:.2e}".split("e")
-        text = f"{float(mantissa):g}×10{str(int(exponent)).translate(_RAISED)}"
-    return text.replace("-", "−")
-
-
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def _dots(row: Parameter, top: float, pitch: float) -> Iterator[_Dot]:

@@ -24,8 +24,8 @@ from synthetic_evidence import (
 
 VOID = {"meta", "br", "img", "input", "link", "base"}
 EVERY_SECTION = [
-    *("Results", "Motion", "Path of the tip", "Error against horizon", "Parameters"),
-    *("Learning", "Energy", "What was run"),
+    *("Results", "Motion", "Energy", "Path of the tip", "Error against horizon", "Parameters"),
+    *("Learning", "What was run"),
 ]
 
 

@@ -97,11 +97,11 @@ def _sections(found: Sequence[Evidence]) -> tuple[str, list[Section]]:
     )
     rest: tuple[tuple[str, Part], ...] = (
         ("Results", _results),
+        *((piece.heading, partial(_piece, name, piece)) for name, piece in pieces().items()),
         ("Path of the tip", _tips),
         ("Error against horizon", _horizon),
         ("Parameters", _parameters),
         ("Learning", _learning),
-        *((piece.heading, partial(_piece, name, piece)) for name, piece in pieces().items()),
     )
     shown, told = ([(of, contents(part)) for of, part in parts] for parts in (views, rest))
     opening = next((of.pop(0) for _, of in shown if of), "")  # one picture, and the rest below
@@ -186,7 +186,7 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
         content = _caption(caption)
         content += f'<div class="player">{_data(scene(evidence.motions, looks))}</div>'
     if evidence.rendering is not None:
-        rendered = "The same scene as its simulator renders it." if content else "What happened."
+        rendered = "The same scene as its simulator renders it." if content else "In motion."
         content += _caption(rendered) + _image(evidence.rendering, "The scene in motion")
     return content
 
@@ -210,7 +210,11 @@ def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
                 distances.append(f"{number(distance)} m ({label})")
         if distances:
             caption += f"; root-mean-square distance from what was observed: {', '.join(distances)}"
-        caption = f"{motion.group}: {caption}" if motion.group else caption[0].upper() + caption[1:]
+        caption = (
+            f"{motion.group.replace('_', ' ')}: {caption}"
+            if motion.group
+            else caption[0].upper() + caption[1:]
+        )
         tips = {label: points[:, -1, :, None] for label, points in motion.chains.items()}
         chart = charts.prediction(Curves(motion.time, tips), looks, ("x (m)", "y (m)", "z (m)"))
         content += _caption(f"{caption}.") + _chart(chart)

@@ -24,6 +24,8 @@ NAMES = {
     "time_to_1pct": "time to 1 % energy",
     "settling_time": "time until at rest",
     "settling": "time until at rest",
+    "planning": "time to plan",
+    "carried": "distance while carrying",
     "lost_share": "frames in which it was lost",
     "late_over_1ms": "deadlines missed by more than 1 ms",
     "decision_p99": "slowest decisions (99th percentile)",

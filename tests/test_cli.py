@@ -121,7 +121,7 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         "palpate identify r": {"rope"},
         "palpate identify rope --dr": {"--driven", "--draws"},
         "palpate plan n": {"namo"},
-        "palpate demo --se": {"--seed"},
+        "palpate demo rope --se": {"--seed"},
         "palpate reproduce rope-mo": {"rope-model"},
         "palpate identify rope R.n": set(),  # a file's name, as the shell completes it
     }

@@ -115,7 +115,7 @@ def _run(words: list[str]) -> int:
     from palpate.commands.parsing import completion, parse
 
     if words[0] == "--completion":
-        kinds = {name: _options(name, command) for name, command in COMMANDS.items()}
+        kinds = {name: command.kinds(name) for name, command in COMMANDS.items()}
         print(completion(" ".join(words[1:]), kinds))
         return 0
 
@@ -143,12 +143,6 @@ def _run(words: list[str]) -> int:
         run = resolve(f"palpate.commands.{name}:run")
         run(options, *([kind] if name == "reproduce" else []))
     return 0
-
-
-def _options(name: str, command: Command) -> dict[str, Any]:
-    """Of each subject of a command; "" where it may be left out."""
-    kinds = {kind: resolve(place) for kind, place in command.kinds(name).items()}
-    return {"": next(iter(kinds.values()))} if command.optional else kinds
 
 
 def _note(show: Callable[..., None], message: Warning | str, *where: Any, **more: Any) -> None:

@@ -62,6 +62,5 @@ def _checked(options: Convert) -> Path:
         raise PalpateError(
             f"{out} is something else, which --fresh would remove: give another --out"
         )
-    if not options.lerobot:
-        check_writable(out)
+    check_writable(out)
     return out

@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
 from palpate.errors import PalpateError
-from palpate.family import check_name
+from palpate.family import Places, check_name, resolve
 
 Options = TypeVar("Options")
 _TAKES = {
@@ -42,16 +42,18 @@ def parse(kind: type[Options], program: str, words: list[str]) -> Options | None
         raise PalpateError(sentence(said.getvalue(), program, words)) from left
 
 
-def completion(shell: str, options: Mapping[str, Mapping[str, Any]]) -> str:
+def completion(shell: str, kinds: Mapping[str, Places]) -> str:
     """A script by which a shell completes commands, what they work on, and options.
 
-    `options` of each subject of each command, "" where a command has none. Raises `PalpateError`
-    for another shell than bash or zsh.
+    `kinds` of each command, as of `palpate.cli.Command`. Raises `PalpateError` for another shell
+    than bash or zsh.
     """
     check_name("shell", shell, ("bash", "zsh"))
     commands = {
-        name: subjects[""] if "" in subjects else make_dataclass(name, [("of", _one_of(subjects))])
-        for name, subjects in options.items()
+        name: resolve(of[""])
+        if "" in of
+        else make_dataclass(name, [("of", _one_of({n: resolve(place) for n, place in of.items()}))])
+        for name, of in kinds.items()
     }
     said, words = io.StringIO(), ["--tyro-print-completion", shell]
     how = (FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes)

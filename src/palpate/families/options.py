@@ -95,17 +95,11 @@ class Track(Options, ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Timing(Options):
-    """When the frames of a recording were taken, where it does not say so itself."""
+class Reading(Options):
+    """What recordings of markers that others have made do not say themselves."""
 
     rate: Number = None
     """Hz, for files that carry no time."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reading(Timing):
-    """What recordings of markers that others have made do not say themselves."""
-
     unit: Annotated[
         Literal["m", "cm", "mm"] | None,
         arg(metavar="{m,cm,mm}", help_behavior_hint="(default: what the file says, else m)"),
@@ -142,7 +136,7 @@ Method = Literal[
 
 
 @dataclass(frozen=True, kw_only=True)
-class Identify(Timing, ABC):
+class Identify(Options, ABC):
     """Identification from recordings; each family says which channels, and which models."""
 
     family: ClassVar[str]
@@ -157,6 +151,8 @@ class Identify(Timing, ABC):
     ]
     """What to fit: .npz of palpate, .npz with `positions`, .csv of a motion-capture system, or a
     robot's log: .mcap, .db3, .bag, or the folder of a rosbag2."""
+    rate: Number = None
+    """Hz, for files that carry no time."""
     validate: Annotated[
         tuple[Path, ...],
         arg(metavar="FILE ...", help_behavior_hint="(default: held-out trials, if any)"),

@@ -5,7 +5,6 @@ renamed over it, so that a reader finds the old content or the new, whatever kil
 """
 
 import dataclasses
-import errno
 import json
 import math
 import os
@@ -65,8 +64,6 @@ def check_writable(path: Path) -> None:
     """Raise `PalpateError` unless `write_bytes` could put a file at `path`; nothing stays there."""
     above = next(one for one in path.absolute().parents if one.exists())
     try:
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         with tempfile.TemporaryFile(dir=above):
             pass
     except OSError as error:

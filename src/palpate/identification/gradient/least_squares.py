@@ -220,13 +220,17 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     objective = Objective(coordinates, observation_scale(aligned, coordinates.reference), KNEE)
     flat, unravel = ravel_pytree(free)
     # The best starts first: about others the parameters' slope is a small difference of large sums.
-    alone = _finite(objective.products(free, offset, segments, False))
-    alone = alone.sum(axis=1, dtype=np.float64)
+    alone = objective.products(free, offset, segments, False).sum(axis=1, dtype=np.float64)
+    if (lost := ~np.isfinite(alone).all(axis=(1, 2))).any():
+        raise PalpateError(
+            f"trial {np.argmax(lost)} cannot be predicted from its start to its end: errors or "
+            "their slopes are no finite numbers; cut it where it jumps, or leave it out"
+        )
     freedom = int(np.sum(segments.seen)) - flat.size
     nowhere = np.zeros((segments.count, offset[0].size))
     own = _eliminated(alone, 0, _noise(alone, freedom), nowhere).start
     offset = jnp.asarray(own.reshape(offset.shape), offset.dtype)
-    products = _finite(objective.products(free, offset, segments)).astype(np.float64)
+    products = objective.products(free, offset, segments).astype(np.float64)
     total = products.sum(axis=1)
     noise = _noise(total[:, flat.size :, flat.size :], freedom)
     reduced = _eliminated(total, flat.size, noise, own)
@@ -255,17 +259,6 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
         share, shift = (np.asarray(of[path]).ravel() for of in (deviation, free))
         verdicts[path] = verdict(undecided(share, shift))
     return Intervals(lower, upper, verdicts, _undecided(information, unravel))
-
-
-def _finite(products: np.ndarray) -> np.ndarray:
-    """Products of the trials, in which every number is one."""
-    lost = ~np.isfinite(products).reshape(len(products), -1).all(axis=1)
-    if lost.any():
-        raise PalpateError(
-            f"trial {np.argmax(lost)} cannot be predicted from its start to its end: errors or "
-            "their slopes are no finite numbers; cut it where it jumps, or leave it out"
-        )
-    return products
 
 
 def _noise(products: Float[np.ndarray, "segments columns columns"], freedom: int) -> float:

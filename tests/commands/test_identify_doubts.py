@@ -1,5 +1,6 @@
 """What is wrong with a recording of a rope ends as a result that nobody takes for a good one."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,11 @@ from numpy_rope import PERIOD, chain
 from palpate.cli import main
 from palpate.commands import folders
 from palpate.commands.identify import run
+from palpate.commands.identify_fit import shareable
 from palpate.errors import DoubtfulResultError
 from palpate.families.rope.options import IdentifyRope
 from palpate.models.files import load_model
+from palpate.models.rope import Rope
 from palpate.runs.result import read_result
 
 
@@ -58,3 +61,31 @@ def test_a_good_recording_leaves_no_doubt(identify, markers, capsys):
     assert "trusted" not in capsys.readouterr().err
     _, about = load_model(Path("run/model.json"))
     assert about[folders.DOUBTS] == []
+
+
+def row(name, value, lower, upper, **said):
+    return {"name": name, "value": value, "lower": lower, "upper": upper,
+            "fixed": False, "shared": False, "verdict": None} | said  # fmt: skip
+
+
+def test_elements_that_may_have_one_value_are_named_with_what_it_gains():
+    alike = row("stiffness", [1.0, 1.2, 0.9, 1.1], [0.5] * 4, [2.0] * 4)
+    assert shareable([alike]) == (
+        "one value may do for all elements of stiffness: with --shared stiffness intervals are up "
+        "to 2 times narrower"
+    )
+    apart = row("mass", [1.0, 2.0, 4.0], [0.9, 1.9, 3.9], [1.1, 2.1, 4.1])
+    few = row("drag", [1.0, 1.0], [0.5, 0.5], [2.0, 2.0])
+    prior = alike | {"verdict": "not told by the data: the interval is the prior's"}
+    assert shareable([apart, few, prior, alike | {"shared": True}, alike | {"fixed": True}]) == ""
+
+
+def test_a_rope_on_the_limit_of_its_time_step_is_named():
+    options = IdentifyRope(recordings=())
+    stiff = Rope.uniform(0.5, 0.05, 6, control_period=0.02, substeps=4)
+    stiff = dataclasses.replace(stiff, stretch_stiffness=1e6 * stiff.stretch_stiffness).constrain()
+    (said,) = options.bounds(stiff)
+    assert "4 steps in 20 ms" in said
+    assert "--substeps 8 allows four times as much" in said
+    soft = dataclasses.replace(stiff, stretch_stiffness=0.1 * stiff.stretch_stiffness)
+    assert options.bounds(soft) == []

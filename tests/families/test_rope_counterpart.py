@@ -182,7 +182,7 @@ def test_a_training_tries_its_policy_in_the_same_rope(tmp_path, monkeypatch):
 
 
 def test_what_cannot_be_tried_is_not_trained(tmp_path):
-    stiff = own_rope(substeps=400, bend_stiffness=60.0)
+    stiff = own_rope(substeps=4000, bend_stiffness=6000.0)
     with pytest.raises(PalpateError, match="too slow to wait for: expected one of less stiffness"):
         TrainRopeStabilization(model=tmp_path).prepare(stiff)
 

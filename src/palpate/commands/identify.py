@@ -189,7 +189,10 @@ def _write_fit(
     write_evidence(run.path, report.evidence())
     rows = {
         "parameters": parameters,
-        "warnings": [*doubts, *found.warnings],
+        "warnings": [
+            *(*doubts, *options.bounds(found.model), *found.warnings),
+            *filter(None, [identify_fit.shareable(parameters)]),
+        ],
         "wall_time_s": wall_time,
     }
     folders.finish(run, figures, settings, identify_report.split(data), **rows)

@@ -19,6 +19,7 @@ from palpate.identification.data.prediction import PredictionError, or_nan, pred
 from palpate.identification.data.segments import difference
 from palpate.identification.gradient.residual import Correction
 from palpate.identification.identify import Identified
+from palpate.identification.verdicts import uninformed
 from palpate.models.model import Model
 from palpate.parameters import describe
 from palpate.report.charts import quantiles
@@ -26,6 +27,7 @@ from palpate.report.motion import in_numbers, in_space
 from palpate.runs import Figure
 from palpate.runs.figure_names import value_in_words
 
+AGREEING = 0.6  # of a parameter's intervals, that have to hold one value
 _START = "start model "
 CORRECTION = "correction"  # what the result's settings say of it
 UNITS = {"m": (100.0, "cm")}  # a person reads these errors of a fit in another unit
@@ -192,6 +194,35 @@ def fitted_rows(found: Identified) -> list[dict[str, Any]]:
 
 def _listed(value: Any) -> Any:
     return None if value is None else np.asarray(value).tolist()
+
+
+def shareable(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A sentence about parameters whose elements may as well have one value; "" without any.
+
+    Those whose intervals hold one and the same value for `AGREEING` of three or more elements. What
+    it costs is how much narrower that value's own interval would be: of independent errors the
+    inverse variances add up.
+    """
+    found, narrower = [], 1.0
+    for row in rows:
+        said = row["fixed"] or row["shared"] or row["lower"] is None or uninformed(row["verdict"])
+        if said or np.size(row["value"]) < 3:
+            continue
+        value, lower, upper = (np.ravel(row[key]) for key in ("value", "lower", "upper"))
+        held = ((lower <= value[:, None]) & (value[:, None] <= upper)).sum(axis=1).max()
+        if held < AGREEING * value.size:
+            continue
+        if (lower > 0).all():  # as it is searched, by its logarithm
+            lower, upper = np.log(lower), np.log(upper)
+        width = np.maximum(upper - lower, np.finfo(float).tiny)
+        found.append(row["name"])
+        narrower = max(narrower, float(np.median(width) * np.sqrt(np.sum(width**-2.0))))
+    if not found:
+        return ""
+    return (
+        f"one value may do for all elements of {', '.join(found)}: with --shared {' '.join(found)} "
+        f"intervals are up to {narrower:.2g} times narrower"
+    )
 
 
 def describe_correction(correction: Mapping[str, Any]) -> str:

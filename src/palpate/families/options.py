@@ -237,6 +237,10 @@ class Identify(Options, ABC):
         """
         return ""
 
+    def bounds(self, model: Model) -> list[str]:
+        """Sentences about values that a fitted model could not exceed, which intervals ignore."""
+        return []
+
     def hypotheses(self, recordings: Sequence[Recording], aligned: Aligned) -> Hypotheses:
         """The models to compare; one is identified without comparison. Arguments as of `reference`.
 

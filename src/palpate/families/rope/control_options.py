@@ -137,7 +137,7 @@ class EvaluateRope(Evaluate):
     bending_stiffness: Number = None
     """E I, N m^2."""
     joint_damping: Number = None
-    """Against bending, N m s/rad at each of 40 joints."""
+    """Against bending, N m s/rad at each of its joints."""
     world: Annotated[Path | None, arg(metavar="FILE.xml", help_behavior_hint="(default: none)")] = (
         None
     )

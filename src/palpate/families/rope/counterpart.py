@@ -10,8 +10,9 @@ the same of what makes a hanging rope swing, summed along its length L:
                  and c_g, the grip's own, at the pivot
     drag         linear and quadratic, so that a rope which swings straight, v = s / L, loses the
                  same power: sum c v^2 and sum c |v|^3 over nodes or bodies
-    twisting     GJ = 0.7 EI: a round section with Poisson's ratio 0.4. How a hanging rope swings
-                 says next to nothing about it
+    twisting     GJ = 0.7 EI: a round section with Poisson's ratio 0.4; but no faster than bending,
+                 because how a hanging rope swings says next to nothing about it
+    bodies       40, or down to 20 where a stiff rope of more would need shorter time steps
     gravity      the model's, as its length and its gravity say together how fast it swings
     markers      where the nodes are
 
@@ -37,6 +38,7 @@ from palpate.worlds.rope.configuration import RopeConfiguration, in_step
 
 SOURCE = "MuJoCo rope"  # in the provenance of what palpate recorded itself
 TWIST = 0.7  # GJ / EI
+BODIES = (40, 30, 20)
 
 
 def counterpart(model: Rope, observation_noise: float) -> RopeConfiguration:
@@ -68,7 +70,6 @@ def counterpart(model: Rope, observation_noise: float) -> RopeConfiguration:
         "mass": float(values["node_mass"].sum()),
         "mass_distribution": "uniform" if uniform else lambda s: np.interp(s, places, density),
         "bending_stiffness": bending,
-        "twisting_stiffness": TWIST * bending,
         "grip": "clamped" if clamped else "pivot",
         "grip_damping": float(values["grip_damping"]),
         "gravity": float(values["gravity"]),
@@ -76,7 +77,17 @@ def counterpart(model: Rope, observation_noise: float) -> RopeConfiguration:
         "marker_places": tuple(places.tolist()),
         "observation_noise": observation_noise,
     }
-    plain = RopeConfiguration(length=constants["length"], air_viscosity=1.0, air_density=1.0)
+    stiff = {name: constants[name] for name in ("length", "mass", "bending_stiffness")}
+    instant = {"time_step": 1e-6, "control_period": 1e-6}
+    for bodies in BODIES:
+        quickest = RopeConfiguration(**stiff, **instant, bodies=bodies).fastest()
+        if quickest["bending_stiffness"] * RopeConfiguration.time_step < 1:
+            break
+    twisting = TWIST * min(1.0, (6 / TWIST) * (RopeConfiguration.radius * bodies / depth[-1]) ** 2)
+    constants |= {"bodies": bodies, "twisting_stiffness": twisting * bending}
+    plain = RopeConfiguration(
+        length=constants["length"], air_viscosity=1.0, air_density=1.0, bodies=bodies
+    )
     spacing = plain.length / plain.bodies
     middles = (np.arange(plain.bodies) + 0.5) / plain.bodies
     viscosity, air = (

@@ -190,6 +190,18 @@ class IdentifyRope(Identify, Reading):
 
         return misfit(aligned, error)
 
+    def bounds(self, model: Rope) -> list[str]:
+        """See `Identify.bounds`: how stiff a rope its time step can integrate."""
+        from palpate.models.rope.stability import LIMIT, load
+
+        if float(load(model).max()) < 0.97 * LIMIT:
+            return []
+        return [
+            f"the rope is as stiff as {model.substeps} steps in {1e3 * model.control_period:.3g} "
+            "ms can integrate: its stiffnesses may be higher, and their intervals do not know; "
+            f"--substeps {2 * model.substeps} allows four times as much"
+        ]
+
     def _driven(self, aligned: Aligned) -> list[int]:
         from palpate.recordings.recording import resolve_indices
 

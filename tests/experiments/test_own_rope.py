@@ -112,7 +112,8 @@ def test_what_is_missed_and_what_is_flagged_falsely_is_counted(tmp_path, monkeyp
     found = spoilt.check_recordings(Experiment("own-rope", tmp_path, True, 0), 2)
     rate, false = found.figures()
     assert (rate.value, false.value) == (0.5, 1)
-    assert len(found.mistaken) == 2
+    assert found.missed == ["280001, rate halved: unit"]
+    assert found.false == ["280001: rate: it is"]
 
 
 def test_the_headline_is_the_worst_rope_in_the_worse_world():
@@ -120,7 +121,9 @@ def test_the_headline_is_the_worst_rope_in_the_worse_world():
         ("mujoco", "controlled"): 39, ("own", "controlled"): 40, ("mujoco", "served"): 40,
         ("own", "served"): 38, ("mujoco", "swing damper"): 40, ("own", "swing damper"): 20,
     }  # fmt: skip
-    times = {key: 1.0 for key in rates} | {("own", "controlled"): 0.9}
+    times: dict[tuple[str, str], float | None] = {key: 1.0 for key in rates} | {
+        ("own", "controlled"): 0.9
+    }
     first = own_rope.Outcome(40, rates, times, True)
     second = dataclasses.replace(first, time=times | {("own", "swing damper"): 0.5}, ended=False)
     values = {figure.name: figure.value for figure in own_rope.figures([first, second])}

@@ -101,7 +101,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             "markers_and_rates": SEEN[: size.ropes],
             "iterations": size.iterations,
             "recorded": [TRIALS, LASTING],
-            "mistaken": flagged.mistaken,
+            "flagged_falsely": flagged.false,
+            "missed": flagged.missed,
         },
         "ropes are drawn by their seeds, and used for nothing else",
     )

@@ -15,6 +15,7 @@ from palpate.families.rope.options import IdentifyRope
 from palpate.recordings import Channel, Recording, Role, Trial
 from palpate.recordings.files import write_recording
 from palpate.runs import Figure
+from palpate.runs.progress import progress
 
 FIRST = 280_000  # seed of the first rope
 MARKERS, RATES = (5, 60), (20.0, 240.0)  # that ropes are drawn with
@@ -55,54 +56,50 @@ KINDS = {
 WRONG_FILE = "wrong file"
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Flagged:
-    """How many recordings of each kind there were, and what was missed or seen falsely."""
+    """Of `count` good recordings and as many spoilt ones: what was flagged falsely, and missed."""
 
-    spoilt: int = 0
-    good: int = 0
-    mistaken: list[str] = dataclasses.field(default_factory=list)
-    missed: int = 0
-    false: int = 0
+    count: int
+    false: list[str]
+    missed: list[str]
 
     def figures(self) -> list[Figure]:
         """`flagged_rate` of the spoilt ones, by the right cause; `false_flags` of the good ones."""
-        caught = self.spoilt - self.missed
         return [
-            share_of("flagged_rate", caught, self.spoilt, bar=1.0),
-            Figure("false_flags", self.false, f"of {self.good}", 0),
+            share_of("flagged_rate", self.count - len(self.missed), self.count, bar=1.0),
+            Figure("false_flags", len(self.false), f"of {self.count}", 0),
         ]
 
 
 def check_recordings(experiment: Experiment, count: int) -> Flagged:
     """Record `count` ropes; let `palpate identify` read each as it is, and spoilt."""
-    found, names = Flagged(), [*KINDS, WRONG_FILE]
     first = experiment.uses(FIRST, count)
-    folder = experiment.out / "checked"
-    folder.mkdir(parents=True, exist_ok=True)
-    with experiment.counted():
-        for index in range(count):
-            seed, name = first + index, names[index % len(names)]
-            random = np.random.default_rng((seed, 2))
-            markers = int(random.integers(MARKERS[0], MARKERS[1] + 1))
-            rope = drawn(seed, markers, float(np.exp(random.uniform(*np.log(RATES)))))
-            recording = recorded(rope, seed, TRIALS, LASTING)
-            good, bad = folder / f"{seed}.npz", folder / f"{seed}-spoilt.npz"
-            write_recording(good, recording)
-            found.good += 1
-            if said := problems(good, rope.mass):
-                found.false += 1
-                found.mistaken.append(f"{seed}: {said[0]}")
-            found.spoilt += 1
-            kind = KINDS.get(name, Spoilt("no channel"))
-            write_recording(
-                bad, _furniture() if name == WRONG_FILE else spoil(recording, kind, random)
-            )
-            said = problems(bad, kind.mass * rope.mass)
-            if not (said and kind.cause in said[0]):
-                found.missed += 1
-                found.mistaken.append(f"{seed}, {name}: {said[0] if said else 'nothing was said'}")
-    return found
+    found = experiment.found(
+        "checked", {"ropes": count}, lambda: _checked(experiment.out / "checked", first, count)
+    )
+    return Flagged(count, found["false"], found["missed"])
+
+
+def _checked(folder: Path, first: int, count: int) -> dict[str, Any]:
+    false, missed, names = [], [], [*KINDS, WRONG_FILE]
+    for index in progress(range(count), "recordings"):
+        seed, name = first + index, names[index % len(names)]
+        random = np.random.default_rng((seed, 2))
+        markers = int(random.integers(MARKERS[0], MARKERS[1] + 1))
+        rope = drawn(seed, markers, float(np.exp(random.uniform(*np.log(RATES)))))
+        recording = recorded(rope, seed, TRIALS, LASTING)
+        kind = KINDS.get(name, Spoilt("no channel"))
+        bad = furniture() if name == WRONG_FILE else spoil(recording, kind, random)
+        good_file, bad_file = folder / f"{seed}.npz", folder / f"{seed}-spoilt.npz"
+        write_recording(good_file, recording)
+        write_recording(bad_file, bad)
+        if said := problems(good_file, rope.mass):
+            false.append(f"{seed}: {said[0]}")
+        said = problems(bad_file, kind.mass * rope.mass)
+        if not (said and kind.cause in said[0]):
+            missed.append(f"{seed}, {name}: {said[0] if said else 'nothing was said'}")
+    return {"false": false, "missed": missed}
 
 
 def problems(file: Path, mass: float) -> list[str]:
@@ -124,7 +121,7 @@ def spoil(recording: Recording, kind: Spoilt, random: Any) -> Recording:
     return dataclasses.replace(recording, trials=tuple(trials))
 
 
-def _furniture() -> Recording:
+def furniture() -> Recording:
     """Something else that was pushed: where it was, and how hard it was pushed."""
     times = np.arange(100) / 50
     pose = Channel("pose", Role.OBSERVATION, times, np.zeros((100, 3)), "m")

@@ -77,10 +77,13 @@ def counterpart(model: Rope, observation_noise: float) -> RopeConfiguration:
         "marker_places": tuple(places.tolist()),
         "observation_noise": observation_noise,
     }
-    stiff = {name: constants[name] for name in ("length", "mass", "bending_stiffness")}
-    instant = {"time_step": 1e-6, "control_period": 1e-6}
+    stiff: dict[str, Any] = {
+        **{name: constants[name] for name in ("length", "mass", "bending_stiffness")},
+        "time_step": 1e-6,
+        "control_period": 1e-6,
+    }
     for bodies in BODIES:
-        quickest = RopeConfiguration(**stiff, **instant, bodies=bodies).fastest()
+        quickest = RopeConfiguration(**stiff, bodies=bodies).fastest()
         if quickest["bending_stiffness"] * RopeConfiguration.time_step < 1:
             break
     twisting = TWIST * min(1.0, (6 / TWIST) * (RopeConfiguration.radius * bodies / depth[-1]) ** 2)

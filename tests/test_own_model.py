@@ -282,6 +282,7 @@ def test_the_page_of_the_docs_runs(workshop, tmp_path, monkeypatch, capsys):
         assert abs(getattr(known["model"], name) / true - 1) < 0.05
         assert known["found"].lower[name] < true < known["found"].upper[name]
     assert "(fixed)" in str(known["weighed"])
+    assert known["drawing"](known["model"], np.zeros((5, 1)))[""].shape == (5, 2, 3)
     assert known["about"] == {"recording": "R.npz"}
 
 

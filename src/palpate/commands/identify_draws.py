@@ -25,7 +25,7 @@ from palpate.report.motion import in_numbers, in_space
 from palpate.runs import Figure
 from palpate.runs.figure_names import value_in_words
 
-LEVEL = 0.9
+LEVEL, SHORT = 0.9, 0.1  # of the intervals, and how far their coverage may fall short of it
 FAN, LINES = "draws", 40  # of the page's fan
 
 
@@ -117,7 +117,10 @@ def summary_of_draws(
         f"Draws of the model ({settings['structure']}) predict {settings['scored_on']}, "
         f"{PIECE:g} s ahead, within {' and '.join(map(value_in_words, errors))} (root mean square)."
     )
-    held = f"Its 90 % intervals hold {value_in_words(inside)} of what was seen. {told(rows)}"
+    held = f"Its 90 % intervals hold {value_in_words(inside)} of what was seen"
+    if inside.value is not None and inside.value < LEVEL - SHORT:
+        held += ", too little to rely on them"
+    held += f". {told(rows)}"
     if apart is not None and apart >= MIXED:
         held += f" Draw more: the chains do not agree yet (R-hat {apart:.3g})."
     return [found, doubted(settings[folders.DOUBTS]) or held]

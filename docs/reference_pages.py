@@ -25,6 +25,7 @@ STAGES = {
         *("models.model", "models.contract", "models.files", "models.python_files", "parameters"),
         *("models.residual", "models.rope.rope", "models.rope.parameters"),
         *("models.planar.planar", "models.planar.parameters", "models.planar.shapes"),
+        *("models.planar.wheels", "families.furniture.structures"),
     ],
     "identification": [
         *("identification.identify", "identification.declarations", "identification.verdicts"),
@@ -33,6 +34,7 @@ STAGES = {
         *("identification.posterior.posterior", "identification.posterior.predictive"),
         *("identification.posterior.comparison", "identification.posterior.calibration"),
         *("identification.posterior.diagnostics", "identification.posterior.files"),
+        "identification.posterior.settled",
         *("identification.samplers.draws", "identification.samplers.target"),
         *("identification.samplers.hamiltonian", "identification.samplers.metropolis"),
         *("identification.samplers.local_global", "identification.samplers.tempered"),
@@ -54,7 +56,8 @@ STAGES = {
     ],
     "worlds": [
         *("worlds.world", "worlds.camera", "worlds.excitation", "worlds.rope.configuration"),
-        *("worlds.rope.rope", "worlds.rope.mjcf", "families.rope.counterpart"),
+        *("worlds.rope.rope", "worlds.rope.mjcf", "worlds.rope.filmed"),
+        "families.rope.counterpart",
         *("worlds.furniture.pieces", "worlds.furniture.furniture", "worlds.furniture.robot"),
         "worlds.furniture.handling",
     ],

@@ -3,6 +3,8 @@
 import importlib
 import importlib.util
 import inspect
+import operator
+import re
 from pathlib import Path
 
 import pytest
@@ -60,6 +62,19 @@ def test_every_command_is_one_call_that_the_reference_explains():
         assert resolve(f"palpate.commands.{name}:run").__doc__, words
         assert resolve(place).__doc__, words
         assert place.partition(":")[0] in MODULES, f"{words}: {place} is on no page"
+
+
+def test_what_the_pages_of_the_docs_point_at_is_explained():
+    pages = [page.read_text(encoding="utf-8") for page in PAGES.parent.glob("*.md")]
+    roles = [role for page in pages for role in re.findall(r"\{(\w+)\}`(palpate[\w.]+)`", page)]
+    assert len(roles) > 15
+    for role, target in roles:
+        home = max((name for name in MODULES if f"{target}.".startswith(f"{name}.")), default="")
+        assert home, f"{target} is on no page"
+        assert (role == "mod") == (home == target)
+        operator.attrgetter(target.removeprefix(home).lstrip(".") or "__doc__")(
+            importlib.import_module(home)
+        )
 
 
 @pytest.mark.parametrize("face", FACES)

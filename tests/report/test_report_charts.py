@@ -149,6 +149,21 @@ def test_motion_survives_its_sixteen_bits_and_keeps_gaps():
     assert np.diff(group["time"]).max() <= 0.02 + 1e-9
 
 
+def test_lines_that_a_gap_ends_have_no_tip_and_those_of_a_fan_are_faint():
+    points = np.zeros((201, 4, 3))
+    outlines = points.copy()
+    outlines[:, -1] = np.nan
+    looks = {"observed": 0, "draws": 1}
+    (group,) = scene([Motion("", TIME, {"observed": points, "draws": outlines})], looks)["groups"]
+    assert [chain["lines"] for chain in group["chains"]] == [False, True]
+    assert [chain["faint"] for chain in group["chains"]] == [False, True]
+    (group,) = scene([Motion("", TIME, {"observed": outlines, "x": points})], looks | {"x": 2})[
+        "groups"
+    ]
+    assert [chain["lines"] for chain in group["chains"]] == [True, False]
+    assert not any(chain["faint"] for chain in group["chains"])
+
+
 def test_a_long_motion_is_thinned():
     time = np.arange(20_000) / 100
     (group,) = scene([Motion("", time, {"x": np.zeros((20_000, 1, 3))})], {"x": 1})["groups"]

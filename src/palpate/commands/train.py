@@ -135,9 +135,8 @@ def summary_of(figures: Sequence[Figure], warnings: Sequence[str]) -> list[str]:
     inside, outside = known.get("in_model.success"), known.get("in_world.success_rate")
     said, tried = [], "Nothing but that model was tried"
     if inside is not None:
-        rate = value_in_words(inside)
         said.append(
-            f"In the model it was trained in, the policy succeeds from {rate} of the starts"
+            f"In its own model the policy succeeds in {value_in_words(inside)} of the starts"
         )
     if outside is not None:
         tried = f"In a few trials in a simulated world it succeeds in {value_in_words(outside)}"

@@ -41,7 +41,7 @@ STYLES = (
 )
 # What has the same look on every chart: what was seen, what was found, and what is without it.
 _ROLES = {
-    **dict.fromkeys(("observed", "true"), 0),
+    **dict.fromkeys(("observed", "true", "desired tip"), 0),
     **dict.fromkeys(("predicted", "identified", "controlled", "draws", "tracked", "error"), 1),
     **dict.fromkeys(("start model", "expected", "held still", "left alone"), 2),
     "physics alone": 3,

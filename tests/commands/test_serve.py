@@ -74,6 +74,7 @@ def test_with_nobody_there_it_waits_and_says_how_it_went(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "waiting: no state has come yet\n" in said
     assert "stopped: asked to stop\n" in said
+    assert "\ntimes it braked: 0\n" in said
     result = read_result(tmp_path / "served/result.json")
     assert {figure.name for figure in result.figures} == {
         "late_over_1ms", "decision_p99_ms", "turnaround_p99_ms", "brakes",

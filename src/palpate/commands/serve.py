@@ -13,6 +13,7 @@ import numpy as np
 
 from palpate.commands import folders
 from palpate.commands.options import Serve
+from palpate.commands.train import lines_of
 from palpate.deployment.deployment import Deployment, deployment_of
 from palpate.deployment.intake import MISSING, Intake
 from palpate.deployment.loop import Record, run_loop
@@ -69,8 +70,8 @@ def run(options: Serve) -> Path:
             printed, status = ([], 0) if robot is None else _ended(robot)
         write_json(run.path / LATENCY, record.to_dict())
         figures = figures_of(record) + (deployment.outcome(printed[-1]) if printed else [])
-        result = folders.finish(run, figures, {"real_time_scheduling": prompt})
-        print("\n".join(result.lines()))
+        folders.finish(run, figures, {"real_time_scheduling": prompt})
+        print("\n".join(lines_of(figures)))
         path = folders.hand_over(options, run, "A policy in real time")
         if fault := stopped_by(record):
             raise StoppedError(f"the policy was stopped and did not go on: {fault}")

@@ -1,4 +1,4 @@
-"""What `palpate identify` shows of any result: a motion, its units, parameters, lines to read."""
+"""What `palpate identify` says of any result: units, names, parameters, lines to read."""
 
 import math
 from collections.abc import Sequence

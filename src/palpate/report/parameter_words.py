@@ -6,7 +6,7 @@ import numpy as np
 
 from palpate.report.evidence import Parameter
 
-_FEW = 8  # elements of a parameter that are told one by one
+_FEW = 4  # elements of a parameter that are told one by one
 
 
 def number(value: float) -> str:

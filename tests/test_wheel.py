@@ -107,7 +107,7 @@ WORK = {
 }
 TOLD = {  # among what the last of them says
     "06_robot": ["the tip, 4.0 s ahead", "at rest in", "running", "braking", "the gripper moves"],
-    "04_own_model": ["inertia: 0.", "simulated with 0.8", "in model: angle"],
+    "04_own_model": ["inertia: 0.", "simulated with 0.8", "angle, in the model"],
     "03_own_rope": ["tried in MuJoCo ropes drawn around that of the model", "8 markers"],
     "05_furniture": ["pushed with 60 N: x (m)", "to be moved: box"],
 }
@@ -115,11 +115,12 @@ BRIEF = """
 import importlib
 from pathlib import Path
 
-from palpate.commands import train
-from palpate.families.rope import options
+from palpate.commands import in_model
+from palpate.families.rope import control_options
 from palpate.trials.rope import stabilization
 
-stabilization.TRIAL_PERIODS, options.RENDERED, train.EPISODES = 0.2, 0.1, 8
+in_model.EPISODES = 8
+stabilization.TRIAL_PERIODS, control_options.RENDERED = 0.2, 0.1
 out = Path("out")
 """
 

@@ -1,10 +1,14 @@
 """What `reproduce own-model` pushes, counts and holds against what; the command is stood in for."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from palpate.experiments import own_model
+from palpate.experiments.rivals.door_sysid import fit_door
+from palpate.experiments.rivals.mujoco_sysid import mujoco_sysid
 from palpate.models.model import Model, rollout
 from palpate.models.python_files import load_class
 from palpate.runs import Figure, Result
@@ -13,7 +17,14 @@ from palpate.runs.storage import write_json
 SEED = 7  # of no door that is reproduced
 
 
-def test_the_doors_of_mujoco_move_as_the_example_says():
+@pytest.fixture
+def strong(monkeypatch):
+    """Pushes under which a door moves far."""
+    monkeypatch.setattr(own_model, "TORQUE", (1.0, 4.0))
+    monkeypatch.setattr(own_model, "PUSHED", (0.5, 1.5))
+
+
+def test_the_doors_of_mujoco_move_as_the_example_says(strong):
     """To the noise, from rest, over four seconds, through friction and past pi."""
     truth = own_model.drawn(SEED)
     door = load_class(f"{own_model.EXAMPLE}:Door", Model)(**truth)
@@ -29,11 +40,22 @@ def test_the_doors_of_mujoco_move_as_the_example_says():
     assert np.abs(angle).max() <= np.pi
 
 
-def test_finite_differences_find_a_door_about():
+def test_finite_differences_find_a_door_that_moves_far(strong):
     truth = own_model.drawn(SEED)
     found = own_model.finite_differences(own_model.pushed(truth, SEED))
     for name, true in truth.items():
         assert found[name] == pytest.approx(true, rel=0.2), name
+
+
+def test_mujoco_sysid_finds_a_door(strong):
+    pytest.importorskip("mujoco.sysid")
+    mujoco_sysid()
+    truth = own_model.drawn(SEED)
+    recording = own_model.pushed(truth, SEED)
+    few = dataclasses.replace(recording, trials=recording.trials[:2])
+    found = fit_door(few, lambda door: own_model.scene(door, 10), own_model.RANGES)
+    for name, true in truth.items():
+        assert found[name] == pytest.approx(true, rel=0.1), name
 
 
 def test_the_worst_method_and_all_intervals_count(tmp_path, monkeypatch):
@@ -51,6 +73,8 @@ def test_the_worst_method_and_all_intervals_count(tmp_path, monkeypatch):
         return options.out
 
     monkeypatch.setattr(own_model.identify, "run", run)
+    monkeypatch.setattr(own_model, "mujoco_sysid", lambda: None)
+    monkeypatch.setattr(own_model, "fit_door", lambda *_: own_model.drawn(SEED))
     result = own_model.reproduce(tmp_path, quick=True, seed=3)
     figures = {figure.name: figure for figure in result.figures}
     assert figures["model_lines"].met
@@ -60,5 +84,8 @@ def test_the_worst_method_and_all_intervals_count(tmp_path, monkeypatch):
     assert not figures["posterior.relative_error"].met
     assert figures["posterior.coverage_90"].value == pytest.approx(2 / 3)
     assert figures["seconds_per_door"].value == 3.0
-    assert result.seeds == [3, 260_003, 260_004]
+    assert result.seeds == [3, 265_003, 265_004]
+    beside = figures["gradient.relative_error"].rival
+    assert beside is not None
+    assert "mujoco.sysid" in beside
     assert result.settings["missed"]["smc"] == [["inertia"], ["inertia"]]

@@ -75,12 +75,31 @@ def test_short_gaps_of_driven_markers_are_filled_and_noted():
     )
 
 
+def test_a_trial_is_cut_where_a_driven_marker_was_long_not_seen():
+    values = swinging()
+    gappy = np.array(values)
+    gappy[20:30, 2] = np.nan
+    gappy[60:62, 0] = np.nan
+    gappy[100:130, 0] = np.nan
+    gappy[133:150, 2] = np.nan  # what is left between these two gaps is no motion
+    made = with_driven(recorded(gappy), [0, 2])
+    first, second, third = made.trials
+    assert [trial.name for trial in made.trials] == ["a, part 1", "a, part 2", "a, part 3"]
+    for trial, rows in ((first, slice(0, 20)), (second, slice(30, 100)), (third, slice(150, None))):
+        np.testing.assert_allclose(trial["grip"].time, 0.01 * np.arange(len(values))[rows])
+        seen = np.isfinite(gappy[rows][:, [0, 2]])
+        np.testing.assert_array_equal(trial["grip"].values[seen], values[rows][:, [0, 2]][seen])
+    assert made.notes[0] == (
+        "trial 'a, part 1', grip: driven marker 0 was not seen for 0.31 s after 0.9900 s, "
+        "more than 10 frames: the trial was cut there"
+    )
+    aligned = made.align(0.01, "markers", "grip")
+    assert aligned.length.tolist() == [20, 70, len(values) - 150]
+    np.testing.assert_allclose(aligned.observation[1, 0], values[30])
+
+
 def test_driven_markers_that_cannot_be_are_refused():
     values = swinging()
-    values[20:30, 2] = np.nan
-    sentence = r"marker 2 of trial 'a' is not seen for 0\.11 s after 0\.1900 s, more than 10 frames"
-    with pytest.raises(PalpateError, match=sentence):
-        with_driven(recorded(values), [0, 2])
     with pytest.raises(PalpateError, match="no marker 6: there are 6, 0 to 5 or -6 to -1"):
         with_driven(recorded(values), [6])
     with pytest.raises(PalpateError, match="marker -6 is named twice"):

@@ -21,6 +21,7 @@ from palpate.recordings.npz import write_recording
 from palpate.recordings.recording import Recording
 from palpate.recordings.rosbag.bag import read_bag
 from palpate.recordings.rosbag.files import is_bag
+from palpate.recordings.rosbag.numbers import read_numbers
 from palpate.recordings.tables import METRES, Z_UP, MarkerTable, recording_of
 from palpate.runs.storage import DamagedFileError
 
@@ -46,7 +47,8 @@ def read_recording(
     "markers" they may give a driven "gripper" and a "command".
 
     A plain CSV that has `columns` by name, and no markers, becomes a channel for each, as
-    `columns.read_channels` describes.
+    `columns.read_channels` describes; in a log they are the places of numbers, as
+    `rosbag.numbers.read_numbers` does.
 
     `rate` (Hz) is for files without time, `unit` ("m", "cm", "mm") for files that do not say, and
     `up` ("x", "y", "z") names the axis that points up, by default y in a Motive export and z
@@ -68,7 +70,7 @@ def read_recording(
         elif path.suffix.lower() == ".csv":
             found = read_channels(path, columns, rate) if columns else [(path.stem, read_csv(path))]
         elif is_bag(path):
-            found = read_bag(path, topics)
+            found = read_numbers(path, columns) if columns else read_bag(path, topics)
         else:
             raise PalpateError(
                 f"unknown kind of recording '{path.suffix}': known are .npz, .csv, .mcap, .db3, "

@@ -8,6 +8,7 @@ others into "not seen"; it changes nothing that fast motion or dropped frames co
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -34,20 +35,23 @@ def with_driven(
 
     `markers` are indices into the second axis of `channel`; negative ones count from the end.
     Which they are is kept as the fact `name`. Gaps of up to 10 nominal periods are filled linearly,
-    and rows at either end at which a driven marker was not seen are left out; both are noted.
+    a trial is cut in two at a longer one, and rows at either end at which a driven marker was not
+    seen are left out; all is noted.
 
-    Raises `PalpateError` for a marker that does not exist or is named twice, a longer gap, or a
-    channel `name` that is there already.
+    Raises `PalpateError` for a marker that does not exist, is named twice or is never seen for 10
+    periods, or a channel `name` that is there already.
     """
     trials = []
     for trial in recording.trials:
         if name in trial.channels:
             raise PalpateError(f"trial '{trial.name}' already has a channel '{name}'")
-        driven = _driven(trial, markers, channel, name)
+        parts = _driven(trial, markers, channel, name)
         count = trial[channel].values.shape[1]
         fact = Driven(channel, resolve_indices(markers, count, "marker"))
-        channels, facts = {**trial.channels, name: driven}, {**trial.facts, name: fact}
-        trials.append(replace(trial, channels=channels, facts=facts))
+        for number, driven in enumerate(parts, 1):
+            channels, facts = {**trial.channels, name: driven}, {**trial.facts, name: fact}
+            called = trial.name if len(parts) == 1 else f"{trial.name}, part {number}"
+            trials.append(replace(trial, name=called, channels=channels, facts=facts))
     return replace(recording, trials=tuple(trials))
 
 
@@ -77,7 +81,8 @@ def repair_markers(recording: Recording, channel: str = "markers") -> Recording:
     return replace(recording, trials=tuple(trials))
 
 
-def _driven(trial: Trial, markers: Sequence[int], channel: str, name: str) -> Channel:
+def _driven(trial: Trial, markers: Sequence[int], channel: str, name: str) -> list[Channel]:
+    """The driven channel, in parts between gaps that are too long to be filled."""
     source = trial[channel]
     if source.values.ndim < 2:
         raise PalpateError(f"channel '{channel}' of trial '{trial.name}' has no markers to drive")
@@ -86,33 +91,46 @@ def _driven(trial: Trial, markers: Sequence[int], channel: str, name: str) -> Ch
         raise PalpateError("no driven marker is named: give at least one index")
     values = np.array(source.values[:, chosen])
     seen = ~np.any(np.isnan(values).reshape(len(values), len(chosen), -1), axis=2)
-    together = np.flatnonzero(np.all(seen, axis=1))
-    if not len(together):
-        raise PalpateError(
-            f"the driven markers {list(markers)} of trial '{trial.name}' are never seen together"
-        )
-    inside = slice(together[0], together[-1] + 1)
-    time, values, seen = source.time[inside], values[inside], seen[inside]
+    longest = DRIVEN_GAP * source.nominal_period * (1 + ON_STAMP)
+    cuts, notes = {0, len(values)}, []
     for k, marker in enumerate(chosen):
         rows = np.flatnonzero(seen[:, k])
-        gap = np.where(np.diff(rows) > 1, np.diff(time[rows]), 0.0)
-        if gap.max(initial=0.0) > DRIVEN_GAP * source.nominal_period * (1 + ON_STAMP):
-            at = time[rows[np.argmax(gap)]]
-            raise PalpateError(
-                f"driven marker {marker} of trial '{trial.name}' is not seen for {gap.max():.4g} s "
-                f"after {at:.4f} s, more than {DRIVEN_GAP} frames: cut the trial there"
+        for before in np.flatnonzero(np.diff(source.time[rows]) > longest):
+            first, last = rows[before], rows[before + 1]
+            cuts.add(int(last))
+            notes.append(
+                f"driven marker {marker} was not seen for "
+                f"{source.time[last] - source.time[first]:.4g} s after {source.time[first]:.4f} s, "
+                f"more than {DRIVEN_GAP} frames: the trial was cut there"
             )
-        for axis in np.ndindex(values.shape[2:]):
-            track = values[(slice(None), k, *axis)]
-            track[:] = np.interp(time, time[rows], track[rows])
-    notes = []
-    if unseen := int((~seen).sum()):
-        notes.append(f"{unseen} unseen positions of driven markers were interpolated")
-    if cut := len(source.time) - len(time):
-        notes.append(f"{cut} rows at the ends were left out, as a driven marker was not seen")
-    return replace(
-        source, name=name, role=Role.DRIVEN, time=time, values=values, notes=tuple(notes)
-    )
+    parts = []
+    for start, stop in pairwise(sorted(cuts)):
+        together = np.flatnonzero(np.all(seen[start:stop], axis=1))
+        if not len(together) or np.ptp(together) < DRIVEN_GAP < len(values) - 1:
+            continue
+        inside = slice(start + int(together[0]), start + int(together[-1]) + 1)
+        said = [*notes] if not parts else []
+        for k in range(len(chosen)):
+            rows = inside.start + np.flatnonzero(seen[inside, k])
+            for axis in np.ndindex(values.shape[2:]):
+                track = values[(slice(None), k, *axis)]
+                track[inside] = np.interp(source.time[inside], source.time[rows], track[rows])
+        if unseen := int((~seen[inside]).sum()):
+            said.append(f"{unseen} unseen positions of driven markers were interpolated")
+        if cut := stop - start - (inside.stop - inside.start):
+            said.append(f"{cut} rows at the ends were left out, as a driven marker was not seen")
+        parts.append(
+            replace(
+                source, name=name, role=Role.DRIVEN, time=source.time[inside],
+                values=values[inside], notes=tuple(said),
+            )
+        )  # fmt: skip
+    if not parts:
+        raise PalpateError(
+            f"the driven markers {list(markers)} of trial '{trial.name}' are never seen together "
+            f"for {DRIVEN_GAP} frames"
+        )
+    return parts
 
 
 def _repaired(source: Channel, trial: Trial) -> Channel:

@@ -31,8 +31,9 @@ class IdentifyOwnModel(Identify):
     """Identify a model of your own: a class of a Python file, of which nothing is registered.
 
     It starts with each parameter at the centre of its prior. Channels of a recording of palpate, or
-    columns of a CSV file with a header such as time,angle [rad],torque, are what is observed and
-    what acts; an action is in force from its time to the next.
+    columns of a CSV file with a header such as time,angle [rad],torque, or numbers in a robot's
+    log such as /joint_states.position[0], are what is observed and what acts; an action is in force
+    from its time to the next.
 
     1. A door, from angles and torques:         palpate identify door.py:Door R.csv
                                                     --observe angle --act torque

@@ -206,7 +206,7 @@ class Posterior:
         if self.rhat_of_predictions >= MIXED:
             said.append(
                 f"the chains do not agree on what will happen: R-hat of predictions is "
-                f"{self.rhat_of_predictions:.3f}, expected below {MIXED}; draw more, or compare "
+                f"{self.rhat_of_predictions:.5g}, expected below {MIXED}; draw more, or compare "
                 "hypotheses if there are several modes"
             )
         if self.size_of_predictions < EFFECTIVE:

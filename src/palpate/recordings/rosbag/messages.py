@@ -62,7 +62,7 @@ def sights(message: Any) -> list[Sight]:
     return [found] if found else []
 
 
-def _content(item: Any) -> dict[str, Any]:
+def named_fields(item: Any) -> dict[str, Any]:
     """The fields of an object or a dictionary by name; none of anything else."""
     return item if isinstance(item, dict) else getattr(item, "__dict__", {})
 
@@ -70,7 +70,7 @@ def _content(item: Any) -> dict[str, Any]:
 def _field(item: Any, *path: str) -> Any:
     """The field of a field of `item`; None where there is none."""
     for name in path:
-        item = _content(item).get(name)
+        item = named_fields(item).get(name)
     return item
 
 
@@ -84,7 +84,9 @@ def _markers(message: Any) -> Sight | None:
         points = _cloud(message)
     else:
         values = [
-            value for own in _content(message).values() for value in (own, *_content(own).values())
+            value
+            for own in named_fields(message).values()
+            for value in (own, *named_fields(own).values())
         ]
         lists = (value for value in values if isinstance(value, list) and value)
         items = next((value for value in lists if _place(value[0]) is not None), [])
@@ -96,9 +98,9 @@ def _markers(message: Any) -> Sight | None:
         points = _moved(points, _field(message, "pose"))
     if points is None or len(points) > MAX_POINTS:
         return None
-    stamp, frame = _header(message)
+    stamp, frame = header(message)
     if stamp is None and frame is None and items:
-        stamp, frame = _header(items[0])
+        stamp, frame = header(items[0])
     return Sight(Kind.MARKERS, points, stamp, frame, names)
 
 
@@ -189,7 +191,7 @@ def _pose(message: Any) -> Sight | None:
     place = _place(message)
     if place is None:
         return None
-    stamp, frame = _header(message)
+    stamp, frame = header(message)
     child = _field(message, "child_frame_id")
     return Sight(Kind.POSE, np.array([place]), stamp, frame, child=child or "")
 
@@ -198,7 +200,7 @@ def _velocity(message: Any) -> Sight | None:
     for path in (("linear",), ("twist", "linear"), ("twist", "twist", "linear")):
         velocity = _point(_field(message, *path))
         if velocity is not None:
-            return Sight(Kind.VELOCITY, np.array([velocity]), *_header(message))
+            return Sight(Kind.VELOCITY, np.array([velocity]), *header(message))
     return None
 
 
@@ -221,7 +223,7 @@ def _place(item: Any) -> list[float] | None:
 
 def _point(item: Any) -> list[float] | None:
     """x, y, z of what has these and no w; null, which JSON has for NaN, is NaN."""
-    fields = _content(item)
+    fields = named_fields(item)
     if "w" in fields or not {*"xyz"} <= fields.keys():
         return None
     values = [fields[axis] for axis in "xyz"]
@@ -230,7 +232,7 @@ def _point(item: Any) -> list[float] | None:
     return [float("nan") if value is None else float(value) for value in values]
 
 
-def _header(message: Any) -> tuple[int | None, str | None]:
+def header(message: Any) -> tuple[int | None, str | None]:
     """(ns, frame) of a message: `header` in ROS, `timestamp` and `frame_id` in Foxglove's JSON."""
     places = ("header", "frame_id"), ("frame_id",), ("parent_frame_id",)
     frame = next((f for place in places if (f := _field(message, *place)) is not None), None)

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from palpate.cli import COMMANDS, main
+from palpate.cli import COMMANDS, PLAIN, main
 from palpate.families.rope.options import RecordRope
 from palpate.family import families
 from palpate.worlds.rope.rope import RopeConfiguration
@@ -308,3 +308,8 @@ def test_a_parameter_that_does_not_exist(refused, tmp_path):
     expected = "unknown parameter 'air_darg'; did you mean 'air_drag'? there are: "
     assert said.startswith(expected)
     assert {"node_mass", "air_drag"} < set(said.removeprefix(expected).split(", "))
+
+
+def test_a_terminal_that_knows_no_greek_is_told_in_ascii():
+    said = "air_drag  −1.2 ×10⁻⁴ N s²/m² ± 3 °".encode("ascii", PLAIN).decode()
+    assert said == "air_drag  -1.2 x10^-4 N s^2/m^2 +- 3 ?"

@@ -3,10 +3,13 @@
 What computes is imported when a command runs, never before, so that help is instant.
 """
 
+import codecs
 import functools
+import io
 import re
 import shlex
 import sys
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -17,6 +20,7 @@ from palpate.errors import PalpateError, PalpateWarning
 from palpate.family import check_name, families, options_of, places, resolve
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
+PLAIN = "palpate.plain"  # an error handler of encodings
 OWN = "FILE.py:CLASS"  # what a subject of somebody's own is called
 
 
@@ -79,6 +83,18 @@ COMMANDS = {
 }
 
 
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    """What an encoding lacks, in ASCII: "×10⁻⁴" is "x10^-4"."""
+    assert isinstance(error, UnicodeEncodeError)
+    lacking = error.object[error.start : error.end]
+    plain = unicodedata.normalize("NFKD", lacking).translate({0x2212: "-", 0xD7: "x", 0xB1: "+-"})
+    raised = "^" if unicodedata.decomposition(lacking[0]).startswith("<super>") else ""
+    return raised + plain.encode("ascii", "replace").decode("ascii"), error.end
+
+
+codecs.register_error(PLAIN, _plain)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
@@ -86,6 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     trusted, likewise; 130: interrupted by Ctrl-C.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # of a terminal that may not know "×10⁻⁴"
+            stream.reconfigure(errors=PLAIN)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", PalpateWarning)

@@ -67,8 +67,8 @@ def misfit(aligned: Aligned, error: float) -> str:
         return "no cause found: the fitted rope's motion is not finite"
     return (
         f"no cause found: the fitted rope misses a marker by {100 * error:.2g} cm, "
-        f"{error / length:.0%} of its length, where one of a hundredth is usual; is this the "
-        "recording of one rope, shaken from hanging, and are the held markers named with --driven?"
+        f"{error / length:.0%} of its length, where one of a hundredth is usual; check that one "
+        "rope was recorded, shaken from hanging, and that --driven names the markers that are held"
     )
 
 

@@ -193,7 +193,7 @@ def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap(tmp_path):
     start = target[:, 0], target[:, 0], target[:, :, 0, :1]
     segments = known_start(*map(jnp.asarray, (*start, target, seen)))
     by_trial, time = np.array([2.0, 1.0, np.nan, np.nan]), 0.1 * np.arange(1, 7)
-    error = PredictionError(0.1, by_trial, time, np.ones(6), prediction, segments)
+    error = PredictionError(0.1, by_trial, time, np.ones(6), prediction, segments, np.ones(6))
     file = recorded("cart", tmp_path / "cart.npz", trials=1)
     data = identify_data.read(IdentifyToy(recordings=(file,)))
     metres, newtons = (

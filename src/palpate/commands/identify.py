@@ -40,6 +40,7 @@ from palpate.runs.storage import check_writable, write_bytes
 
 DRAWS, NETCDF = "posterior.npz", "posterior.nc"
 RESIDUAL = "residual"  # the folder of its run
+TRUSTED = 5.0  # s of a prediction, by which a fit is judged
 ADAM = "adam"  # an older name of the method "gradient"
 
 
@@ -167,7 +168,7 @@ def _write_fit(
     wall_time = run.elapsed + earlier
     report = identify_fit.FitReport.of(start, found.model, data, correction)
     figures, parameters = report.figures(wall_time), identify_fit.fitted_rows(found)
-    doubts = _doubts(options, data, report.scored.mean_absolute)
+    doubts = _doubts(options, data, report.scored.within(TRUSTED))
     summary = identify_fit.summary_of_fit(report, figures, parameters, doubts)
     settings = report.settings() | {folders.DOUBTS: doubts, folders.SUMMARY: summary}
     noise = measurement_noise(data.fitted_aligned.observation)

@@ -38,7 +38,8 @@ class PredictionError:
     """Open-loop errors over whole trials, in the observation's unit.
 
     `mean_absolute` is over all coordinates seen (the measure of DEFORM's table), `by_trial` the
-    same for each trial; `horizon` (s) and `rmse` (of the distance, all seen points) run over time.
+    same for each trial; `horizon` (s), `by_time` (the same again) and `rmse` (of the distance, all
+    seen points) run over time.
     NaN where nothing was seen: an error that is not known is not zero.
     """
 
@@ -48,6 +49,12 @@ class PredictionError:
     rmse: np.ndarray
     prediction: np.ndarray
     segments: Segments
+    by_time: np.ndarray
+
+    def within(self, seconds: float) -> float:
+        """The mean absolute error of so long: what motion does later may be chance, and is hard."""
+        early = self.by_time[self.horizon <= seconds * (1 + 1e-6)]
+        return float(np.nanmean(early)) if np.isfinite(early).any() else self.mean_absolute
 
     @property
     def last_seen(self) -> int:
@@ -84,6 +91,7 @@ def prediction_error(model: Model, aligned: Aligned) -> PredictionError:
         rmse=np.sqrt(np.square(error).sum(per_time) / or_nan(seen.sum(per_time) / axes)),
         prediction=prediction,
         segments=segments,
+        by_time=np.abs(error).sum(per_time) / or_nan(seen.sum(per_time)),
     )
 
 

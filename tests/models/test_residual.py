@@ -268,7 +268,7 @@ ONE, STATE = jnp.ones(1), Marked(1.0, 0.2).initial_state(jnp.ones((2, 1)))
 FORWARDED = {
     "control_period": None, "action_shape": None, "observation_shape": None,
     "observation_units": None, "observe": (STATE,), "difference": (ONE, 3.0 * ONE),
-    "initial_state": (jnp.ones((2, 1)),), "velocity": (STATE,),
+    "initial_state": (jnp.ones((2, 1)),), "velocity": (STATE,), "drawing": (ONE,),
 }  # fmt: skip
 CORRECTED = {"overrides", "step", "stepper", "independent_parts", "constrain"}
 

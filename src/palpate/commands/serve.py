@@ -203,6 +203,8 @@ def _ended(robot: subprocess.Popen) -> tuple[list[str], int]:
     try:
         return robot.communicate(timeout=FAREWELL)[0].splitlines(), status
     except subprocess.TimeoutExpired:
+        robot.kill()  # before the link closes: two that close at once may wait for one another
+        robot.communicate()
         return [], status
 
 

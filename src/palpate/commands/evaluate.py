@@ -6,7 +6,6 @@ from pathlib import Path
 import jax
 
 from palpate.commands import folders
-from palpate.commands.in_model import tried_in_model
 from palpate.commands.train import lines_of, named_task
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate, Found
@@ -18,6 +17,7 @@ from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import write_text
 from palpate.tasks.task import Task
+from palpate.trials.in_model import tried_in_model
 
 
 def run(options: Evaluate) -> Path:

@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import Any
 
 from palpate.commands import folders
-from palpate.commands.in_model import EPISODES, tried_in_model
 from palpate.families.options import Train
 from palpate.family import find
 from palpate.learning import Training, train
@@ -24,6 +23,7 @@ from palpate.runs.figure_names import name_in_words, value_in_words
 from palpate.runs.result import machine, read_result
 from palpate.runs.run import RESULT
 from palpate.tasks.task import Task
+from palpate.trials.in_model import EPISODES, tried_in_model
 
 POOR = 0.5  # share of successes below which a policy is warned of
 

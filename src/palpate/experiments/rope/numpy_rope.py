@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate.errors import PalpateError
 from palpate.recordings import Channel, Recording, Role, Trial
 from palpate.worlds.excitation import excitation, record
 from palpate.worlds.rope.configuration import in_step
@@ -117,7 +118,8 @@ class NumpyRope(World):
                          gripper, velocity, self.configuration)  # fmt: skip
 
     def render(self, width: int = 640, height: int = 480) -> np.ndarray:
-        raise NotImplementedError("this rope has no picture")
+        """See `World.render`: there is none, which is said with a `PalpateError`."""
+        raise PalpateError("a NumPy rope has no picture: its markers can be drawn")
 
     def _advance(self, command: np.ndarray) -> None:
         step, limits = self._step, self.configuration

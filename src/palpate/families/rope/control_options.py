@@ -14,6 +14,7 @@ from tyro.conf import arg
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate, Found, Number, Train
 from palpate.families.rope.options import NOISE
+from palpate.family import options_of, resolve
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -75,15 +76,13 @@ class TrainRope(Train):
             )
         return prepared
 
-    @abstractmethod
-    def evaluation(self) -> EvaluateRope:
-        """A small one, of the policy."""
-
     def in_world(self, policy: CommandPolicy, manifest: Mapping[str, Any]) -> list[Figure]:
         """See `Train.in_world`: what `palpate evaluate` finds with one rope."""
         from palpate.trials.trial import run_trials
 
-        small = self.evaluation()
+        small = resolve(options_of("evaluate")[self.task])(
+            policy=self.model, seed=self.seed, ropes=1
+        )
         base, _ = small.base(policy, manifest, None)
         trials = small.trials(base)
         figures = type(trials[0]).figures(trials, run_trials(trials, small.controlled(policy)))
@@ -100,10 +99,6 @@ class TrainRopeStabilization(TrainRope):
 
     task: ClassVar[str] = "rope-stabilization"
 
-    def evaluation(self) -> EvaluateRopeStabilization:
-        """One rope from each pose."""
-        return EvaluateRopeStabilization(policy=self.model, seed=self.seed, ropes=1)
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainRopeTracking(TrainRope):
@@ -116,10 +111,6 @@ class TrainRopeTracking(TrainRope):
     """
 
     task: ClassVar[str] = "rope-tracking"
-
-    def evaluation(self) -> EvaluateRopeTracking:
-        """One rope on each path."""
-        return EvaluateRopeTracking(policy=self.model, seed=self.seed, ropes=1)
 
 
 @dataclass(frozen=True, kw_only=True)

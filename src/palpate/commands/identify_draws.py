@@ -9,8 +9,8 @@ import numpy as np
 from palpate.commands import folders
 from palpate.commands.identify_report import (
     doubted,
+    informed_parameters,
     or_none,
-    told,
     typical_and_worst,
     units_of,
 )
@@ -120,7 +120,7 @@ def summary_of_draws(
     held = f"Its 90 % intervals hold {value_in_words(inside)} of what was seen"
     if inside.value is not None and inside.value < LEVEL - SHORT:
         held += ", too little to rely on them"
-    held += f". {told(rows)}"
+    held += f". {informed_parameters(rows)}"
     if apart is not None and apart >= MIXED:
         held += f" Draw more: the chains do not agree yet (R-hat {apart:.3g})."
     return [found, doubted(settings[folders.DOUBTS]) or held]

@@ -9,9 +9,9 @@ import numpy as np
 from palpate.commands.identify_data import Data
 from palpate.commands.identify_report import (
     doubted,
+    informed_parameters,
     or_none,
     predicted_names,
-    told,
     typical_and_worst,
     units_of,
 )
@@ -251,7 +251,7 @@ def summary_of_fit(
     )
     if CORRECTION in settings:
         found += f" {describe_correction(settings[CORRECTION])}."
-    trust = told(rows)
+    trust = informed_parameters(rows)
     if not held_out:
         trust += " No trial was held out, so the error on other motions is unknown."
     return [found, doubted(doubts) or trust]

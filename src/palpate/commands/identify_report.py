@@ -93,7 +93,7 @@ def doubted(doubts: Sequence[str]) -> str:
     return f"It is not to be trusted: {doubts[0]}." if doubts else ""
 
 
-def told(rows: Sequence[dict[str, Any]]) -> str:
+def informed_parameters(rows: Sequence[dict[str, Any]]) -> str:
     """Of how many free parameters the data tell something, and of which they tell nothing."""
     free = [row for row in rows if not (row["fixed"] or row.get("derived"))]
     left = [row["name"].replace("_", " ") for row in free if uninformed(row["verdict"])]

@@ -103,11 +103,13 @@ def _sections(found: Sequence[Evidence]) -> tuple[str, list[Section]]:
         ("Parameters", _parameters),
         ("Learning", _learning),
     )
-    shown, told = ([(of, contents(part)) for of, part in parts] for parts in (views, rest))
+    shown, others = ([(of, contents(part)) for of, part in parts] for parts in (views, rest))
     opening = next((of.pop(0) for _, of in shown if of), "")  # one picture, and the rest below
     if opening:
         opening = f'<section class="opening">{opening}</section>\n'
-    ordered = [(of, "".join(content)) for of, content in (told[0], *shown, *told[1:]) if content]
+    ordered = [
+        (of, "".join(content)) for of, content in (others[0], *shown, *others[1:]) if content
+    ]
     return opening, [*ordered, ("What was run", "".join(map(_provenance, found)))]
 
 

@@ -115,7 +115,7 @@ BRIEF = """
 import importlib
 from pathlib import Path
 
-from palpate.commands import in_model
+from palpate.trials import in_model
 from palpate.families.rope import control_options
 from palpate.trials.rope import stabilization
 

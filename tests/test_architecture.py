@@ -63,11 +63,12 @@ PLACE_KEEPERS = {"families", "family", "cli"}
 FAMILY_WORDS = {"rope", "ropes", "furniture", "appliance", "appliances", "maze", "mazes"}
 GENERAL = {
     *FOUNDATION,
+    "commands/identify",
     *("identification", "planning", "learning", "safety", "deployment", "report", "cli"),
     *(
         f"commands/{name}.py"
         for name in (
-            *("demo", "record", "convert", "track", "identify", "plan", "train", "evaluate"),
+            *("demo", "record", "convert", "track", "plan", "train", "evaluate"),
             *("export", "serve", "report", "reproduce", "folders", "parsing"),
         )
     ),

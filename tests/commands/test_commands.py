@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from palpate.cli import main
-from palpate.commands import demo, folders, identify, identify_data, reproduce, train
-from palpate.commands.identify_fit import FitReport
+from palpate.commands import demo, folders, identify, reproduce, train
+from palpate.commands.identify.data import read
+from palpate.commands.identify.fit import FitReport
 from palpate.commands.options import Reproduce
 from palpate.errors import PalpateError
 from palpate.families.options import Identify, Train
@@ -195,7 +196,7 @@ def test_a_chain_that_is_not_seen_for_a_while_leaves_a_gap(tmp_path):
     by_trial, time = np.array([2.0, 1.0, np.nan, np.nan]), 0.1 * np.arange(1, 7)
     error = PredictionError(0.1, by_trial, time, np.ones(6), prediction, segments, np.ones(6))
     file = recorded("cart", tmp_path / "cart.npz", trials=1)
-    data = identify_data.read(IdentifyToy(recordings=(file,)))
+    data = read(IdentifyToy(recordings=(file,)))
     metres, newtons = (
         FitReport(
             TwoPoints(1.0, 0.5, units=(unit,) * 3),
@@ -216,12 +217,10 @@ def test_validation_is_scored_as_recorded_and_not_fitted(tmp_path):
         recordings=(recorded("cart", tmp_path / "a.npz", trials=2),),
         validate=(recorded("cart", tmp_path / "b.npz", trials=3),),
     )
-    data = identify_data.read(options)
+    data = read(options)
     assert len(data.fitted.trials) == 2
     assert len(data.validation.trials) == 3
-    both = identify_data.read(
-        dataclasses.replace(options, validate=(), recordings=options.validate * 2)
-    )
+    both = read(dataclasses.replace(options, validate=(), recordings=options.validate * 2))
     assert {trial.name for trial in both.fitted.trials}.isdisjoint(
         trial.name for trial in both.validation.trials
     )
@@ -241,7 +240,7 @@ def test_what_was_put_right_is_said_of_every_recording(tmp_path, capsys):
 
     fitted, validation = marked("a.npz", [7], 4), marked("b.npz", [11, 12], 5)
     options = IdentifyRope(recordings=(fitted,), validate=(validation,))
-    identify_data.read(options)
+    read(options)
     unseen = "unseen positions of driven markers were interpolated"
     assert capsys.readouterr().out.splitlines() == [
         "note: trial 'one', markers: 4 unlabelled markers were left out",
@@ -249,7 +248,7 @@ def test_what_was_put_right_is_said_of_every_recording(tmp_path, capsys):
         "note: validation, trial 'one', markers: 5 unlabelled markers were left out",
         f"note: validation, trial 'one', grip: 2 {unseen}",
     ]
-    identify_data.read(dataclasses.replace(options, nodes=3, validate=()))
+    read(dataclasses.replace(options, nodes=3, validate=()))
     assert capsys.readouterr().out.splitlines()[1] == f"note: trial 'one', grip: 1 {unseen}"
 
 

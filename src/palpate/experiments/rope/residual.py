@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.commands import identify, identify_fit
+from palpate.commands import identify
+from palpate.commands.identify.fit import CORRECTION
 from palpate.experiments.experiment import Experiment
 from palpate.experiments.rope.model import GRIPPED, RATE, captures, seen_capture
 from palpate.experiments.rope.simulated import simulated
@@ -72,10 +73,7 @@ def reproduce(
         figures + _simulated_figures(results["simulated"]),
         {
             "simulated": constants(),
-            **{
-                f"{name}.residual": found.settings[identify_fit.CORRECTION]
-                for name, found in results.items()
-            },
+            **{f"{name}.residual": found.settings[CORRECTION] for name, found in results.items()},
         },
         {name: found.split for name, found in results.items()},
     )
@@ -137,7 +135,7 @@ def gain_figures(ours: np.ndarray, alone: np.ndarray) -> list[Figure]:
 
 
 def _simulated_figures(found: Result) -> list[Figure]:
-    dropped = int(not found.settings[identify_fit.CORRECTION]["kept"])
+    dropped = int(not found.settings[CORRECTION]["kept"])
     head = Figure("simulated.dropped", dropped, "", bar=1, better="higher")
     return [head, *_figures("simulated", found)]
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.commands import folders, identify_draws, identify_fit, identify_report
-from palpate.commands.identify_data import Data, read
+from palpate.commands import folders
+from palpate.commands.identify import draws, fit, tables
+from palpate.commands.identify.data import Data, read
 from palpate.errors import DoubtfulResultError, PalpateError
 from palpate.families.options import Hypotheses, Identify
 from palpate.identification.declarations import with_values_of
@@ -93,7 +94,7 @@ def run(options: Identify) -> Path:
             write = _write_fit if options.fits else _write_draws
             write(run, options, data, hypotheses, found)
         result = read_result(run.path / RESULT)
-        identify_report.show(result)
+        tables.show(result)
         if options.arviz is not None:
             write_bytes(options.arviz, (run.path / NETCDF).read_bytes())
             print(f"for ArviZ: {options.arviz}")
@@ -166,10 +167,10 @@ def _write_fit(
         _correction(found.model, data, options, run) if options.residual else (None, 0.0)
     )
     wall_time = run.elapsed + earlier
-    report = identify_fit.FitReport.of(start, found.model, data, correction)
-    figures, parameters = report.figures(wall_time), identify_fit.fitted_rows(found)
+    report = fit.FitReport.of(start, found.model, data, correction)
+    figures, parameters = report.figures(wall_time), fit.fitted_rows(found)
     doubts = _doubts(options, data, report.scored.within(TRUSTED))
-    summary = identify_fit.summary_of_fit(report, figures, parameters, doubts)
+    summary = fit.summary_of_fit(report, figures, parameters, doubts)
     settings = report.settings() | {folders.DOUBTS: doubts, folders.SUMMARY: summary}
     noise = measurement_noise(data.fitted_aligned.observation)
     save_model(
@@ -192,11 +193,11 @@ def _write_fit(
         "parameters": parameters,
         "warnings": [
             *(*doubts, *options.bounds(found.model), *found.warnings),
-            *filter(None, [identify_fit.shareable(parameters)]),
+            *filter(None, [fit.shareable(parameters)]),
         ],
         "wall_time_s": wall_time,
     }
-    folders.finish(run, figures, settings, identify_report.split(data), **rows)
+    folders.finish(run, figures, settings, tables.split(data), **rows)
 
 
 def _doubts(options: Identify, data: Data, error: float) -> list[str]:
@@ -234,8 +235,8 @@ def _write_draws(
     model = posterior.target.coordinates.reference
     pieces = cut_pieces(data.validation_aligned, model, *_cut(options))
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
-    evidence = identify_draws.expected_errors(predicted, pieces, model)
-    evidence |= identify_draws.drawn_motion(posterior, predicted, pieces)
+    evidence = draws.expected_errors(predicted, pieces, model)
+    evidence |= draws.drawn_motion(posterior, predicted, pieces)
     write_evidence(run.path, evidence)
     everything = np.ones(model.observation_shape[-1], bool)
     doubts = _doubts(options, data, score.pooled(everything))
@@ -247,12 +248,12 @@ def _write_draws(
         "sampler": posterior.sampler,
         "pieces": pieces.count,
         "scored_on": "what was fitted" if data.validation is None else "what was not fitted",
-        "observation_unit": identify_report.units_of(data.unit, model)[0],
-        "predicted": identify_report.predicted_names(data, model),
+        "observation_unit": tables.units_of(data.unit, model)[0],
+        "predicted": tables.predicted_names(data, model),
     }
-    figures = identify_draws.drawn_figures(posterior, score, model, run.elapsed, data.unit)
+    figures = draws.drawn_figures(posterior, score, model, run.elapsed, data.unit)
     meanings = options.meanings(posterior.models(), posterior.prior)
-    parameters = [*identify_draws.drawn_rows(posterior), *meanings]
+    parameters = [*draws.drawn_rows(posterior), *meanings]
     rows = {"parameters": parameters, "warnings": [*doubts, *found.warnings]}
-    settings[folders.SUMMARY] = identify_draws.summary_of_draws(figures, settings, parameters)
-    folders.finish(run, figures, settings, identify_report.split(data), **rows)
+    settings[folders.SUMMARY] = draws.summary_of_draws(figures, settings, parameters)
+    folders.finish(run, figures, settings, tables.split(data), **rows)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.identify_report import (
+from palpate.commands.identify.tables import (
     doubted,
     informed_parameters,
     or_none,

@@ -1,0 +1,3 @@
+"""`palpate identify`."""
+
+from palpate.commands.identify.command import run as run

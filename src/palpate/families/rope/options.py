@@ -192,14 +192,17 @@ class IdentifyRope(Identify, Reading):
 
     def bounds(self, model: Rope) -> list[str]:
         """See `Identify.bounds`: how stiff a rope its time step can integrate."""
-        from palpate.models.rope.stability import LIMIT, load
+        from palpate.models.rope.stability import LIMIT, heaviest, load
 
         if float(load(model).max()) < 0.97 * LIMIT:
             return []
+        name, twice = heaviest(model), 2 * model.substeps
+        more = "twice" if name.endswith("damping") else "four times"
         return [
-            f"the rope is as stiff as {model.substeps} steps in {1e3 * model.control_period:.3g} "
-            "ms can integrate: its stiffnesses may be higher, and their intervals do not know; "
-            f"--substeps {2 * model.substeps} allows four times as much"
+            f"the {name.replace('_', ' ')} is as great as {model.substeps} steps in "
+            f"{1e3 * model.control_period:.3g} ms can integrate: it may be greater, others may "
+            f"make up for it, and no interval knows; --substeps {twice} allows {more} as much, "
+            "and fewer --nodes far more"
         ]
 
     def _driven(self, aligned: Aligned) -> list[int]:

@@ -49,6 +49,12 @@ def load(rope: RopeParameters) -> Float[Array, "*batch nodes"]:
     return sum(_loads(rope).values(), start=jnp.zeros(()))
 
 
+def heaviest(rope: RopeParameters) -> str:
+    """The parameter whose elements load a node most, of one rope."""
+    loads = {name: float(values.max()) for name, values in _loads(rope).items()}
+    return max(loads, key=lambda name: loads[name])
+
+
 def soften(rope: SomeRope) -> SomeRope:
     """A stable rope: itself when the load stays below `LIMIT`.
 

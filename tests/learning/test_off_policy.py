@@ -1,0 +1,92 @@
+"""The off-policy loop: it finds known optima, resumes to the bit, and compiles once."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+from safetensors import safe_open
+
+from palpate.errors import PalpateError
+from palpate.learning.off_policy import OffPolicyTraining, SoftActorCritic, train_off_policy
+from palpate.learning.off_policy.loop import Compiled
+from palpate.runs import Run
+from small_environments import Bandit, Regulator, side_by_side
+
+pytestmark = pytest.mark.optimised
+
+SMALL = SoftActorCritic(width=32, learning_rate=3e-3, target_rate=0.02)
+SHORT = OffPolicyTraining(400, warm_up=100, batch=16, capacity=300, log_every=50, evaluate_every=80,
+                          checkpoint_every=200)  # fmt: skip
+
+
+def greedy(agent, state, observation) -> np.ndarray:
+    return np.asarray(agent.propose(state, jnp.asarray(observation, jnp.float32), None))
+
+
+def test_a_bandit_is_solved() -> None:
+    settings = OffPolicyTraining(3000, warm_up=500, batch=64, capacity=3000, ratio=0.5)
+    state = train_off_policy(side_by_side(Bandit, 4), SMALL, settings, 0)
+    seen = np.linspace(-0.9, 0.9, 19)[:, None]
+    assert np.abs(greedy(SMALL, state, seen) - 0.5 * seen).max() < 0.1
+
+
+def test_a_regulator_comes_near_its_riccati_gain() -> None:
+    settings = OffPolicyTraining(5000, warm_up=500, batch=64, capacity=5000, ratio=1.0)
+    agent = SoftActorCritic(width=64, learning_rate=1e-3, target_rate=0.02, temperature=0.1)
+    state = train_off_policy(side_by_side(Regulator, 8), agent, settings, 0)
+    seen = np.linspace(-0.8, 0.8, 9)[:, None]
+    executed = 2.0 * greedy(agent, state, seen)  # stretched onto the bounds
+    assert np.abs(executed + Regulator.gain * seen).max() < 0.15
+
+
+def trained(folder: Path, seed: int = 0, killed_after: int = 0):
+    """What a short training leaves: its whole last checkpoint and its lines."""
+
+    def evaluation(step: int, state) -> dict[str, float]:
+        if step == killed_after:
+            raise RuntimeError("killed")
+        return {"evaluated": float(step)}
+
+    with Run.open(folder, {"seed": seed}) as run:
+        environments = side_by_side(Bandit, 4)
+        train_off_policy(environments, SMALL, SHORT, seed, run, evaluation=evaluation)
+        last, entry = sorted((folder / "checkpoints").iterdir())[-1], "time"
+        with safe_open(last, framework="numpy") as file:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return arrays, [line | {entry: 0} for line in run.metrics()]
+
+
+def test_a_killed_training_resumes_to_the_same_bits(tmp_path: Path) -> None:
+    arrays, lines = trained(tmp_path / "whole")
+    assert arrays["buffer.added"] == SHORT.steps > SHORT.capacity  # the ring has gone round
+    with pytest.raises(RuntimeError, match="killed"):
+        trained(tmp_path / "cut", killed_after=320)
+    again, again_lines = trained(tmp_path / "cut")
+    assert lines == again_lines
+    assert [line["step"] for line in lines][-2:] == [352, 400]
+    assert arrays.keys() == again.keys()
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(values, again[name], err_msg=name)
+    other, _ = trained(tmp_path / "other", seed=1)
+    assert not np.array_equal(arrays["agent.actor.network.weights.0"],
+                              other["agent.actor.network.weights.0"])  # fmt: skip
+
+
+def test_each_function_is_compiled_once(monkeypatch) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr(
+        "palpate.learning.off_policy.loop.Compiled",
+        lambda *given: made.append(Compiled(*given)) or made[-1],
+    )
+    train_off_policy(side_by_side(Bandit, 4), SMALL, dataclasses.replace(SHORT, ratio=0.3), 0)
+    assert made[0].act._cache_size() == made[0].learn._cache_size() == 1
+
+
+def test_environments_that_reset_a_step_later_are_refused() -> None:
+    late = SyncVectorEnv([Bandit, Bandit])
+    with pytest.raises(PalpateError, match="SAME_STEP"):
+        train_off_policy(late, SMALL, SHORT, 0)

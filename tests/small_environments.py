@@ -1,0 +1,48 @@
+"""Environments with a known optimum, to be learnt in seconds."""
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+
+class Bandit(gymnasium.Env):
+    """One step: the reward is -(action - half of what is seen)^2, at best 0."""
+
+    observation_space = Box(-1.0, 1.0, (1,), np.float32)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seen = self.np_random.uniform(-1.0, 1.0, 1).astype(np.float32)
+        return self.seen, {}
+
+    def step(self, action):
+        wrong = float(action[0]) - 0.5 * float(self.seen[0])
+        told = {"cost": float(action[0] > 0.4), "end": "goal" if abs(wrong) < 0.1 else "missed"}
+        return self.seen, -(wrong**2), True, False, told
+
+
+class Regulator(gymnasium.Env):
+    """A scalar linear system x' = x + u, cost x^2 + u^2, 10 steps; its Riccati equation is solved.
+
+    `gain` is the steady one: the value is -p x^2 with p = (1 + sqrt 5) / 2, and u = -x / p.
+    """
+
+    observation_space = Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = Box(-2.0, 2.0, (1,), np.float32)
+    gain = 2.0 / (1.0 + 5.0**0.5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.left = self.np_random.uniform(-1.0, 1.0), 10
+        return np.array([self.state], np.float32), {}
+
+    def step(self, action):
+        reward = -(self.state**2) - float(action[0]) ** 2
+        self.state, self.left = self.state + float(action[0]), self.left - 1
+        return np.array([self.state], np.float32), reward, False, self.left == 0, {}
+
+
+def side_by_side(kind: type[gymnasium.Env], count: int) -> SyncVectorEnv:
+    return SyncVectorEnv([kind] * count, autoreset_mode=AutoresetMode.SAME_STEP)

@@ -1,0 +1,5 @@
+"""A compliant tip that touches walls."""
+
+from palpate.models.contact.tip import Tip as Tip
+from palpate.models.contact.tip import TipState as TipState
+from palpate.models.contact.tip import facing as facing

@@ -1,0 +1,121 @@
+"""One step of a mass on an impedance between springs that only push, with dry friction.
+
+The springs are integrated by the trapezoidal rule, implicitly: stable for any stiffness, of second
+order, and without damping of its own. A spring that is met or left within the step counts for the
+share of the step that it is met in: it then gives back no more than it took. Friction is implicit,
+on the velocity at the end: it stops the tip, and never turns it round.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Vector = Float[Array, "*batch 2"]
+Numbers = Float[Array, "*batch walls"]
+
+
+class Surfaces(NamedTuple):
+    """Walls as the integration needs them.
+
+    `normal` is outward; a tip at x is pressed in by `place` - normal . x, in m.
+    """
+
+    normal: Float[Array, "*batch walls 2"]
+    place: Numbers
+    stiffness: Numbers  # N/m
+    damping: Numbers  # N s/m
+    friction: Numbers
+
+
+class Impedance(NamedTuple):
+    """What pulls the tip: mass in kg, set-point in m, stiffness in N/m, damping in N s/m."""
+
+    mass: Float[Array, "*batch 1"]
+    setpoint: Vector
+    stiffness: Vector
+    damping: Vector
+
+
+def advance(
+    surfaces: Surfaces,
+    impedance: Impedance,
+    position: Vector,
+    velocity: Vector,
+    time: float,
+    slip: float,
+) -> tuple[Vector, Vector, Vector]:
+    """Position, velocity, and the mean force of the walls on the tip in N, `time` seconds later.
+
+    `slip` (m/s) is the sliding velocity at which friction has half its size.
+    """
+    normal, place, stiffness, damping, friction = surfaces
+    mass = impedance.mass
+    depth = place - _along(normal, position)
+    rate = -_along(normal, velocity)
+    pressed = jnp.maximum(depth, 0.0)
+    # How deep it will be, by the energy that is in the spring and in the velocity.
+    leaving = jnp.sqrt(jnp.square(rate) + stiffness * jnp.square(pressed) / mass + 1e-12) - rate
+    after = depth + time * jnp.where(depth > 0.0, -0.5 * leaving, rate)
+    share = (pressed + jnp.maximum(after, 0.0)) / (jnp.abs(depth) + jnp.abs(after) + 1e-12)
+    # A wall that recovers more slowly than the tip leaves it does not pull it back.
+    share = jnp.where(stiffness * pressed + damping * rate >= 0.0, share, 0.0)
+    implicit = jnp.where(after > 0.0, 0.5 * share, 0.0)
+    spring = stiffness * (jnp.where(depth > 0.0, 0.5 * share, 0.0) + implicit) * depth
+    yielding = time * stiffness * implicit + damping * share  # N s/m of the mean velocity
+
+    # Mean velocity w: (2 m / h + D + K h / 2 + sum of n n' yielding) w = 2 m / h v + forces.
+    held = 2.0 * mass / time
+    diagonal = held + impedance.damping + 0.5 * time * impedance.stiffness
+    pull = impedance.stiffness * (impedance.setpoint - position)
+    right = held * velocity + pull + jnp.sum(normal * spring[..., None], axis=-2)
+    mean = _solved(diagonal, normal, yielding, right)
+    force = jnp.maximum(spring - yielding * _along(normal, mean), 0.0)
+    following = 2.0 * mean - velocity
+
+    total = jnp.sum(normal * force[..., None], axis=-2)
+    most = time * friction * force / mass  # that friction takes from the velocity
+    for wall in range(normal.shape[-2]):  # one after the other: in a corner each acts on the rest
+        tangent = _turned(normal[..., wall, :])
+        sliding = jnp.sum(tangent * following, axis=-1)
+        after_it = slowed(sliding, most[..., wall], slip)
+        change = -most[..., wall] * after_it / (jnp.abs(after_it) + slip)
+        following = following + tangent * change[..., None]
+        total = total + tangent * (change[..., None] * mass / time)
+    return position + 0.5 * time * (velocity + following), following, total
+
+
+def slowed(
+    sliding: Float[Array, "*batch"], most: Float[Array, "*batch"], slip: float
+) -> Float[Array, "*batch"]:
+    """The velocity u that dry friction leaves: u + `most` u / (|u| + `slip`) = `sliding`."""
+    speed = jnp.abs(sliding)
+    rest = most + slip - speed
+    root = jnp.sqrt(jnp.square(rest) + 4.0 * speed * slip)
+    # Of the two forms of the same root the one without a small difference of large numbers.
+    slips = rest < 0.0
+    fast = 0.5 * (root - rest) / jnp.where(slips, speed, 1.0)
+    slow = 2.0 * slip / (root + jnp.where(slips, 0.0, rest))
+    return sliding * jnp.where(slips, fast, slow)
+
+
+def _along(normal: Array, vector: Array) -> Array:
+    """The part of a vector along each normal."""
+    return jnp.sum(normal * vector[..., None, :], axis=-1)
+
+
+def _turned(normal: Array) -> Array:
+    """A quarter of a turn to the left."""
+    return jnp.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+
+
+def _solved(diagonal: Array, normal: Array, weight: Array, right: Array) -> Array:
+    """Solve (diag + sum over walls of weight n n') w = right, two unknowns, by Cramer's rule."""
+    x, y = normal[..., 0], normal[..., 1]
+    a = diagonal[..., 0] + jnp.sum(weight * x * x, axis=-1)
+    b = jnp.sum(weight * x * y, axis=-1)
+    d = diagonal[..., 1] + jnp.sum(weight * y * y, axis=-1)
+    determinant = a * d - b * b
+    first = (d * right[..., 0] - b * right[..., 1]) / determinant
+    second = (a * right[..., 1] - b * right[..., 0]) / determinant
+    return jnp.stack([first, second], axis=-1)

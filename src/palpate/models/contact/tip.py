@@ -1,0 +1,198 @@
+"""A compliant tip in a plane, and walls that yield: what touching them shows."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from palpate.errors import PalpateError
+from palpate.models.contact.integration import Impedance, Surfaces, advance
+from palpate.models.model import Model
+from palpate.parameters import LogNormal, Normal, Parameter, as_floating, parameter, parameters_of
+
+Number = Float[Array, "*batch"]
+Walls = Float[Array, "*batch walls"]
+Point = Float[Array, "*batch 2"]
+
+SUBSTEP = 1e-3  # s, of the integration, at most
+SLIP = 1e-5  # m/s, the sliding velocity at which friction has half its size
+
+
+def _data() -> Any:
+    return eqx.field(converter=as_floating)
+
+
+class TipState(NamedTuple):
+    """Position in m, velocity in m/s, and the mean force of the walls on the tip, N, each (2,).
+
+    The force is that of the control period which has just ended.
+    """
+
+    position: Point
+    velocity: Point
+    force: Point
+
+
+class Tip(Model):
+    """The tip of a robot under Cartesian impedance control, in a plane with straight walls.
+
+    The controller pulls the tip to a set-point x_d: m a = K (x_d - x) - D v + f, with the diagonal
+    stiffness K that it commands and the damping D = 2 zeta sqrt(K m) by design (Albu-Schaeffer et
+    al., ICRA 2003, of one mass). An action is x_d and K for one control period.
+
+    Each wall is a plate on a spring: where the tip is pressed in by u, it pushes with
+    f_n = max(0, k u + d u'), along its outward normal, and rubs with Coulomb's friction mu f_n
+    against the sliding velocity (regularised: half of it at `slip` m/s).
+
+    How many walls there are, and the nominal `direction` (rad) of each outward normal, is data; a
+    wall may be tilted about it. `position` is where the wall is along that direction, from the
+    frame's origin, measured abreast of the point `centre`: so that a tilt does not move what is
+    near it. What is observed is the tip's position and the force on it as a sensor shows it, with
+    the sensor's bias. Batch axes lead everywhere.
+
+    Raises `PalpateError` for no wall, and where direction and parameters are of different numbers
+    of walls.
+    """
+
+    mass: Number = parameter(
+        "kg", prior=LogNormal(1.0, 0.7), spread=0.3, about="effective mass at the tip"
+    )
+    damping_ratio: Number = parameter(
+        "", prior=LogNormal(1.0, 0.3), spread=0.2, about="of the impedance, one is critical"
+    )
+    position: Walls = parameter(
+        "m", prior=Normal(None, 0.02), about="of each wall along its direction"
+    )
+    tilt: Walls = parameter(
+        "rad", prior=Normal(0.0, 0.05), about="of each wall's normal from its direction"
+    )
+    stiffness: Walls = parameter("N/m", prior=LogNormal(1e3, 1.5), spread=0.3, about="of each wall")
+    damping: Walls = parameter("N s/m", prior=LogNormal(10.0, 1.5), spread=0.5, about="of each")
+    friction: Walls = parameter(
+        "", prior=LogNormal(0.3, 0.7), spread=0.3, about="Coulomb's coefficient on each wall"
+    )
+    force_bias: Point = parameter(
+        "N", prior=Normal(0.0, 0.5), about="what the sensor shows without contact"
+    )
+    direction: Walls = _data()
+    centre: Point = _data()
+    control_period: float = eqx.field(static=True, default=5e-3)
+    slip: float = eqx.field(static=True, default=SLIP)
+    overrides: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        shape = getattr(self.direction, "shape", None)  # of a tree of something else None
+        if shape is None:
+            return
+        if not shape or shape[-1] < 1:
+            raise PalpateError(f"expected the direction of at least one wall, got {shape}")
+        for name in ("position", "tilt", "stiffness", "damping", "friction"):
+            own = getattr(getattr(self, name), "shape", shape)
+            if own[-1:] != shape[-1:]:
+                raise PalpateError(
+                    f"'{name}' has the shape {own}: expected as many walls as there are "
+                    f"directions, {shape[-1]}"
+                )
+
+    @property
+    def action_shape(self) -> tuple[int]:
+        """(4,): set-point x and y (m), stiffness along x and y (N/m)."""
+        return (4,)
+
+    @property
+    def observation_shape(self) -> tuple[int]:
+        """(4,): position x and y, force x and y."""
+        return (4,)
+
+    @property
+    def observation_units(self) -> tuple[str, ...]:
+        """Of x, y and the force along them."""
+        return "m", "m", "N", "N"
+
+    @property
+    def walls(self) -> int:
+        """How many there are."""
+        return self.direction.shape[-1]
+
+    @property
+    def surfaces(self) -> Surfaces:
+        """The walls as the integration needs them."""
+        nominal, normal = _unit(self.direction), _unit(self.direction + self.tilt)
+        across = jnp.stack([-nominal[..., 1], nominal[..., 0]], axis=-1)
+        abreast = jnp.sum(across * self.centre[..., None, :], axis=-1)
+        point = nominal * self.position[..., None] + across * abreast[..., None]
+        place = jnp.sum(normal * point, axis=-1)
+        return Surfaces(normal, place, self.stiffness, self.damping, self.friction)
+
+    def step(self, state: TipState, action: Float[Array, "*batch 4"]) -> TipState:
+        """The state one control period later; the action is x and y of x_d (m) and of K (N/m)."""
+        return self.stepper()(state, action)
+
+    def stepper(self) -> Callable[[TipState, Array], TipState]:
+        surfaces, mass = self.surfaces, self.mass[..., None]
+        count = max(1, math.ceil(self.control_period / SUBSTEP - 1e-9))
+        time = self.control_period / count
+
+        def step(state: TipState, action: Array) -> TipState:
+            stiffness = action[..., 2:]
+            # A floor below any stiffness that matters: the slope of a root is infinite at zero.
+            root = jnp.sqrt(jnp.maximum(stiffness, 1e-6) * mass)
+            damping = 2.0 * self.damping_ratio[..., None] * root
+            impedance = Impedance(mass, action[..., :2], stiffness, damping)
+
+            def advanced(carry: tuple[Array, Array, Array], _: None):
+                position, velocity, force = advance(
+                    surfaces, impedance, *carry[:2], time, self.slip
+                )
+                return (position, velocity, carry[2] + force), None
+
+            start = state.position, state.velocity, jnp.zeros_like(state.force)
+            (position, velocity, total), _ = jax.lax.scan(advanced, start, length=count)
+            return TipState(position, velocity, total / count)
+
+        return step
+
+    def observe(self, state: TipState) -> Float[Array, "*batch 4"]:
+        """Position (m) and the force of the walls on the tip with the sensor's bias (N)."""
+        bias = self.force_bias.reshape(
+            *self.force_bias.shape[:-1], *(1,) * (state.force.ndim - self.force_bias.ndim), 2
+        )
+        return jnp.concatenate([state.position, state.force + bias], axis=-1)
+
+    def initial_state(self, observations: Float[Array, "*batch frames 4"]) -> TipState:
+        """At the last of a few frames, with the velocity between the last two; of one at rest."""
+        last, before = observations[..., -1, :], observations[..., -2:, :][..., 0, :]
+        velocity = (last[..., :2] - before[..., :2]) / self.control_period
+        return TipState(last[..., :2], velocity, last[..., 2:] - self.force_bias)
+
+    def velocity(self, state: TipState) -> Point:
+        """Of the tip, m/s."""
+        return state.velocity
+
+
+def facing(directions: Sequence[float], **values: Any) -> Tip:
+    """A tip between walls whose outward normals point to `directions` (rad).
+
+    `values` are fields of `Tip`: parameters that are not given are at their prior's centre, and a
+    single number serves all walls; walls without a position are at the frame's origin.
+    """
+    count = len(directions)
+    fields: dict[str, Any] = {
+        name: 0.0 if declared.prior.centre is None else declared.prior.centre
+        for name, declared in parameters_of(Tip).items()
+    }
+    fields = {"centre": 0.0} | fields | values
+    for name in ("position", "tilt", "stiffness", "damping", "friction"):
+        fields[name] = np.broadcast_to(fields[name], count)
+    for name in ("force_bias", "centre"):
+        fields[name] = np.broadcast_to(fields[name], 2)
+    return Tip(direction=np.asarray(directions, float), **fields)
+
+
+def _unit(angle: Array) -> Array:
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)

@@ -1,0 +1,314 @@
+"""A compliant tip in a maze that it cannot see, felt through a force-torque sensor alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.signal import lfilter
+
+from palpate.errors import PalpateError
+from palpate.worlds.maze.layout import TIP_RADIUS, Layout, named_layout
+from palpate.worlds.maze.scene import (
+    BASE_MASS,
+    BLOCK,
+    REFERENCE_HEIGHT,
+    TIME_STEP,
+    TIP,
+    TIP_MASS,
+    contact_solref,
+    maze_scene,
+)
+from palpate.worlds.world import DivergedError, OffscreenCamera, World
+
+# What the robot may do. With 300 N/m a spring stretched by the displacement limit pulls 9 N, less
+# than any obstacle resists; with 1000 N/m 30 N, more than the force limit.
+FORCE_LIMIT = 26.0  # N, of the horizontal contact force on the tip; more is a violation
+DISPLACEMENT_LIMIT = 0.03  # m from where the tip is to where a decision sends it
+STIFFNESS_RANGE = (50.0, 1000.0)  # N/m
+
+OBSTACLE_FRICTION = (16.0, 24.5)  # N, dry: what it takes to move the block
+OBSTACLE_MASS = (0.5, 1.5)  # kg
+CONTACT_FRICTION = (0.2, 0.4)  # coefficient, of the tip on walls and block
+
+SWAY = 0.03  # m, amplitude of the base's sideways motion: a mobile base on soft tyres
+SWAY_FREQUENCY = (0.9, 1.1)  # Hz
+SERVO = 100.0  # rad/s, of the base that follows the sway, critically damped
+
+DRIVE_LIMIT = 100.0  # N: the drives give no more, whatever is commanded
+FASTEST = 20.0  # m/s: a tip that is faster has left physics
+
+# Ornstein-Uhlenbeck noise: standard deviation and correlation time, s, of each channel.
+FORCE_NOISE, TORQUE_NOISE, WRENCH_CORRELATION = 0.3, 0.01, 0.1  # N, N m
+POSITION_NOISE, POSITION_CORRELATION = 1e-3, 1.0  # m
+BLOCK_OF_NOISE = 1000  # steps that are drawn at once
+
+
+class TipObservation(NamedTuple):
+    """What the robot's sensors show, in axes parallel to the world's."""
+
+    time: float  # s since reset
+    # (6,) N, N m with noise: net contact force on the tip, and its torque about the point
+    # `REFERENCE_HEIGHT` above the contact.
+    wrench: np.ndarray
+    position: np.ndarray  # (3,) m with noise, of the tip relative to the robot's base
+    velocity: np.ndarray  # (3,) m/s relative to the robot's base, of encoders: exact
+
+
+class TipTruth(NamedTuple):
+    """The hidden state and constants, for judges and tests alone. World frame."""
+
+    time: float  # s since reset
+    position: np.ndarray  # (3,) m
+    velocity: np.ndarray  # (3,) m/s
+    force: np.ndarray  # (3,) N, net contact force on the tip, at the end of the control period
+    peak_force: float  # N, the greatest horizontal one in the last control period
+    sway: float  # m: where the base is in y
+    obstacle: float  # m by which the block has been pushed
+    fault: bool  # whether the last command was not finite, and so no force was given
+    layout: Layout
+    obstacle_friction: float  # N
+    obstacle_mass: float  # kg
+    contact_friction: float
+
+
+class BlindMaze(World):
+    """A tip of 1 kg in a maze, driven by a force (3,) N that acts between it and the robot's base.
+
+    The base sways sideways like a mobile one on soft tyres, with an amplitude of `sway` m, a
+    frequency about 1 Hz and a random phase; position and velocity are seen relative to it. The tip
+    keeps its height by itself and gravity is compensated. `layouts` names mazes, one of which is
+    drawn at each reset; `noise` scales the sensors' Ornstein-Uhlenbeck noise, 0 switches it off;
+    `control_period` is a whole number of milliseconds, in s.
+
+    A command that is not finite is a fault of who commands: the drives give no force in that
+    period. No more than `DRIVE_LIMIT` is ever given.
+
+    Raises `PalpateError` for an unknown maze, values outside their range, and a malformed command.
+    """
+
+    def __init__(
+        self,
+        layouts: Sequence[str | Layout] = ("home",),
+        *,
+        sway: float = SWAY,
+        noise: float = 1.0,
+        control_period: float = TIME_STEP,
+    ):
+        self._layouts = tuple(map(_layout, layouts))
+        if not self._layouts:
+            raise PalpateError("a maze world needs at least one layout")
+        for name, value in (("sway", sway), ("noise", noise)):
+            if not 0 <= value < math.inf:
+                raise PalpateError(f"the {name} is 0 or greater and finite, not {value}")
+        substeps = control_period / TIME_STEP
+        if not (0.5 < substeps < 1e4 and abs(substeps - round(substeps)) < 1e-6):
+            raise PalpateError(
+                f"the control period is a whole number of {TIME_STEP:g} s, not {control_period}"
+            )
+        self._substeps = round(substeps)
+        self._sway_amplitude, self._noise_scale = float(sway), float(noise)
+        self._models: dict[Layout, tuple[mujoco.MjModel, mujoco.MjData]] = {}
+        self._camera: OffscreenCamera | None = None
+        self._ready = False
+
+    @property
+    def control_period(self) -> float:
+        return self._substeps * TIME_STEP
+
+    def reset(
+        self,
+        seed: int,
+        *,
+        layout: str | Layout | None = None,
+        start: Sequence[float] | np.ndarray | None = None,
+        obstacle_friction: float | None = None,
+        contact_friction: float | None = None,
+    ) -> TipObservation:
+        """Put the tip at rest on the base, near the entrance or at `start` (x, y) m in the world.
+
+        What is None is drawn by the seed: the maze among those of the world, the block's dry
+        friction (N) and the tip's coefficient of friction; the block's mass is always drawn.
+        """
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+            raise PalpateError(f"a seed is a whole number, 0 or greater, not {seed!r}")
+        self._ready = False
+        random = self._random = np.random.default_rng(seed)
+        drawn = self._layouts[random.integers(len(self._layouts))]
+        place = random.uniform(-1, 1, 2)
+        friction, touch = random.uniform(*OBSTACLE_FRICTION), random.uniform(*CONTACT_FRICTION)
+        self._obstacle_mass = random.uniform(*OBSTACLE_MASS)
+        self._rate = 2 * math.pi * random.uniform(*SWAY_FREQUENCY)
+        self._phase = random.uniform(0, 2 * math.pi)
+        if layout is not None:
+            drawn = _layout(layout)
+        if start is None:
+            place = drawn.start + place * drawn.start_half_sizes
+        else:
+            place = np.asarray(start, float)
+            if place.shape != (2,) or not drawn.clearance(place) >= TIP_RADIUS:
+                raise PalpateError(
+                    f"a tip starts at (x, y) in m, at least {TIP_RADIUS} from every wall of maze "
+                    f"'{drawn.name}', not at {start}"
+                )
+        self._layout = drawn
+        self._obstacle_friction = _positive("obstacle's friction", obstacle_friction, friction)
+        self._contact_friction = _positive("contact's friction", contact_friction, touch)
+        self._place(place)
+        self._noise = np.zeros(9)
+        self._drawn = BLOCK_OF_NOISE  # none are left
+        if self._noise_scale:
+            self._noise = random.standard_normal(9)
+        self._count, self._peak, self._fault = 0, 0.0, False
+        self._ready = True
+        return self._observe()
+
+    def _place(self, place: np.ndarray) -> None:
+        """A maze's engine with the constants of this episode, the tip at rest on its base."""
+        if self._layout not in self._models:
+            model = maze_scene(self._layout).compile()
+            self._models[self._layout] = (model, mujoco.MjData(model))
+        model, data = self._model, self._data = self._models[self._layout]
+        tip, block = model.body(TIP).id, model.body(BLOCK).id
+        model.body_mass[block] = self._obstacle_mass
+        mujoco.mj_setConst(model, data)
+        mujoco.mj_resetData(model, data)
+        inverse_mass = model.body_invweight0[tip, 0] + model.body_invweight0[block, 0]
+        model.pair_solref[model.pair(BLOCK).id] = contact_solref(inverse_mass)
+        model.pair_friction[:, :2] = self._contact_friction
+        model.dof_frictionloss[4] = self._obstacle_friction
+        offset, speed, _ = self._sway(0.0)
+        data.qpos[:3] = offset, place[0], place[1] - offset
+        data.qvel[0] = speed
+        mujoco.mj_forward(model, data)
+        self._position, self._velocity = data.qpos, data.qvel
+        self._applied, self._felt = data.qfrc_applied, data.sensordata
+        self._constraint, self._tip_place = data.qfrc_constraint, data.xpos[tip]
+
+    def _sway(self, time: float) -> tuple[float, float, float]:
+        """Where the base should be, m, how fast, m/s, and its acceleration, m/s^2."""
+        amplitude, rate = self._sway_amplitude, self._rate
+        angle = rate * time + self._phase
+        offset = amplitude * math.sin(angle)
+        return offset, amplitude * rate * math.cos(angle), -rate * rate * offset
+
+    def step(self, action: np.ndarray) -> TipObservation:
+        """Drive the tip with the force `action` (3,) N for one control period."""
+        if not self._ready:
+            raise PalpateError("a maze world runs after reset(seed), not before")
+        try:
+            x, y, z = map(float, action)
+        except (TypeError, ValueError) as error:
+            raise PalpateError(
+                f"a maze world takes a force (x, y, z) in N, not {action}"
+            ) from error
+        size = math.sqrt(x * x + y * y + z * z)
+        self._fault = not size < math.inf
+        if self._fault:
+            x = y = z = 0.0
+        elif size > DRIVE_LIMIT:
+            x, y, z = (value * DRIVE_LIMIT / size for value in (x, y, z))
+        position, velocity, applied = self._position, self._velocity, self._applied
+        applied[1], applied[2], applied[3] = x, y, z
+        peak, constraint = 0.0, self._constraint
+        for _ in range(self._substeps):
+            offset, speed, acceleration = self._sway(self._data.time)
+            applied[0] = (BASE_MASS + TIP_MASS) * (
+                acceleration
+                + 2 * SERVO * (speed - velocity[0])
+                + SERVO * SERVO * (offset - position[0])
+            )
+            mujoco.mj_step(self._model, self._data)
+            peak = max(peak, constraint[1] ** 2 + constraint[2] ** 2)
+        self._peak = math.sqrt(peak)
+        self._count += 1
+        if not velocity[1] ** 2 + velocity[2] ** 2 + velocity[4] ** 2 < FASTEST**2:
+            self._ready = False
+            raise DivergedError(
+                f"the maze's simulation diverged at {self._data.time:.3f} s; gentler forces would "
+                "work"
+            )
+        return self._observe()
+
+    def _observe(self) -> TipObservation:
+        force = -self._felt[:3]
+        wrench = np.empty(6)
+        wrench[:3] = force
+        wrench[3:] = 0.0
+        position = self._position[1:4].copy()
+        if force.any():
+            # From the point that all contacts together act at to the one that torques are about.
+            x, y, z = self._felt[6:9] - self._tip_place
+            z -= REFERENCE_HEIGHT
+            fx, fy, fz = force
+            wrench[3] = y * fz - z * fy - self._felt[3]
+            wrench[4] = z * fx - x * fz - self._felt[4]
+            wrench[5] = x * fy - y * fx - self._felt[5]
+        if self._noise_scale:
+            noise = self._next_noise()
+            wrench += noise[:6]
+            position += noise[6:]
+        return TipObservation(
+            self._count * self.control_period, wrench, position, self._velocity[1:4].copy()
+        )
+
+    def _next_noise(self) -> np.ndarray:
+        """(9,) of the Ornstein-Uhlenbeck processes, sampled exactly at the control period."""
+        if self._drawn == BLOCK_OF_NOISE:
+            kicks = self._random.standard_normal((BLOCK_OF_NOISE, 9))
+            self._block = np.empty_like(kicks)
+            for part, correlation in (
+                (slice(0, 6), WRENCH_CORRELATION),
+                (slice(6, 9), POSITION_CORRELATION),
+            ):
+                keep = math.exp(-self.control_period / correlation)
+                self._block[:, part] = lfilter(
+                    [math.sqrt(1 - keep**2)], [1, -keep], kicks[:, part], axis=0,
+                    zi=keep * self._noise[None, part],
+                )[0]  # fmt: skip
+            self._noise = self._block[-1].copy()
+            self._block *= self._noise_scale * NOISE
+            self._drawn = 0
+        self._drawn += 1
+        return self._block[self._drawn - 1]
+
+    def truth(self) -> TipTruth:
+        if not self._ready:
+            raise PalpateError("a maze world has a truth after reset(seed), not before")
+        position, velocity = self._position[1:4].copy(), self._velocity[1:4].copy()
+        position[1] += self._position[0]
+        velocity[1] += self._velocity[0]
+        return TipTruth(
+            self._count * self.control_period, position, velocity, self._constraint[1:4].copy(),
+            self._peak, float(self._position[0]), float(self._position[4]), self._fault,
+            self._layout, self._obstacle_friction, self._obstacle_mass, self._contact_friction,
+        )  # fmt: skip
+
+    def render(self, width: int = 640, height: int = 480) -> np.ndarray:
+        if not self._ready:
+            raise PalpateError("a maze world is drawn after reset(seed), not before")
+        camera = self._camera
+        if camera is None or (camera.model, camera.width, camera.height) != (
+            self._model, width, height,
+        ):  # fmt: skip
+            self._camera = camera = OffscreenCamera(self._model, width, height)
+        view = mujoco.MjvCamera()
+        view.lookat, view.distance, view.azimuth, view.elevation = (0, 0, 0), 0.75, 90, -80
+        return camera.picture(self._data, view)
+
+
+NOISE = np.array([FORCE_NOISE] * 3 + [TORQUE_NOISE] * 3 + [POSITION_NOISE] * 3)
+
+
+def _layout(given: str | Layout) -> Layout:
+    return given if isinstance(given, Layout) else named_layout(given)
+
+
+def _positive(what: str, given: float | None, drawn: float) -> float:
+    value = drawn if given is None else float(given)
+    if not 0 <= value < math.inf:
+        raise PalpateError(f"the {what} is 0 or greater and finite, not {given}")
+    return value

@@ -1,0 +1,124 @@
+"""The MuJoCo scene of a maze: a tip on a swaying base, soft walls and a block that slides."""
+
+import math
+
+import mujoco
+
+from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
+
+TIME_STEP = 1e-3  # s
+TIP_MASS = 1.0  # kg
+BASE_MASS = 1000.0  # kg: what the tip's force does to it is micrometres
+
+# The tip's rubber on any wall: a spring and damper, critically damped for the tip's mass.
+CONTACT_STIFFNESS = 3000.0  # N/m
+CONTACT_DAMPING = 2 * math.sqrt(CONTACT_STIFFNESS * TIP_MASS)  # N s/m
+# MuJoCo's direct form takes both per effective mass. An impedance near 0 makes the contact that
+# spring, whatever else pushes; near 1 it would be a rigid constraint (Todorov 2014, ICRA).
+CONTACT_IMPEDANCE = 0.01
+# Dry friction holds by a damper between rubber and wall; a stiffer one would, in MuJoCo's convex
+# contacts, lift what slides off the wall by its speed times coefficient, damping over stiffness.
+SLIP_DAMPING = 5.0  # N s/m
+FRICTION_RATIO = 1000  # by which friction is held harder than the normal direction
+PLANE_STIFFNESS = 1e4  # N/m, holds the tip at its height
+HALF_HEIGHT = 0.03  # m, of walls
+REFERENCE_HEIGHT = 0.05  # m above the contact: the point that torques are felt about
+
+TIP, BLOCK, FEELER = "tip", "block", "feeler"
+
+
+def contact_solref(inverse_mass: float) -> tuple[float, float]:
+    """(-stiffness, -damping) per effective mass, as MuJoCo takes them, for a contact's spring.
+
+    `inverse_mass`, 1/kg, is that of the two bodies together: MuJoCo divides by it.
+    """
+    return (-CONTACT_STIFFNESS * inverse_mass, -CONTACT_DAMPING * inverse_mass)
+
+
+def maze_scene(layout: Layout) -> mujoco.MjSpec:
+    """The scene, uncompiled: joints base y, tip x, y, z (relative to the base), block x."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "maze"
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep, option.gravity = TIME_STEP, (0, 0, 0)  # compensated by the robot
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = FRICTION_RATIO
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    world, box = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX
+    world.add_light(pos=(-0.2, -0.3, 1), dir=(0.2, 0.3, -1))
+    world.add_geom(
+        type=box, size=(ARENA[0] + 0.1, ARENA[1] + 0.05, 0.005), pos=(0, 0, -HALF_HEIGHT - 0.005),
+        contype=0, conaffinity=0, rgba=(0.93, 0.93, 0.9, 1),
+    )  # fmt: skip
+    x, y = layout.goal
+    world.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=(layout.goal_radius, 0.001, 0),
+        pos=(x, y, -HALF_HEIGHT), contype=0, conaffinity=0, rgba=(0.3, 0.7, 0.4, 1),
+    )  # fmt: skip
+    for number, wall in enumerate(layout.walls):
+        world.add_geom(
+            name=f"wall {number}", type=box, size=(*wall.half_sizes, HALF_HEIGHT),
+            pos=(*wall.position, 0), quat=(math.cos(wall.yaw / 2), 0, 0, math.sin(wall.yaw / 2)),
+            contype=0, conaffinity=0, rgba=(0.55, 0.55, 0.6, 1),
+        )  # fmt: skip
+    _add_tip(spec)
+    block = world.add_body(name=BLOCK, pos=(*layout.obstacle.position, 0))
+    block.add_joint(
+        name=BLOCK, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0),
+        limited=1, range=(0, layout.obstacle.travel), solref_limit=(0.004, 1),
+        # Stiff: with MuJoCo's own values a block that is pushed less than it resists creeps 1 cm/s.
+        solref_friction=(2 * TIME_STEP, 1), solimp_friction=(0.9999, 0.9999, 0.001, 0.5, 2),
+        frictionloss=1.0,
+    )  # fmt: skip
+    block.add_geom(
+        name=BLOCK, type=box, size=(*layout.obstacle.half_sizes, HALF_HEIGHT), mass=1.0,
+        contype=0, conaffinity=0, rgba=(0.85, 0.5, 0.2, 1),
+    )  # fmt: skip
+    for touched in (BLOCK, *(f"wall {number}" for number in range(len(layout.walls)))):
+        spec.add_pair(
+            name=touched, geomname1=TIP, geomname2=touched, condim=3,
+            solref=contact_solref(1 / TIP_MASS), solreffriction=(-SLIP_DAMPING, -SLIP_DAMPING),
+            solimp=(CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 0.01, 0.5, 2),
+        )  # fmt: skip
+    data = mujoco.mjtConDataField
+    spec.add_sensor(
+        name=FEELER, type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=TIP,
+        # Force, torque and place of all contacts together ("netforce"), in world axes.
+        intprm=(
+            sum(1 << int(f) for f in (
+                data.mjCONDATA_FORCE, data.mjCONDATA_TORQUE, data.mjCONDATA_POS)),
+            3, 1,
+        ),
+    )  # fmt: skip
+    return spec
+
+
+def _add_tip(spec: mujoco.MjSpec) -> None:
+    """The base on its slide, and on it the tip on three slides.
+
+    The tip is a vertical capsule whose lower end, a ball, is what touches: a whole capsule would
+    touch a wall at one or two points, and be twice as stiff at two.
+    """
+    slide, capsule = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtGeom.mjGEOM_CAPSULE
+    base = spec.worldbody.add_body(name="base", mass=BASE_MASS, inertia=(1, 1, 1))
+    base.explicitinertial = True
+    base.add_joint(name="base", type=slide, axis=(0, 1, 0))
+    tip = base.add_body(name=TIP, mass=TIP_MASS, inertia=(1e-3, 1e-3, 1e-3))
+    tip.explicitinertial = True
+    for axis, name in zip(((1, 0, 0), (0, 1, 0)), "xy", strict=True):
+        tip.add_joint(name=f"tip {name}", type=slide, axis=axis)
+    tip.add_joint(
+        name="tip z", type=slide, axis=(0, 0, 1), stiffness=PLANE_STIFFNESS,
+        damping=2 * math.sqrt(PLANE_STIFFNESS * TIP_MASS),
+    )  # fmt: skip
+    tip.add_geom(
+        name=TIP, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(TIP_RADIUS, 0, 0),
+        contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
+    )  # fmt: skip
+    tip.add_geom(
+        type=capsule, size=(TIP_RADIUS, 0, 0), fromto=(0, 0, 0, 0, 0, 2 * REFERENCE_HEIGHT),
+        contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
+    )  # fmt: skip

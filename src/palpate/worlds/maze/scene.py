@@ -40,6 +40,7 @@ def maze_scene(layout: Layout) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "maze"
     spec.compiler.degree = False
+    spec.memory = 2**20  # bytes, of which 17 kB are used
     option = spec.option
     option.timestep, option.gravity = TIME_STEP, (0, 0, 0)  # compensated by the robot
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -32,9 +32,12 @@ def still(**options) -> BlindMaze:
     return BlindMaze(sway=0.0, noise=0.0, **options)
 
 
-def held(world, force, steps):
+def held(world, force, steps, damping=0.0):
+    """The last observation under a force, and a damper (N s/m) where what bounces is to rest."""
+    velocity = np.zeros(3)
     for _ in range(steps):
-        observation = world.step(force)
+        observation = world.step(force - damping * velocity)
+        velocity = observation.velocity
     return observation
 
 
@@ -45,7 +48,7 @@ def test_a_wall_gives_way_like_a_spring(force, direction):
     start = (-0.165 + TIP_RADIUS, -0.15) if direction[0] < 0 else (-0.1, -0.235)
     world.reset(0, start=start, contact_friction=0.0)
     push = force * np.array([*direction, 0.0])
-    observation = held(world, push, 3000)
+    observation = held(world, push, 3000, damping=60.0)
     truth = world.truth()
     if direction[0] < 0:  # against the thin wall's right face
         depth, feels, arm = -0.175 + TIP_RADIUS - truth.position[0], -push, (-1, 0)
@@ -56,7 +59,7 @@ def test_a_wall_gives_way_like_a_spring(force, direction):
     assert depth == pytest.approx(normal / CONTACT_STIFFNESS, rel=0.015)
     np.testing.assert_allclose(truth.force, feels, atol=1e-4)
     np.testing.assert_allclose(observation.wrench[:3], truth.force, atol=1e-4)
-    assert truth.peak_force == pytest.approx(force, rel=1e-6)
+    assert truth.peak_force == pytest.approx(force, rel=1e-5)
     level = np.cross([0, 0, -REFERENCE_HEIGHT], feels)[:2]
     np.testing.assert_allclose(observation.wrench[3:5], level, atol=1e-4)
 
@@ -64,7 +67,7 @@ def test_a_wall_gives_way_like_a_spring(force, direction):
 def test_friction_is_felt_as_a_torque_about_the_vertical():
     world = still()
     world.reset(0, start=(-0.1, -0.239), contact_friction=0.3)
-    observation = held(world, np.array([3.0, -4.0, 0.0]), 100)
+    observation = held(world, np.array([3.0, -4.0, 0.0]), 250, damping=20.0)
     # It slides: the wall drags it back by 0.3 times 4 N, at the radius less half its depth.
     np.testing.assert_allclose(observation.wrench[:2], [-1.2, 4.0], rtol=0.02)
     depth = 4.0 / CONTACT_STIFFNESS
@@ -142,17 +145,17 @@ def test_noise_is_an_ornstein_uhlenbeck_process():
 def test_the_block_holds_below_its_friction_and_yields_above():
     world = still()
     world.reset(0, start=AT_BLOCK, obstacle_friction=20.0)
-    held(world, np.array([19.0, 0, 0]), 5000)
+    held(world, np.array([19.0, 0, 0]), 5000, damping=60.0)
     assert world.truth().obstacle < 3e-3  # its dent at first touch, then less than 1 mm in 5 s
     before = world.truth().obstacle
-    held(world, np.array([19.0, 0, 0]), 5000)
+    held(world, np.array([19.0, 0, 0]), 5000, damping=60.0)
     assert world.truth().obstacle - before < 1e-4
-    held(world, np.array([21.0, 0, 0]), 5000)
+    held(world, np.array([21.0, 0, 0]), 10_000, damping=60.0)
     truth = world.truth()
     assert truth.obstacle == pytest.approx(HOME.obstacle.travel, abs=1e-3)
     # Pushed to its end, it lets the tip out of the channel: beyond the thick wall's corner.
     assert truth.position[0] > 0.07 + TIP_RADIUS
-    held(world, np.array([0.0, 3.0, 0]), 600)
+    held(world, np.array([0.0, 3.0, 0]), 600, damping=60.0)
     assert world.truth().position[1] > AT_BLOCK[1] + BLOCK_HALF_SIZES[1] + TIP_RADIUS
 
 

@@ -10,9 +10,10 @@ TIME_STEP = 1e-3  # s
 TIP_MASS = 1.0  # kg
 BASE_MASS = 1000.0  # kg: what the tip's force does to it is micrometres
 
-# The tip's rubber on any wall: a spring and damper, critically damped for the tip's mass.
+# The tip's rubber on any wall: a spring and a damper, a fifth of the critical one. A critical one
+# answers a wall that the swaying base brings up with 21 N at once, however soft the tip is held.
 CONTACT_STIFFNESS = 3000.0  # N/m
-CONTACT_DAMPING = 2 * math.sqrt(CONTACT_STIFFNESS * TIP_MASS)  # N s/m
+CONTACT_DAMPING = 0.2 * 2 * math.sqrt(CONTACT_STIFFNESS * TIP_MASS)  # N s/m
 # MuJoCo's direct form takes both per effective mass. An impedance near 0 makes the contact that
 # spring, whatever else pushes; near 1 it would be a rigid constraint (Todorov 2014, ICRA).
 CONTACT_IMPEDANCE = 0.01

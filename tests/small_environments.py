@@ -23,6 +23,26 @@ class Bandit(gymnasium.Env):
         return self.seen, -(wrong**2), True, False, told
 
 
+class Cliff(gymnasium.Env):
+    """Three steps at most; each is worth its action, and one above 0 ends it by a violation."""
+
+    observation_space = Box(-1.0, 1.0, (2,), np.float32)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = 3
+        return self._seen(), {}
+
+    def step(self, action):
+        over, self.left = bool(action[0] > 0.0), self.left - 1
+        told = {"cost": float(over), "end": "violation" if over else "", "force": 9.0 * over}
+        return self._seen(), float(action[0]), over, not over and self.left == 0, told
+
+    def _seen(self):
+        return self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32)
+
+
 class Regulator(gymnasium.Env):
     """A scalar linear system x' = x + u, cost x^2 + u^2, 10 steps; its Riccati equation is solved.
 

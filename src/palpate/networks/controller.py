@@ -1,7 +1,8 @@
 """What decides: the contract of every controller, and the files that controllers are kept in.
 
-A file says of which kind its controller is. The kinds are `CommandPolicy` and what the families'
-table names as `controllers`: networks, planners, hand-written laws.
+A file says of which kind its controller is. The kinds are `CommandPolicy`, `ActorPolicy`,
+`GuardedPolicy` and what the families' table names as `controllers`: networks, planners,
+hand-written laws.
 """
 
 import dataclasses
@@ -22,7 +23,11 @@ from palpate.runs.storage import load_arrays, read_json, read_manifest, save_arr
 
 _FORMAT, _VERSION = "palpate.controller", 1  # of JSON files
 _NETWORK = "command network"
-_OWN_KINDS = {_NETWORK: "palpate.networks.policy:CommandPolicy"}
+_OWN_KINDS = {
+    _NETWORK: "palpate.networks.policy:CommandPolicy",
+    "actor": "palpate.networks.guarded:ActorPolicy",
+    "guarded actor": "palpate.networks.guarded:GuardedPolicy",
+}
 _DECLARED = ("observations", "actions", "period")
 
 

@@ -3,4 +3,9 @@
 from palpate.learning.off_policy.buffer import Transition as Transition
 from palpate.learning.off_policy.loop import OffPolicyTraining as OffPolicyTraining
 from palpate.learning.off_policy.loop import train_off_policy as train_off_policy
+from palpate.learning.off_policy.recovery import RecoveryAgent as RecoveryAgent
+from palpate.learning.off_policy.rollouts import at_its_best as at_its_best
+from palpate.learning.off_policy.rollouts import collect as collect
+from palpate.learning.off_policy.rollouts import evaluate as evaluate
 from palpate.learning.off_policy.sac import SoftActorCritic as SoftActorCritic
+from palpate.learning.off_policy.safety_critic import SafetyCritic as SafetyCritic

@@ -44,6 +44,10 @@ STAGES = {
     "learning": [
         *("learning.self_supervised", "learning.closed_loop", "learning.dagger"),
         *("learning.loss_monitor", "networks.policy", "networks.controller", "networks.channels"),
+        *("learning.off_policy.loop", "learning.off_policy.agent", "learning.off_policy.buffer"),
+        *("learning.off_policy.sac", "learning.off_policy.recovery"),
+        *("learning.off_policy.safety_critic", "learning.off_policy.rollouts"),
+        *("networks.actor", "networks.guarded"),
         *("tasks.task", "tasks.rope.stabilization", "tasks.rope.tracking", "tasks.rope.paths"),
         "tasks.furniture.cart",
     ],

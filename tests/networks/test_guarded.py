@@ -19,13 +19,21 @@ OBSERVATION = jax.random.normal(KEYS[2], (7, 9))
 
 
 def actor() -> ActorPolicy:
-    return ActorPolicy(DeterministicActor.create(KEYS[0], 9, 4, 16, 2), SEEN, DONE, 0.1)
+    network = DeterministicActor.create(KEYS[0], 9, 4, 16, 2)
+    return ActorPolicy(actor=network, observations=SEEN, actions=DONE, period=0.1)
 
 
 def guarded(threshold: float = 0.5) -> GuardedPolicy:
     guard = untrained_guard(KEYS[1], 6, 4, (16, 16, 16), tuple(range(6)))
     network = GaussianActor.create(KEYS[0], 9, 4, 16, 2)
-    return GuardedPolicy(network, SEEN, DONE, 0.1, guard, threshold)
+    return GuardedPolicy(
+        actor=network,
+        observations=SEEN,
+        actions=DONE,
+        period=0.1,
+        guard=guard,
+        threshold=threshold,
+    )
 
 
 def test_what_is_risky_is_recovered_and_nothing_else() -> None:

@@ -99,7 +99,8 @@ class ActorPolicy(DeclaredController):
     def from_settings(cls, folder: Path, **settings: Any) -> "ActorPolicy":
         kind, (width, *others) = ACTORS[settings.pop("actor")], settings.pop("layers")
         seen, done = count_of(settings["observations"]), count_of(settings["actions"])
-        return cls(kind.create(jax.random.key(0), seen, done, width, 1 + len(others)), **settings)
+        actor = kind.create(jax.random.key(0), seen, done, width, 1 + len(others))
+        return cls(actor=actor, **settings)
 
 
 class GuardedPolicy(ActorPolicy):
@@ -142,8 +143,8 @@ class GuardedPolicy(ActorPolicy):
         alone = ActorPolicy.from_settings(folder, **settings)
         features = count_of(alone.observations) if seen is None else len(seen)
         guard = untrained_guard(jax.random.key(0), features, count_of(alone.actions), layers, seen)
-        declared = alone.observations, alone.actions, alone.period
-        return cls(alone.actor, *declared, guard, threshold)
+        declared = {name: getattr(alone, name) for name in ("observations", "actions", "period")}
+        return cls(actor=alone.actor, guard=guard, threshold=threshold, **declared)
 
 
 def untrained_guard(

@@ -1,0 +1,1 @@
+"""What an action may do to the world: how stiff, how hard."""

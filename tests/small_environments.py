@@ -43,6 +43,24 @@ class Cliff(gymnasium.Env):
         return self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32)
 
 
+class Priced(gymnasium.Env):
+    """One step: the reward is -(action - 1)^2, its cost the action's square.
+
+    At a price p of the cost the best action is 1 / (1 + p); under a limit of 1/4 it is 1/2.
+    """
+
+    observation_space = Box(-1.0, 1.0, (1,), np.float32)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        cost = {"cost": float(action[0]) ** 2}
+        return np.zeros(1, np.float32), -((float(action[0]) - 1.0) ** 2), True, False, cost
+
+
 class Regulator(gymnasium.Env):
     """A scalar linear system x' = x + u, cost x^2 + u^2, 10 steps; its Riccati equation is solved.
 

@@ -11,10 +11,17 @@ from gymnasium.vector import SyncVectorEnv
 from safetensors import safe_open
 
 from palpate.errors import PalpateError
-from palpate.learning.off_policy import OffPolicyTraining, SoftActorCritic, train_off_policy
+from palpate.learning.off_policy import (
+    DeterministicPolicyGradient,
+    Lagrangian,
+    OffPolicyTraining,
+    Penalty,
+    SoftActorCritic,
+    train_off_policy,
+)
 from palpate.learning.off_policy.loop import Compiled
 from palpate.runs import Run
-from small_environments import Bandit, Regulator, side_by_side
+from small_environments import Bandit, Priced, Regulator, side_by_side
 
 pytestmark = pytest.mark.optimised
 
@@ -32,6 +39,26 @@ def test_a_bandit_is_solved() -> None:
     state = train_off_policy(side_by_side(Bandit, 4), SMALL, settings, 0)
     seen = np.linspace(-0.9, 0.9, 19)[:, None]
     assert np.abs(greedy(SMALL, state, seen) - 0.5 * seen).max() < 0.1
+
+
+DETERMINISTIC = DeterministicPolicyGradient(width=32, learning_rate=3e-3, noise=0.1)
+PRICED = OffPolicyTraining(4000, warm_up=200, batch=64, capacity=1000, ratio=0.5)
+
+
+def test_a_price_on_the_cost_moves_the_optimum() -> None:
+    agent = Penalty(DETERMINISTIC, weight=3.0)
+    state = train_off_policy(side_by_side(Priced, 8), agent, PRICED, 0)
+    assert abs(greedy(agent, state, [[0.0]])[0, 0] - 0.25) < 0.07
+
+
+@pytest.mark.parametrize("episodic", [True, False])
+def test_a_limit_finds_its_price(episodic: bool) -> None:
+    agent = Lagrangian(
+        DETERMINISTIC, 0.25, episodic, 3e-3, multiplier_rate=3e-3, width=32, patience=200
+    )
+    state = train_off_policy(side_by_side(Priced, 8), agent, PRICED, 0)
+    assert abs(greedy(agent, state, [[0.0]])[0, 0] - 0.5) < 0.07
+    assert abs(state.multiplier - 1.0) < 0.3
 
 
 def test_a_regulator_comes_near_its_riccati_gain() -> None:

@@ -1,6 +1,11 @@
 """Learning from remembered transitions, in environments side by side."""
 
 from palpate.learning.off_policy.buffer import Transition as Transition
+from palpate.learning.off_policy.constrained import Lagrangian as Lagrangian
+from palpate.learning.off_policy.constrained import Penalty as Penalty
+from palpate.learning.off_policy.ddpg import (
+    DeterministicPolicyGradient as DeterministicPolicyGradient,
+)
 from palpate.learning.off_policy.loop import OffPolicyTraining as OffPolicyTraining
 from palpate.learning.off_policy.loop import train_off_policy as train_off_policy
 from palpate.learning.off_policy.recovery import RecoveryAgent as RecoveryAgent

@@ -1,10 +1,12 @@
 """What every world shares: decimation and pictures."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.worlds.world import Decimated, World, _gl_context
+from palpate.worlds.world import Decimated, World, _gl_context, side_by_side
 from small_rope import rope
 
 
@@ -38,18 +40,53 @@ def test_a_decimated_world_holds_the_action():
     assert world.render(4, 2).shape == (2, 4, 3)
 
 
-def test_what_stands_between_the_rates_sees_each_observation_and_changes_the_action():
-    seen = []
+class Shown(NamedTuple):
+    total: float
+    place: np.ndarray
 
-    def capped(observation, action):
-        seen.append(observation)
-        return min(action, 15 - observation)
 
-    world = Decimated(Counter(), every=3, between=capped)
+class ShowingCounter(Counter):
+    def reset(self, seed, **options):
+        return Shown(super().reset(seed), np.zeros(2))
+
+    def step(self, action):
+        return Shown(super().step(float(action[0])), np.ones(2))
+
+
+class Capped:
+    """Counts on, but not beyond 15."""
+
+    def __init__(self):
+        self.seen, self.began = [], []
+
+    def begin(self, observation, action, fresh):
+        self.action = action
+        self.began.append((*observation.total, *fresh))
+
+    def command(self, observation):
+        assert observation.place.shape == (1, 2)
+        self.seen.append(*observation.total)
+        return np.minimum(self.action, 15 - observation.total[:, None])
+
+
+def test_a_law_between_the_rates_sees_each_observation_and_makes_the_command():
+    law = Capped()
+    world = Decimated(ShowingCounter(), every=3, law=law)
     world.reset(2)
-    assert world.step(5) == 15
-    assert seen == [2, 7, 12]
-    assert world.step(1) == 15
+    assert world.step(np.array([5.0])).total == 15
+    assert law.seen == [2, 7, 12]
+    assert world.step(np.array([1.0])).total == 15
+    world.reset(4)
+    world.step(np.array([1.0]))
+    assert law.began == [(2, True), (15, False), (4, True)]
+
+
+def test_worlds_side_by_side_show_named_tuples():
+    both = side_by_side([Shown(1.0, np.zeros(2)), Shown(2.0, np.ones(2))])
+    np.testing.assert_array_equal(both.total, [1, 2])
+    np.testing.assert_array_equal(both.place, [[0, 0], [1, 1]])
+    with pytest.raises(PalpateError, match="named tuples of numbers and arrays, not int"):
+        side_by_side([1, 2])
 
 
 @pytest.mark.parametrize("every", [0, -2])

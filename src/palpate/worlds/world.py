@@ -7,8 +7,8 @@ import functools
 import os
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -60,33 +60,66 @@ class World(ABC):
         """
 
 
+@runtime_checkable
+class ControlLaw(Protocol):
+    """What turns the decision in force into what is done in each control period.
+
+    It serves worlds side by side: observations and all it takes and gives lead with an axis of
+    worlds (`side_by_side`). A filter or a reflex is a control law that wraps another.
+    """
+
+    def begin(self, observation: Any, action: np.ndarray, fresh: np.ndarray) -> None:
+        """A decision: from now on `action` (worlds, ...) holds; `fresh` (worlds,) bool where an
+        episode has just begun, of which nothing may be carried over."""
+
+    def command(self, observation: Any) -> np.ndarray:
+        """What to do in the next control period (worlds, ...): asked in each, the first as well."""
+        ...
+
+
+def side_by_side(observations: Sequence[Any]) -> Any:
+    """Observations of several worlds as one of their kind, whose fields lead with the worlds.
+
+    Raises `PalpateError` for observations that are no named tuples.
+    """
+    kind = type(observations[0])
+    if not hasattr(kind, "_make"):
+        raise PalpateError(
+            f"worlds side by side give named tuples of numbers and arrays, not {kind.__name__}"
+        )
+    return kind._make(map(np.array, zip(*observations, strict=True)))
+
+
 class Decimated(World):
     """A world seen by a slower decision: each action is held for `every` control periods.
 
-    `between`, if given, stands between the two rates, such as a filter or a reflex: of the newest
-    observation and the action it makes what is done in the next control period. The observation
-    returned is the last one.
+    `law`, if given, stands between the two rates: of the newest observation and the action it
+    makes what is done in the next control period. The observation returned is the last one.
     """
 
-    def __init__(self, world: World, every: int, between: Callable[[Any, Any], Any] | None = None):
-        if not isinstance(every, int | np.integer) or every < 1:
-            raise PalpateError(
-                f"a decision is held for a whole number of control periods, 1 or more, not {every}"
-            )
-        self.world, self.every, self.between = world, int(every), between
+    def __init__(self, world: World, every: int, law: ControlLaw | None = None):
+        self.world, self.every, self.law = world, whole_periods(every), law
         self._observation: Any = None
+        self._fresh = True
 
     @property
     def control_period(self) -> float:
         return self.every * self.world.control_period
 
     def reset(self, seed: int, **options: Any) -> Any:
-        self._observation = self.world.reset(seed, **options)
+        self._observation, self._fresh = self.world.reset(seed, **options), True
         return self._observation
 
     def step(self, action: Any) -> Any:
+        if self.law:
+            seen = side_by_side([self._observation])
+            self.law.begin(seen, np.asarray(action)[None], np.array([self._fresh]))
+            self._fresh = False
         for _ in range(self.every):
-            done = self.between(self._observation, action) if self.between else action
+            if self.law is None:
+                done = action
+            else:
+                done = self.law.command(side_by_side([self._observation]))[0]
             self._observation = self.world.step(done)
         return self._observation
 
@@ -95,6 +128,15 @@ class Decimated(World):
 
     def render(self, width: int = 640, height: int = 480) -> np.ndarray:
         return self.world.render(width, height)
+
+
+def whole_periods(every: int) -> int:
+    """For how many control periods a decision is held; raises `PalpateError` for fewer than one."""
+    if not isinstance(every, int | np.integer) or every < 1:
+        raise PalpateError(
+            f"a decision is held for a whole number of control periods, 1 or more, not {every}"
+        )
+    return int(every)
 
 
 @functools.cache

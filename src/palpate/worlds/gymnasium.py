@@ -1,0 +1,259 @@
+"""Any world as an environment of Gymnasium: one, or several that are stepped side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from palpate.errors import PalpateError
+from palpate.worlds.world import (
+    ControlLaw,
+    DivergedError,
+    World,
+    side_by_side,
+    whole_periods,
+)
+
+# What is beyond is cut off: features are scaled to about 1, and Gymnasium wants them bounded.
+FEATURE_LIMIT = 100.0
+# How an episode can end beside what the task says.
+VIOLATION, HORIZON, DIVERGED = "violation", "horizon", "diverged"
+
+
+@runtime_checkable
+class WorldTask(Protocol):
+    """What is wanted in a world, judged by its truth. It keeps nothing of an episode.
+
+    `features` and `actions` are the sizes of what a policy sees and does, the latter in [-1, 1];
+    `horizon` is the number of decisions after which an episode is cut off.
+    """
+
+    features: int
+    actions: int
+    horizon: int
+
+    def observe(self, observation: Any) -> np.ndarray:
+        """(worlds, features) of observations side by side."""
+        ...
+
+    def reward(self, before: Any, after: Any, action: np.ndarray) -> float:
+        """Of one decision, by the truths of the world at its beginning and its end."""
+        ...
+
+    def violates(self, truth: Any) -> bool:
+        """Asked in every control period: whether it breaks the limit, which ends the episode."""
+        ...
+
+    def force(self, truth: Any) -> float:
+        """N: the greatest contact force in the last control period; 0 where there is none."""
+        ...
+
+    def end(self, truth: Any) -> str:
+        """Asked after a decision: "" while the episode goes on, else how it ended ("goal")."""
+        ...
+
+
+class _Lockstep:
+    """Worlds side by side at the control rate, whose decisions are taken together."""
+
+    def __init__(
+        self, worlds: Sequence[World], task: WorldTask, law: ControlLaw | None, every: int
+    ):
+        self.worlds, self.task, self.law = tuple(worlds), task, law
+        self.every = whole_periods(every)
+        count = len(self.worlds)
+        if not count:
+            raise PalpateError("environments side by side need at least one world")
+        self.observations: list[Any] = [None] * count
+        self._truths: list[Any] = [None] * count
+        self.fresh = np.ones(count, bool)
+        self.decisions = np.zeros(count, int)
+        one = np.ones(task.features, np.float32) * FEATURE_LIMIT
+        self.observation_space = Box(-one, one)
+        self.action_space = Box(-1.0, 1.0, (task.actions,), np.float32)
+
+    def reset(self, number: int, random: np.random.Generator, options: dict[str, Any]) -> None:
+        world = self.worlds[number]
+        self.observations[number] = world.reset(int(random.integers(2**31)), **options)
+        self._truths[number] = world.truth()
+        self.fresh[number], self.decisions[number] = True, 0
+
+    def features(self) -> np.ndarray:
+        seen = self.task.observe(side_by_side(self.observations))
+        return np.clip(seen, -FEATURE_LIMIT, FEATURE_LIMIT).astype(np.float32)
+
+    def decide(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
+        """Rewards, who terminated, who was cut off, and what else is told, each (worlds,).
+
+        A world whose episode ends within the decision stands still until the others are done.
+        """
+        worlds, task, law, observations = self.worlds, self.task, self.law, self.observations
+        if observations[0] is None:
+            raise PalpateError("an environment takes a step after reset(), not before")
+        before, truths = list(self._truths), self._truths
+        end = np.full(len(worlds), "", object)
+        force, running = [0.0] * len(worlds), list(range(len(worlds)))
+        if law is not None:
+            law.begin(side_by_side(observations), actions, self.fresh.copy())
+        for _ in range(self.every):
+            commands = actions if law is None else law.command(side_by_side(observations))
+            for number in tuple(running):
+                world = worlds[number]
+                try:
+                    observations[number] = world.step(commands[number])
+                except DivergedError:
+                    end[number] = DIVERGED
+                    running.remove(number)
+                    continue
+                truths[number] = truth = world.truth()
+                force[number] = max(force[number], task.force(truth))
+                if task.violates(truth):
+                    end[number] = VIOLATION
+                    running.remove(number)
+        self.fresh[:] = False
+        self.decisions += 1
+        reward = np.array(
+            [float(task.reward(*each)) for each in zip(before, truths, actions, strict=True)]
+        )
+        for number in running:
+            end[number] = task.end(truths[number]) or (
+                HORIZON if self.decisions[number] >= task.horizon else ""
+            )
+        cut = (end == HORIZON) | (end == DIVERGED)
+        told = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
+        told["force"] = np.array(force)
+        return reward, (end != "") & ~cut, cut, told
+
+
+class GymnasiumWorlds(VectorEnv):
+    """Worlds side by side as a vector environment that resets in the step that ends an episode.
+
+    Each action is held for `every` control periods; `law` makes of it what is done in each of them
+    (None: the action itself is done). `task` says what is seen, wanted and forbidden. World i
+    behaves as `GymnasiumWorld` does with the seed that Gymnasium gives it: that of `reset`, plus i.
+
+    The infos of a step hold, for all worlds: "cost" (0 or 1: a violation, which ends the episode at
+    once, within the decision), "end" (str: "" while it goes on, else what the task says,
+    "violation", "horizon" or "diverged") and "force" (N, the greatest in this decision); and
+    "final_obs" where an episode ended. An episode that is cut off at the horizon, or whose
+    simulation diverged, is truncated.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
+        "render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.SAME_STEP,
+    }  # fmt: skip
+
+    def __init__(
+        self,
+        worlds: Sequence[World],
+        task: WorldTask,
+        law: ControlLaw | None,
+        every: int,
+        render_mode: str | None = None,
+    ):
+        self._lockstep = _Lockstep(worlds, task, law, every)
+        self.num_envs, self.render_mode = len(worlds), render_mode
+        self.single_observation_space = self._lockstep.observation_space
+        self.single_action_space = self._lockstep.action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._randoms = [np_random(None)[0] for _ in range(self.num_envs)]
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """First observations (worlds, features) float32; `options` go to the reset of each world.
+
+        Raises `PalpateError` for a list of seeds of another length.
+        """
+        if seed is None or isinstance(seed, int):
+            seeds = [None if seed is None else seed + number for number in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise PalpateError(f"{self.num_envs} worlds take as many seeds, not {len(seeds)}")
+        for number, given in enumerate(seeds):
+            if given is not None:
+                self._randoms[number] = np_random(given)[0]
+            self._lockstep.reset(number, self._randoms[number], options or {})
+        return self._lockstep.features(), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One decision of every world, `actions` (worlds, actions) in [-1, 1]."""
+        lockstep = self._lockstep
+        actions = _checked(actions, (self.num_envs, *(self.single_action_space.shape or ())))
+        reward, terminated, truncated, infos = lockstep.decide(actions)
+        features, ended = lockstep.features(), terminated | truncated
+        if ended.any():
+            final = np.full(self.num_envs, None, object)
+            for number in np.flatnonzero(ended).tolist():
+                final[number] = features[number]
+                lockstep.reset(number, self._randoms[number], {})
+            infos |= {"final_obs": final, "_final_obs": ended}
+            features = lockstep.features()
+        return features, reward, terminated, truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture (height, width, 3) uint8 of each world, with the render mode "rgb_array"."""
+        if self.render_mode is None:
+            return None
+        return tuple(world.render() for world in self._lockstep.worlds)
+
+
+class GymnasiumWorld(gymnasium.Env):
+    """One world as an environment; see `GymnasiumWorlds`. Nothing is reset but by `reset`."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        world: World,
+        task: WorldTask,
+        law: ControlLaw | None,
+        every: int,
+        render_mode: str | None = None,
+    ):
+        self._lockstep = _Lockstep([world], task, law, every)
+        self.observation_space = self._lockstep.observation_space
+        self.action_space = self._lockstep.action_space
+        self.render_mode = render_mode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """The first observation (features,) float32; `options` go to the world's reset."""
+        super().reset(seed=seed)
+        self._lockstep.reset(0, self.np_random, options or {})
+        return self._lockstep.features()[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One decision, (actions,) in [-1, 1]."""
+        action = _checked(action, self.action_space.shape or ())
+        reward, terminated, truncated, told = self._lockstep.decide(action[None])
+        info = {name: values.tolist()[0] for name, values in told.items()}
+        features = self._lockstep.features()[0]
+        return features, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> np.ndarray | None:
+        """A picture (height, width, 3) uint8, with the render mode "rgb_array"."""
+        return None if self.render_mode is None else self._lockstep.worlds[0].render()
+
+
+def _checked(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The action as it came: what is not finite is for the law, which fails closed."""
+    action = np.asarray(action, float)
+    if action.shape != shape:
+        raise PalpateError(f"the action has the shape {shape}, not {action.shape}")
+    return action

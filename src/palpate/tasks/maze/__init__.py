@@ -1,0 +1,1 @@
+"""What is wanted of a tip in a maze, and of a point between obstacles."""

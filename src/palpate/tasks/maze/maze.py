@@ -1,0 +1,68 @@
+"""To get a tip from a maze's entrance to its goal without ever pushing too hard."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from palpate.worlds.maze.maze import FORCE_LIMIT, TipObservation, TipTruth
+from palpate.worlds.maze.scene import REFERENCE_HEIGHT
+
+# Papers print what a reward is made of (progress to the goal, a penalty of force, one for leaving
+# by the entrance, a bonus at the goal), but no number of it: these are our own.
+HORIZON = 500  # decisions, as printed
+PROGRESS = 10.0  # per m of the way to the goal, around walls: the whole way is worth about 6
+DECISION_COST = 0.01  # so that standing still for the whole horizon costs about as much
+FORCE_COST = 0.02  # of the force limit, squared: pushing the obstacle may cost a fifth of a bonus
+GOAL_BONUS = 5.0
+ENTRANCE_COST = 2.0  # twice what standing still costs in the long run, so that none walks out
+
+# What brings features to about 1.
+WRENCH_SCALE = np.array([FORCE_LIMIT] * 3 + [FORCE_LIMIT * REFERENCE_HEIGHT] * 3)
+POSITION_SCALE = 0.3  # m, half the arena
+
+
+class MazeTask:
+    """A `palpate.worlds.gymnasium.WorldTask` for `palpate.worlds.maze.maze.BlindMaze`.
+
+    A policy sees the wrench (6) and the position (3), as they are measured, each divided by what
+    makes it about 1, and acts by [dx, dy, stiffness along, stiffness across]. More than
+    `force_limit` N of horizontal contact force is a violation and costs no reward: only the rest of
+    the episode. A method that wants it to cost more adds that itself.
+    """
+
+    features, actions, horizon = 9, 4, HORIZON
+
+    def __init__(self, force_limit: float = FORCE_LIMIT):
+        self.force_limit = force_limit
+
+    def observe(self, observation: TipObservation) -> Float[np.ndarray, "worlds 9"]:
+        return np.concatenate(
+            [observation.wrench / WRENCH_SCALE, observation.position / POSITION_SCALE], axis=1
+        )
+
+    def reward(self, before: TipTruth, after: TipTruth, action: np.ndarray) -> float:
+        """What the decision brought, by the way to the goal in the world's frame."""
+        layout = before.layout
+        way = layout.distance(np.stack([before.position, after.position]))
+        reward = PROGRESS * (way[0] - way[1]) - DECISION_COST
+        reward -= FORCE_COST * (after.peak_force / self.force_limit) ** 2
+        ended = self.end(after)
+        return float(
+            reward + GOAL_BONUS * (ended == "goal") - ENTRANCE_COST * (ended == "entrance")
+        )
+
+    def violates(self, truth: TipTruth) -> bool:
+        return truth.peak_force > self.force_limit
+
+    def force(self, truth: TipTruth) -> float:
+        return truth.peak_force
+
+    def end(self, truth: TipTruth) -> str:
+        x, y = float(truth.position[0]), float(truth.position[1])
+        goal = truth.layout.goal
+        if math.hypot(x - goal[0], y - goal[1]) < truth.layout.goal_radius:
+            return "goal"
+        return "entrance" if x < truth.layout.entrance else ""

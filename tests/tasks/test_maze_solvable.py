@@ -1,0 +1,60 @@
+"""Whether the maze asks for what it is meant to: one who sees everything, stiff and soft.
+
+The agent reads the truth: it follows the way to the goal softly, and pushes the block stiffly along
+the channel and softly across it, with 25.3 N at most.
+"""
+
+import numpy as np
+import pytest
+
+from palpate.families.contact.environments import blind_maze
+from palpate.worlds.maze.layout import TIP_RADIUS
+from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE
+
+AROUND = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+CIRCLE = 0.013 * np.stack([np.cos(AROUND), np.sin(AROUND)], -1)
+SOFT, SOFTEST, STIFFEST = -0.35, -1.0, 1.0
+
+
+def decision(truth):
+    place, layout = truth.position[:2], truth.layout
+    block, y = layout.obstacle.position
+    face = block + truth.obstacle - layout.obstacle.half_sizes[0]
+    abreast, stopped = abs(place[1] - y), truth.obstacle > layout.obstacle.travel - 2e-3
+    if abreast < 8e-3 and -0.085 < place[0] < face and not stopped:
+        if face - TIP_RADIUS - place[0] < 4e-3:
+            push = 25.3 / STIFFNESS_RANGE[1] / DISPLACEMENT_LIMIT
+            return np.array([push, 0, STIFFEST, SOFTEST], np.float32)
+        return np.array([0.35, 0, SOFT, SOFTEST], np.float32)
+    if abreast < 0.035 and 0.07 < place[0] < face:
+        way = np.array([-0.15, 1.0])  # past the block, where it has come to its end
+    else:
+        blocked = layout.clearance(place + CIRCLE) < 0.8 * TIP_RADIUS
+        way = CIRCLE[np.argmin(layout.distance(place + CIRCLE) + blocked)]
+    return np.array([*(0.9 * way / np.linalg.norm(way)), SOFT, SOFTEST], np.float32)
+
+
+def lived(layout, stiffness=None, most=250):
+    environment = blind_maze(layouts=(layout,), constant_stiffness=stiffness)
+    environment.reset(seed=1)
+    (world,) = environment._lockstep.worlds
+    for _ in range(most):
+        action = decision(world.truth())
+        if stiffness and action[2] == STIFFEST:
+            action[0] = 1.0  # as far as it may
+        *_, terminated, _, info = environment.step(action)
+        if terminated:
+            break
+    return info["end"], world.truth().obstacle
+
+
+@pytest.mark.parametrize("layout", ["home", "unseen-3"])
+def test_who_sees_everything_reaches_the_goal_without_a_violation(layout):
+    assert lived(layout)[0] == "goal"
+
+
+def test_one_stiffness_for_all_is_stuck_or_breaks_the_limit():
+    end, pushed = lived("home", 300.0, most=120)
+    assert end == ""
+    assert pushed < 1e-3
+    assert lived("home", 1000.0)[0] == "violation"

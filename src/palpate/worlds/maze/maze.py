@@ -200,32 +200,34 @@ class BlindMaze(World):
         if not self._ready:
             raise PalpateError("a maze world runs after reset(seed), not before")
         try:
-            x, y, z = map(float, action)
+            x, y, z = np.asarray(action, float).tolist()
+            size = math.sqrt(x * x + y * y + z * z)
         except (TypeError, ValueError) as error:
             raise PalpateError(
                 f"a maze world takes a force (x, y, z) in N, not {action}"
             ) from error
-        size = math.sqrt(x * x + y * y + z * z)
         self._fault = not size < math.inf
         if self._fault:
             x = y = z = 0.0
         elif size > DRIVE_LIMIT:
             x, y, z = (value * DRIVE_LIMIT / size for value in (x, y, z))
+        model, data, constraint = self._model, self._data, self._constraint
         position, velocity, applied = self._position, self._velocity, self._applied
-        applied[1], applied[2], applied[3] = x, y, z
-        peak, constraint = 0.0, self._constraint
+        applied[1:4] = x, y, z
+        peak = 0.0
         for _ in range(self._substeps):
-            offset, speed, acceleration = self._sway(self._data.time)
+            offset, speed, acceleration = self._sway(data.time)
             applied[0] = (BASE_MASS + TIP_MASS) * (
                 acceleration
-                + 2 * SERVO * (speed - velocity[0])
-                + SERVO * SERVO * (offset - position[0])
+                + 2 * SERVO * (speed - velocity.item(0))
+                + SERVO * SERVO * (offset - position.item(0))
             )
-            mujoco.mj_step(self._model, self._data)
-            peak = max(peak, constraint[1] ** 2 + constraint[2] ** 2)
+            mujoco.mj_step(model, data)
+            peak = max(peak, constraint.item(1) ** 2 + constraint.item(2) ** 2)
         self._peak = math.sqrt(peak)
         self._count += 1
-        if not velocity[1] ** 2 + velocity[2] ** 2 + velocity[4] ** 2 < FASTEST**2:
+        _, speed_x, speed_y, _, speed_block = velocity.tolist()
+        if not speed_x**2 + speed_y**2 + speed_block**2 < FASTEST**2:
             self._ready = False
             raise DivergedError(
                 f"the maze's simulation diverged at {self._data.time:.3f} s; gentler forces would "
@@ -234,19 +236,16 @@ class BlindMaze(World):
         return self._observe()
 
     def _observe(self) -> TipObservation:
-        force = -self._felt[:3]
-        wrench = np.empty(6)
-        wrench[:3] = force
-        wrench[3:] = 0.0
-        position = self._position[1:4].copy()
-        if force.any():
-            # From the point that all contacts together act at to the one that torques are about.
-            x, y, z = self._felt[6:9] - self._tip_place
+        wrench, position = np.zeros(6), self._position[1:4].copy()
+        if self._data.ncon:
+            # The sensor tells what the tip does, and the point that all contacts act at together.
+            fx, fy, fz, tx, ty, tz, *point = self._felt.tolist()
+            x, y, z = (a - b for a, b in zip(point, self._tip_place.tolist(), strict=True))
             z -= REFERENCE_HEIGHT
-            fx, fy, fz = force
-            wrench[3] = y * fz - z * fy - self._felt[3]
-            wrench[4] = z * fx - x * fz - self._felt[4]
-            wrench[5] = x * fy - y * fx - self._felt[5]
+            wrench[:] = (
+                -fx, -fy, -fz,
+                z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz,
+            )  # fmt: skip
         if self._noise_scale:
             noise = self._next_noise()
             wrench += noise[:6]
@@ -278,12 +277,13 @@ class BlindMaze(World):
     def truth(self) -> TipTruth:
         if not self._ready:
             raise PalpateError("a maze world has a truth after reset(seed), not before")
+        sway, _, _, _, obstacle = self._position.tolist()
         position, velocity = self._position[1:4].copy(), self._velocity[1:4].copy()
-        position[1] += self._position[0]
+        position[1] += sway
         velocity[1] += self._velocity[0]
         return TipTruth(
             self._count * self.control_period, position, velocity, self._constraint[1:4].copy(),
-            self._peak, float(self._position[0]), float(self._position[4]), self._fault,
+            self._peak, sway, obstacle, self._fault,
             self._layout, self._obstacle_friction, self._obstacle_mass, self._contact_friction,
         )  # fmt: skip
 

@@ -13,6 +13,7 @@ from palpate.worlds.maze.maze import (
     FORCE_LIMIT,
     FORCE_NOISE,
     OBSTACLE_FRICTION,
+    POSITION_CORRELATION,
     POSITION_NOISE,
     STIFFNESS_RANGE,
     SWAY,
@@ -136,6 +137,9 @@ def test_noise_is_an_ornstein_uhlenbeck_process():
     correlation = (force[lag:] * force[:-lag]).mean() / force.var()
     assert correlation == pytest.approx(math.exp(-1), abs=0.08)
     assert np.std(position) == pytest.approx(POSITION_NOISE, rel=0.3)
+    # It never jumps, not even where the next block of it is drawn: 6 standard deviations.
+    most = 6 * POSITION_NOISE * math.sqrt(2 * 1e-3 / POSITION_CORRELATION)
+    assert np.abs(np.diff(position, axis=0)).max() < most
     louder = BlindMaze(sway=0.0, noise=2.0)
     np.testing.assert_allclose(
         louder.reset(1, start=OPEN).wrench, 2 * world.reset(1, start=OPEN).wrench

@@ -64,7 +64,9 @@ STAGES = {
         *("worlds.rope.rope", "worlds.rope.mjcf", "worlds.rope.filmed"),
         "families.rope.counterpart",
         *("worlds.furniture.pieces", "worlds.furniture.furniture", "worlds.furniture.robot"),
-        "worlds.furniture.handling",
+        *("worlds.furniture.handling", "worlds.gymnasium", "families.contact.environments"),
+        *("worlds.maze.maze", "worlds.maze.layout", "worlds.maze.navigation"),
+        *("safety.impedance", "tasks.maze.maze", "tasks.maze.navigation"),
     ],
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),

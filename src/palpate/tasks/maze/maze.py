@@ -7,6 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from palpate.worlds.gymnasium import WorldTask
 from palpate.worlds.maze.maze import FORCE_LIMIT, TipObservation, TipTruth
 from palpate.worlds.maze.scene import REFERENCE_HEIGHT
 
@@ -24,8 +25,8 @@ WRENCH_SCALE = np.array([FORCE_LIMIT] * 3 + [FORCE_LIMIT * REFERENCE_HEIGHT] * 3
 POSITION_SCALE = 0.3  # m, half the arena
 
 
-class MazeTask:
-    """A `palpate.worlds.gymnasium.WorldTask` for `palpate.worlds.maze.maze.BlindMaze`.
+class MazeTask(WorldTask):
+    """The task of `palpate.worlds.maze.maze.BlindMaze`.
 
     A policy sees the wrench (6) and the position (3), as they are measured, each divided by what
     makes it about 1, and acts by [dx, dy, stiffness along, stiffness across]. More than

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from palpate.worlds.gymnasium import WorldTask
 from palpate.worlds.maze.navigation import PointObservation, PointTruth
 
 HORIZON = 100  # decisions
@@ -15,8 +16,8 @@ REWARD_SCALE = 50.0  # the printed reward is -distance: about 50 at the start
 FEATURE_SCALE = np.array([50.0, 10.0])
 
 
-class NavigationTask:
-    """A `palpate.worlds.gymnasium.WorldTask` for `palpate.worlds.maze.navigation.Navigation`.
+class NavigationTask(WorldTask):
+    """The task of `palpate.worlds.maze.navigation.Navigation`.
 
     The first navigation task of Thananjeyan et al. 2021 (Recovery RL, arXiv 2010.15920). A policy
     sees the position and decides on the motion of the next ten control periods. The reward is the

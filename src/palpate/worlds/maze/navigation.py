@@ -28,11 +28,15 @@ VIEW = (-60.0, 10.0, -12.0, 12.0)  # x and y that a picture shows
 
 
 class PointObservation(NamedTuple):
+    """What is seen: the state itself, as in the original."""
+
     time: float  # s since reset; a step of the original is one second
     position: np.ndarray  # (2,), exact
 
 
 class PointTruth(NamedTuple):
+    """The state, and whether it is forbidden."""
+
     time: float
     position: np.ndarray  # (2,)
     inside: bool  # an obstacle

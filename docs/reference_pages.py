@@ -81,7 +81,7 @@ STAGES = {
         *("deployment.deployment", "deployment.supervisor", "deployment.intake"),
         *("deployment.decision", "deployment.loop", "deployment.transport"),
         *("deployment.messages", "deployment.plausibility", "deployment.onnx_export"),
-        "deployment.contract",
+        *("deployment.contract", "deployment.onnx_actor"),
     ],
     "runs": [
         *("runs.run", "runs.result", "runs.progress", "runs.storage", "report.evidence"),

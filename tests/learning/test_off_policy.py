@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,8 +18,10 @@ from palpate.learning.off_policy import (
     OffPolicyTraining,
     Penalty,
     SoftActorCritic,
+    Transition,
     train_off_policy,
 )
+from palpate.learning.off_policy.buffer import ReplayBuffer
 from palpate.learning.off_policy.loop import Compiled
 from palpate.runs import Run
 from small_environments import Bandit, Priced, Regulator, side_by_side
@@ -111,6 +114,33 @@ def test_each_function_is_compiled_once(monkeypatch) -> None:
     )
     train_off_policy(side_by_side(Bandit, 4), SMALL, dataclasses.replace(SHORT, ratio=0.3), 0)
     assert made[0].act._cache_size() == made[0].learn._cache_size() == 1
+
+
+def numbered(first: int, count: int, every: int = 0) -> Transition:
+    """Transitions whose reward is their number; each of so many violates."""
+    number = jnp.arange(first, first + count, dtype=jnp.float32)
+    cost = (number % every == 0).astype(jnp.float32) if every else 0.0 * number
+    seen, done = number[:, None], number[:, None]
+    return Transition(seen, done, done, number, cost, seen, 0.0 * number)
+
+
+def test_buffer_forgets_the_oldest_but_what_is_kept_and_what_violated() -> None:
+    buffer = ReplayBuffer.create(1, 1, capacity=30, violating=4)
+    buffer = buffer.add(numbered(0, 10, every=5)).keep()
+    for first in range(10, 80, 7):
+        buffer = buffer.add(numbered(first, 7))
+    drawn = np.unique(buffer.sample(jax.random.key(0), 2000).reward)
+    np.testing.assert_array_equal(drawn, np.arange(60, 80))  # 20 places beside the kept ones
+    batch = buffer.sample_violating(jax.random.key(1), 1000, 0.25)
+    np.testing.assert_array_equal(np.unique(batch.reward[:250]), [0, 5])
+    assert (batch.cost[:250] == 1).all()
+    np.testing.assert_array_equal(np.unique(batch.reward[250:]), [*range(10), *range(60, 80)])
+    for first in (100, 110, 120, 130, 140):
+        buffer = buffer.add(numbered(first, 2, every=10))
+    batch = buffer.sample_violating(jax.random.key(2), 400, 0.5)
+    np.testing.assert_array_equal(np.unique(batch.reward[:200]), [110, 120, 130, 140])
+    none = ReplayBuffer.create(1, 1, 10).add(numbered(1, 3))
+    assert set(np.unique(none.sample_violating(jax.random.key(0), 50, 0.5).reward)) == {1, 2, 3}
 
 
 def test_environments_that_reset_a_step_later_are_refused() -> None:

@@ -29,7 +29,7 @@ def onnx_model(policy: CommandPolicy) -> Any:
     Raises `PalpateError` without the extra `deploy`.
     """
     onnx = extra_module("onnx", EXTRA)
-    graph = _Graph(onnx)
+    graph = Graph(onnx)
     centred = graph.add("Sub", "features", graph.constant(policy.mean))
     seen = graph.add("Div", centred, graph.constant(policy.scale))
     shape = list(policy.action_shape)
@@ -54,7 +54,7 @@ def onnx_model(policy: CommandPolicy) -> Any:
     return graph.model(inputs, {"command": shape, "carry_out": shape})
 
 
-def _moved(graph: "_Graph", channel: Channel, period: float, output: str, before: str) -> str:
+def _moved(graph: "Graph", channel: Channel, period: float, output: str, before: str) -> str:
     """The next command of one channel, from the network's output and the command before."""
     limit, one = graph.constant(channel.bound), graph.constant(1.0)
     length = graph.add("Sqrt", graph.add("Add", graph.square(output), one))
@@ -133,7 +133,7 @@ def _limits(policy: CommandPolicy) -> np.ndarray:
     return np.repeat(limits, [channel.count for channel in policy.actions])
 
 
-class _Graph:
+class Graph:
     """Nodes and constants in the order they were added, each result under a name of its own."""
 
     def __init__(self, onnx: Any):

@@ -22,7 +22,7 @@ SCENE = """<mujoco><option timestep="1e-4" gravity="0 0 0" cone="elliptic" impra
 def test_pressing_and_sliding_along_a_plate_on_a_spring_is_as_in_mujoco():
     """Set-point and stiffness change, and the plate is met at speed, rubbed along, and left."""
     tip = facing([math.pi], position=-0.04, mass=1.2, damping_ratio=0.7, stiffness=1500.0,
-                 damping=6.0, friction=0.35)  # fmt: skip
+                 damping=6.0, friction=0.35, arm_friction=0.0)  # fmt: skip
     time = tip.control_period * np.arange(400)
     way = np.stack([0.05 * np.sin(4.0 * time), 0.08 * np.sin(2.3 * time)], axis=1)
     stiffness = np.where(time[:, None] < 1.2, [400.0, 600.0], [800.0, 300.0])

@@ -95,7 +95,7 @@ def prediction_error(model: Model, aligned: Aligned) -> PredictionError:
     )
 
 
-def or_nan(count: np.ndarray) -> np.ndarray:
+def or_nan(count: np.ndarray | np.number) -> np.ndarray:
     """The count to divide by, NaN in place of zero."""
     return np.where(count > 0, count, np.nan)
 

@@ -29,9 +29,13 @@ class Surfaces(NamedTuple):
 
 
 class Impedance(NamedTuple):
-    """What pulls the tip: mass in kg, set-point in m, stiffness in N/m, damping in N s/m."""
+    """What pulls the tip: mass in kg, set-point in m, stiffness in N/m, damping in N s/m.
+
+    `friction` is the dry friction of the arm itself, N.
+    """
 
     mass: Float[Array, "*batch 1"]
+    friction: Float[Array, "*batch"]
     setpoint: Vector
     stiffness: Vector
     damping: Vector
@@ -73,6 +77,10 @@ def advance(
     force = jnp.maximum(spring - yielding * _along(normal, mean), 0.0)
     following = 2.0 * mean - velocity
 
+    speed = jnp.sqrt(jnp.sum(jnp.square(following), axis=-1) + 1e-18)
+    kept = slowed(speed, time * impedance.friction / mass[..., 0], slip) / speed
+    following = following * kept[..., None]
+
     total = jnp.sum(normal * force[..., None], axis=-2)
     most = time * friction * force / mass  # that friction takes from the velocity
     for wall in range(normal.shape[-2]):  # one after the other: in a corner each acts on the rest
@@ -86,8 +94,8 @@ def advance(
 
 
 def slowed(
-    sliding: Float[Array, "*batch"], most: Float[Array, "*batch"], slip: float
-) -> Float[Array, "*batch"]:
+    sliding: Float[Array, "*#batch"], most: Float[Array, "*#batch"], slip: float
+) -> Float[Array, "*_"]:
     """The velocity u that dry friction leaves: u + `most` u / (|u| + `slip`) = `sliding`."""
     speed = jnp.abs(sliding)
     rest = most + slip - speed

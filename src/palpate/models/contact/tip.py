@@ -19,7 +19,8 @@ Number = Float[Array, "*batch"]
 Walls = Float[Array, "*batch walls"]
 Point = Float[Array, "*batch 2"]
 
-SUBSTEP = 1e-3  # s, of the integration, at most
+SUBSTEP = 2.5e-3  # s, of the integration, at most
+UNROLLED = 4  # so many of them in a control period are written out
 SLIP = 1e-5  # m/s, the sliding velocity at which friction has half its size
 
 
@@ -43,7 +44,7 @@ class Tip(Model):
 
     The controller pulls the tip to a set-point x_d: m a = K (x_d - x) - D v + f, with the diagonal
     stiffness K that it commands and the damping D = 2 zeta sqrt(K m) by design (Albu-Schaeffer et
-    al., ICRA 2003, of one mass). An action is x_d and K for one control period.
+    al., ICRA 2003, of one mass), and the arm rubs. An action is x_d and K for one control period.
 
     Each wall is a plate on a spring: where the tip is pressed in by u, it pushes with
     f_n = max(0, k u + d u'), along its outward normal, and rubs with Coulomb's friction mu f_n
@@ -64,6 +65,9 @@ class Tip(Model):
     )
     damping_ratio: Number = parameter(
         "", prior=LogNormal(1.0, 0.3), spread=0.2, about="of the impedance, one is critical"
+    )
+    arm_friction: Number = parameter(
+        "N", prior=LogNormal(0.2, 1.0), spread=0.5, about="dry friction of the arm, at the tip"
     )
     position: Walls = parameter(
         "m", prior=Normal(None, 0.02), about="of each wall along its direction"
@@ -143,7 +147,7 @@ class Tip(Model):
             # A floor below any stiffness that matters: the slope of a root is infinite at zero.
             root = jnp.sqrt(jnp.maximum(stiffness, 1e-6) * mass)
             damping = 2.0 * self.damping_ratio[..., None] * root
-            impedance = Impedance(mass, action[..., :2], stiffness, damping)
+            impedance = Impedance(mass, self.arm_friction, action[..., :2], stiffness, damping)
 
             def advanced(carry: tuple[Array, Array, Array], _: None):
                 position, velocity, force = advance(
@@ -152,7 +156,9 @@ class Tip(Model):
                 return (position, velocity, carry[2] + force), None
 
             start = state.position, state.velocity, jnp.zeros_like(state.force)
-            (position, velocity, total), _ = jax.lax.scan(advanced, start, length=count)
+            (position, velocity, total), _ = jax.lax.scan(
+                advanced, start, length=count, unroll=count <= UNROLLED
+            )
             return TipState(position, velocity, total / count)
 
         return step
@@ -191,7 +197,7 @@ def facing(directions: Sequence[float], **values: Any) -> Tip:
         fields[name] = np.broadcast_to(fields[name], count)
     for name in ("force_bias", "centre"):
         fields[name] = np.broadcast_to(fields[name], 2)
-    return Tip(direction=np.asarray(directions, float), **fields)
+    return Tip(direction=as_floating(np.asarray(directions, float)), **fields)
 
 
 def _unit(angle: Array) -> Array:

@@ -1,0 +1,1 @@
+"""A tip and plates on springs, in MuJoCo."""

@@ -27,15 +27,15 @@ class RecordContact(Record):
     are drawn by the seed. The file holds the position and the force as sensors show them, and the
     set-point and stiffness that were commanded.
 
-    1. Eight trials of 2.5 s:                   palpate record contact --out R.npz
+    1. Sixteen trials of 1.25 s:                palpate record contact --out R.npz
     2. Other plates:                            palpate record contact --seed 3 --out R3.npz
     """
 
     family: ClassVar[str] = "contact"
 
-    trials: int = 8
+    trials: int = 16
     """Uninterrupted motions, each from rest before the plates."""
-    duration: float = 2.5
+    duration: float = 1.25
     """Seconds of each."""
 
     def record(self) -> Recording:
@@ -65,6 +65,7 @@ class IdentifyContact(Identify):
 
     family: ClassVar[str] = "contact"
     observation: ClassVar[str] = "position"
+    piece: ClassVar[float] = 1.25  # s
 
     walls: Annotated[
         tuple[float, ...],

@@ -100,16 +100,24 @@ def or_nan(count: np.ndarray | np.number) -> np.ndarray:
     return np.where(count > 0, count, np.nan)
 
 
-def observation_scale(aligned: Aligned, model: Model) -> float:
+def observation_scale(aligned: Aligned, model: Model) -> Float[np.ndarray, "#last"]:
     """Typical size of what is to be explained: how far observations move from their start.
 
-    Root mean square over trials, frames and coordinates of the change since the first frame.
+    Root mean square over trials, frames and coordinates of the change since the first frame; of
+    lengths and angles together, and of each other unit by itself, for each entry of the last
+    observation axis.
+
+    Raises `PalpateError` when nothing of some unit moves.
     """
     first = np.broadcast_to(aligned.observation[:, :1], aligned.observation.shape)
-    scale = float(np.sqrt(np.nanmean(np.square(difference(model, aligned.observation, first)))))
-    if not np.isfinite(scale) or scale <= 0:
+    off = difference(model, aligned.observation, first)
+    units = ["m" if unit in ("m", "rad") else unit for unit in model.observation_units]
+    kinds = np.unique(units, return_inverse=True)[1]
+    own = [np.nanmean(np.square(off[..., kinds == kind])) for kind in range(kinds.max() + 1)]
+    scale = np.sqrt(own)
+    if not np.all(np.isfinite(scale) & (scale > 0)):
         raise PalpateError(
             "nothing moves in the recording: every observation equals the first of its trial, "
             "and there is nothing to identify from"
         )
-    return scale
+    return scale[kinds] if len(scale) > 1 else scale

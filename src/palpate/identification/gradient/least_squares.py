@@ -47,7 +47,7 @@ class Objective(eqx.Module):
     """
 
     coordinates: FreeParameters
-    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    scale: Float[Array, "#last"] = eqx.field(converter=jnp.asarray)
     knee: float | None = eqx.field(static=True, default=None)
     prior_weight: float = eqx.field(static=True, default=0.0)
 

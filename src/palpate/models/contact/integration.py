@@ -72,25 +72,37 @@ def advance(
     held = 2.0 * mass / time
     diagonal = held + impedance.damping + 0.5 * time * impedance.stiffness
     pull = impedance.stiffness * (impedance.setpoint - position)
+    inverse = _inverse(diagonal, normal, yielding)
     right = held * velocity + pull + jnp.sum(normal * spring[..., None], axis=-2)
-    mean = _solved(diagonal, normal, yielding, right)
+    mean = _product(inverse, right)
     force = jnp.maximum(spring - yielding * _along(normal, mean), 0.0)
-    following = 2.0 * mean - velocity
-
-    speed = jnp.sqrt(jnp.sum(jnp.square(following), axis=-1) + 1e-18)
-    kept = slowed(speed, time * impedance.friction / mass[..., 0], slip) / speed
-    following = following * kept[..., None]
-
     total = jnp.sum(normal * force[..., None], axis=-2)
-    most = time * friction * force / mass  # that friction takes from the velocity
-    for wall in range(normal.shape[-2]):  # one after the other: in a corner each acts on the rest
-        tangent = _turned(normal[..., wall, :])
-        sliding = jnp.sum(tangent * following, axis=-1)
-        after_it = slowed(sliding, most[..., wall], slip)
-        change = -most[..., wall] * after_it / (jnp.abs(after_it) + slip)
-        following = following + tangent * change[..., None]
-        total = total + tangent * (change[..., None] * mass / time)
-    return position + 0.5 * time * (velocity + following), following, total
+
+    # Friction as a further force, of the size that the velocity at the end asks for: of the arm,
+    # then of one wall after the other, as in a corner each acts on the rest.
+    sliding = 2.0 * mean - velocity
+    speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=-1) + 1e-18)
+    mean, _ = _rubbed(mean, velocity, sliding / speed[..., None], impedance.friction, inverse, slip)
+    for wall in range(normal.shape[-2]):
+        tangent = jnp.broadcast_to(_turned(normal[..., wall, :]), mean.shape)
+        most = (friction * force)[..., wall]
+        mean, rubbing = _rubbed(mean, velocity, tangent, most, inverse, slip)
+        total = total - tangent * rubbing[..., None]
+    return position + time * mean, 2.0 * mean - velocity, total
+
+
+def _rubbed(
+    mean: Array, velocity: Array, along: Array, most: Array, inverse: tuple[Array, ...], slip: float
+) -> tuple[Array, Array]:
+    """The mean velocity with dry friction of at most `most` N `along` a direction, and its force.
+
+    `inverse` is by how much a force changes the mean velocity; that at the end twice as much.
+    """
+    answer = _product(inverse, along)
+    sliding = jnp.sum(along * (2.0 * mean - velocity), axis=-1)
+    rest = slowed(sliding, 2.0 * jnp.sum(along * answer, axis=-1) * most, slip)
+    force = most * rest / (jnp.abs(rest) + slip)
+    return mean - answer * force[..., None], force
 
 
 def slowed(
@@ -117,13 +129,18 @@ def _turned(normal: Array) -> Array:
     return jnp.stack([-normal[..., 1], normal[..., 0]], axis=-1)
 
 
-def _solved(diagonal: Array, normal: Array, weight: Array, right: Array) -> Array:
-    """Solve (diag + sum over walls of weight n n') w = right, two unknowns, by Cramer's rule."""
+def _inverse(diagonal: Array, normal: Array, weight: Array) -> tuple[Array, ...]:
+    """The inverse of diag + sum over walls of weight n n': its xx, xy and yy."""
     x, y = normal[..., 0], normal[..., 1]
     a = diagonal[..., 0] + jnp.sum(weight * x * x, axis=-1)
     b = jnp.sum(weight * x * y, axis=-1)
     d = diagonal[..., 1] + jnp.sum(weight * y * y, axis=-1)
     determinant = a * d - b * b
-    first = (d * right[..., 0] - b * right[..., 1]) / determinant
-    second = (a * right[..., 1] - b * right[..., 0]) / determinant
-    return jnp.stack([first, second], axis=-1)
+    return d / determinant, -b / determinant, a / determinant
+
+
+def _product(matrix: tuple[Array, ...], vector: Array) -> Array:
+    """A symmetric matrix (xx, xy, yy) times a vector."""
+    xx, xy, yy = matrix
+    x, y = vector[..., 0], vector[..., 1]
+    return jnp.stack([xx * x + xy * y, xy * x + yy * y], axis=-1)

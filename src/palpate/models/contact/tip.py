@@ -29,10 +29,7 @@ def _data() -> Any:
 
 
 class TipState(NamedTuple):
-    """Position in m, velocity in m/s, and the mean force of the walls on the tip, N, each (2,).
-
-    The force is that of the control period which has just ended.
-    """
+    """Position in m, velocity in m/s, and the force on the tip as sensed, N, each (2,)."""
 
     position: Point
     velocity: Point
@@ -53,8 +50,8 @@ class Tip(Model):
     How many walls there are, and the nominal `direction` (rad) of each outward normal, is data; a
     wall may be tilted about it. `position` is where the wall is along that direction, from the
     frame's origin, measured abreast of the point `centre`: so that a tilt does not move what is
-    near it. What is observed is the tip's position and the force on it as a sensor shows it, with
-    the sensor's bias. Batch axes lead everywhere.
+    near it. What is observed is the tip's position and the force on it as a sensor shows it: late,
+    by a low-pass of first order, and with a bias. Batch axes lead everywhere.
 
     Raises `PalpateError` for no wall, and where direction and parameters are of different numbers
     of walls.
@@ -82,6 +79,9 @@ class Tip(Model):
     )
     force_bias: Point = parameter(
         "N", prior=Normal(0.0, 0.5), about="what the sensor shows without contact"
+    )
+    sensor_lag: Number = parameter(
+        "s", prior=LogNormal(2e-3, 0.7), about="time constant of the force sensor's low-pass"
     )
     direction: Walls = _data()
     centre: Point = _data()
@@ -141,6 +141,7 @@ class Tip(Model):
         surfaces, mass = self.surfaces, self.mass[..., None]
         count = max(1, math.ceil(self.control_period / SUBSTEP - 1e-9))
         time = self.control_period / count
+        late = jnp.exp(-time / self.sensor_lag)[..., None]
 
         def step(state: TipState, action: Array) -> TipState:
             stiffness = action[..., 2:]
@@ -149,17 +150,15 @@ class Tip(Model):
             damping = 2.0 * self.damping_ratio[..., None] * root
             impedance = Impedance(mass, self.arm_friction, action[..., :2], stiffness, damping)
 
-            def advanced(carry: tuple[Array, Array, Array], _: None):
+            def advanced(state: TipState, _: None) -> tuple[TipState, None]:
                 position, velocity, force = advance(
-                    surfaces, impedance, *carry[:2], time, self.slip
+                    surfaces, impedance, state.position, state.velocity, time, self.slip
                 )
-                return (position, velocity, carry[2] + force), None
+                sensed = force + late * (state.force - force)
+                return TipState(position, velocity, sensed), None
 
-            start = state.position, state.velocity, jnp.zeros_like(state.force)
-            (position, velocity, total), _ = jax.lax.scan(
-                advanced, start, length=count, unroll=count <= UNROLLED
-            )
-            return TipState(position, velocity, total / count)
+            unroll = count <= UNROLLED
+            return jax.lax.scan(advanced, state, length=count, unroll=unroll)[0]
 
         return step
 

@@ -1,9 +1,8 @@
 """Two plates on springs and a tip under impedance control, in MuJoCo.
 
 What is not told: where the plates are, how they are turned, their springs, and how they rub. What
-a model of springs does not have: the plates' own mass, dry friction in the arm, a controller that
-knows the state a millisecond late, and a force sensor with a low-pass, noise and a bias that
-drifts.
+a model of springs does not have: the plates' own mass, an arm that creeps before it slides, a
+controller that holds its force for a millisecond, and a bias of the force sensor that drifts.
 """
 
 import dataclasses
@@ -24,12 +23,12 @@ NOMINAL = math.pi, -math.pi / 2  # rad, where the plates face: one behind larger
 DISTANCE, SPREAD = 0.06, 0.01  # m from the start to where a plate meets the tip, and more or less
 TURNED = 0.05  # rad, at most
 STIFFNESS, FRICTION = (400.0, 4000.0), (0.15, 0.7)  # N/m; log-uniform both
-MASS, DAMPING = (0.03, 0.15), (2.0, 15.0)  # kg and N s/m, of a plate
+MASS, DAMPING = (0.01, 0.03), (2.0, 15.0)  # kg and N s/m, of a plate
 TIP_MASS, DAMPING_RATIO = (0.7, 1.6), (0.7, 1.0)
-ARM_FRICTION, STICKS = 0.3, 5e-3  # N, dry, and the velocity (m/s) from which it is about all there
+ARM_FRICTION, STICKS = 0.3, 1e-3  # N, dry, and the velocity (m/s) from which it is about all there
 LOW_PASS = 3e-3  # s
 FORCE_NOISE, POSITION_NOISE = 0.15, 1e-4  # N and m, standard deviations
-BIAS, DRIFT = 0.3, 0.03  # N, and N after one second of a random walk
+BIAS, DRIFT = 0.3, 0.01  # N, and N after one second of a random walk
 FASTEST = 20.0  # m/s, of a tip that is lost
 
 
@@ -75,7 +74,7 @@ class PlatesWorld(World):
 
     An action (4,) is the set-point (x and y, m) and the stiffness along x and y (N/m), each held
     for one control period. The tip starts at the origin, at rest; the plates are drawn by the seed
-    and stay the same in all of its episodes. The sensor drifts on from episode to episode.
+    and stay the same in all of its episodes. Before each the force sensor is tared, badly.
     """
 
     def __init__(self) -> None:
@@ -91,16 +90,16 @@ class PlatesWorld(World):
 
     def reset(self, seed: int, *, episode: int = 0) -> PlatesObservation:
         """Start an episode with the plates of `seed`; `episode` draws the noise."""
-        if seed != self._seed or episode == 0:
-            self._seed, self._plates = seed, drawn(np.random.default_rng([seed, 0]))
+        if seed != self._seed:
+            self._seed, self._plates = seed, plates_of(seed)
             self._model = mujoco.MjModel.from_xml_string(scene(self._plates))
-            self._drifted = self._plates.bias.copy()
             self._camera = None
         assert self._model is not None
+        assert self._plates is not None
+        self._drifted = self._plates.bias.copy()
         self._random = np.random.default_rng([seed, 1, episode])
         self._data = mujoco.MjData(self._model)
         self._sensed = np.zeros(2)
-        self._known = np.zeros(2), np.zeros(2)  # what the controller has of position and velocity
         self._count = 0
         return self._observed()
 
@@ -113,10 +112,8 @@ class PlatesWorld(World):
                 f"(N/m, not negative), got {action}"
             )
         setpoint, stiffness = action[:2], action[2:]
-        position, velocity = self._known
         damping = 2.0 * plates.damping_ratio * np.sqrt(stiffness * plates.tip_mass)
-        pull = stiffness * (setpoint - position) - damping * velocity
-        self._known = data.qpos[:2].copy(), data.qvel[:2].copy()
+        pull = stiffness * (setpoint - data.qpos[:2]) - damping * data.qvel[:2]
         for _ in range(STEPS):
             speed = np.linalg.norm(data.qvel[:2])
             dry = ARM_FRICTION * math.tanh(speed / STICKS) / max(speed, 1e-9)
@@ -159,8 +156,9 @@ class PlatesWorld(World):
         return self._model, self._data, self._plates
 
 
-def drawn(random: np.random.Generator) -> Plates:
-    """Plates and a tip, drawn at random."""
+def plates_of(seed: int) -> Plates:
+    """The plates and the tip of a world of this seed."""
+    random = np.random.default_rng([seed, 0])
 
     def between(bounds: tuple[float, float], size: int | None = 2) -> Any:
         low, high = np.log(bounds)

@@ -31,7 +31,8 @@ def touches(seed: int, duration: float) -> Float[np.ndarray, "periods 4"]:
     random = np.random.default_rng([seed, 2])
     steps = round(duration / CONTROL_PERIOD)
     outward = np.array([[math.cos(angle), math.sin(angle)] for angle in NOMINAL])
-    stiffness = np.exp(random.uniform(*np.log(STIFF).tolist(), 2))
+    low, high = np.log(STIFF)
+    stiffness = np.exp(random.uniform(low, high, 2))
     here, way = np.zeros(2), []
     while sum(map(len, way)) < steps:
         touched = random.permutation(2)[: random.choice([1, 2], p=[0.75, 0.25])]

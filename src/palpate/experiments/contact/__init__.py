@@ -1,0 +1,1 @@
+"""Reproductions of contact: mazes, and walls that are touched."""

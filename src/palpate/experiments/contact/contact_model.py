@@ -1,0 +1,216 @@
+"""`palpate reproduce contact-model`: plates on springs, found by touching them for 20 seconds.
+
+Ten pairs of plates that MuJoCo hides, each touched in sixteen trials by a robot that its log says
+everything of (`palpate record contact`), and identified from that file by `palpate identify
+contact`, once as a fit and once as draws. Four of the trials are not fitted. Beside the methods
+stand what is known without touching, the priors' medians; and what a textbook does: a straight line
+through force over position while in contact, and the ratio of tangential to normal force while
+sliding, in the directions that the plates were meant to face.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from palpate.commands import identify, record
+from palpate.commands.identify.data import read
+from palpate.experiments.experiment import Experiment
+from palpate.families.contact.touch_options import IdentifyContact, RecordContact
+from palpate.families.options import Method
+from palpate.models.contact import facing
+from palpate.recordings import Recording
+from palpate.recordings.files import read_recording
+from palpate.runs import Figure, Result
+from palpate.runs.result import read_result
+from palpate.runs.run import RESULT
+from palpate.worlds.contact.plates import NOMINAL, Plates, plates_of
+
+NAME = "contact-model"
+FIRST = 300_000  # seed of the first pair of plates
+SETS, QUICK = 10, 1
+METHODS: dict[str, Method] = {"gradient": "levenberg-marquardt", "posterior": "local-global"}
+MINUTES = {"gradient": 1, "posterior": 4}  # of a set
+NEAR, WRONG, COVERED, COVERED_OVER = 1.0, 0.10, 0.80, 0.98  # the bars; mm and shares
+FOUND = ("position", "stiffness", "friction")
+TOUCHED, SLIDING = 1.5, 0.02  # N and m/s, from which on a textbook counts a frame
+PRIOR = facing(NOMINAL)  # its values are the priors' medians
+
+Walls = dict[str, Float[np.ndarray, "walls"]]  # by what is found; SI units
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What is said of one pair of plates: errors, and which 90 % intervals hold, by what is found.
+
+    Positions are off by mm, the others by shares.
+    """
+
+    error: Walls
+    held: dict[str, Float[np.ndarray, "walls"]]
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Touch and identify plates below `out`; `quick` is one pair.
+
+    Raises `PalpateError` when `out` holds other runs.
+    """
+    experiment, count = Experiment(NAME, out, quick, seed), QUICK if quick else SETS
+    experiment.announce({of: minutes * count for of, minutes in MINUTES.items()})
+    first = experiment.uses(FIRST, count)
+    found: dict[str, list[Outcome]] = {name: [] for name in METHODS}
+    rivals: dict[str, list[Outcome]] = {"prior": [], "straight line": []}
+    for plates in range(first, first + count):
+        file = out / f"plates-{plates}" / "R.npz"
+        record.run(RecordContact(seed=plates, out=file))
+        recording, hidden = read_recording(file), plates_of(plates)
+        for name, method in METHODS.items():
+            asked = IdentifyContact(
+                recordings=(file,), method=method, seed=plates, out=file.parent / name
+            )
+            result = read_result(identify.run(asked) / RESULT)
+            experiment.seconds += seconds_of(result)
+            found[name].append(judged(result, hidden, centre_of(asked)))
+        guesses = prior_of(recording), straight_line(recording)
+        for outcomes, guess in zip(rivals.values(), guesses, strict=True):
+            outcomes.append(Outcome(errors(guess, truth_of(hidden, np.zeros(2))), {}))
+    settings = {
+        "methods": METHODS,
+        "missed": {
+            name: [
+                [of for of, held in one.held.items() for hit in held if not hit]
+                for one in outcomes
+            ]
+            for name, outcomes in found.items()
+        },
+    }  # fmt: skip
+    split = "each pair of plates is drawn anew; of its sixteen trials four are not fitted"
+    return experiment.result(figures(found, rivals), settings, split)
+
+
+def truth_of(plates: Plates, centre: Float[np.ndarray, "2"]) -> Walls:
+    """What is to be found: positions along the nominal directions, abreast of `centre`."""
+    nominal, normal = unit(np.array(NOMINAL)), unit(plates.angle)
+    across = np.stack([-nominal[:, 1], nominal[:, 0]], axis=1)
+    abreast = across @ centre
+    position = plates.offset - np.sum(normal * across, axis=1) * abreast
+    position /= np.sum(normal * nominal, axis=1)
+    return {"position": position, "stiffness": plates.stiffness, "friction": plates.friction}
+
+
+def centre_of(options: IdentifyContact) -> Float[np.ndarray, "2"]:
+    """The point that a model of these options measures positions abreast of."""
+    data = read(options)
+    model: Any = options.reference(data.shown, data.fitted_aligned)
+    return np.asarray(model.centre)
+
+
+def judged(result: Result, hidden: Plates, centre: Float[np.ndarray, "2"]) -> Outcome:
+    """What `palpate identify contact` wrote, against what is hidden."""
+    rows = {row["name"]: row for row in result.parameters}
+    truth = truth_of(hidden, centre)
+    value, lower, upper = (
+        {of: np.asarray(values_of(rows, of, key)) for of in FOUND}
+        for key in ("value", "lower", "upper")
+    )
+    held = {of: (lower[of] <= true) & (true <= upper[of]) for of, true in truth.items()}
+    return Outcome(errors(value, truth), held)
+
+
+def values_of(rows: dict[str, dict[str, Any]], name: str, key: str) -> list[float]:
+    """Of each wall: draws have a row for each element, a fit one for all."""
+    if name in rows:
+        return np.ravel(rows[name][key]).tolist()
+    return [rows[f"{name}[{wall}]"][key] for wall in range(len(NOMINAL))]
+
+
+def errors(value: Walls, truth: Walls) -> Walls:
+    """Positions in mm, the others as shares, all positive."""
+    off = {of: np.abs(value[of] / true - 1.0) for of, true in truth.items()}
+    return off | {"position": 1e3 * np.abs(value["position"] - truth["position"])}
+
+
+def prior_of(recording: Recording) -> Walls:
+    """What is believed before: walls as far away as the tip ever was, and priors' medians."""
+    position = np.concatenate([trial["position"].values for trial in recording.trials])
+    farthest = (position @ unit(np.array(NOMINAL)).T).min(axis=0)
+    guess = {of: np.asarray(getattr(PRIOR, of)) for of in FOUND}
+    return guess | {"position": farthest}
+
+
+def straight_line(recording: Recording) -> Walls:
+    """Least squares of normal force over position in contact, and the median ratio of forces."""
+    position, force, velocity = (
+        np.concatenate(parts)
+        for parts in zip(*(_states(trial) for trial in recording.trials), strict=True)
+    )
+    found: dict[str, list[float]] = {of: [] for of in FOUND}
+    for angle in NOMINAL:
+        normal = unit(np.array(angle))
+        across = np.array([-normal[1], normal[0]])
+        pressed, rubbed = force @ normal, force @ across
+        touching = pressed > TOUCHED
+        slope, height = np.polyfit(position[touching] @ normal, pressed[touching], 1)
+        sliding = touching & (np.abs(velocity @ across) > SLIDING)
+        ratio = -rubbed[sliding] * np.sign(velocity[sliding] @ across) / pressed[sliding]
+        for of, number in zip(FOUND, (-height / slope, -slope, np.median(ratio)), strict=True):
+            found[of].append(float(number))
+    return {of: np.array(numbers) for of, numbers in found.items()}
+
+
+def _states(trial: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, force without its mean of the first tenth of a second, and velocity."""
+    position, force = trial["position"].values, trial["force"].values
+    steady = force - force[:20].mean(axis=0)
+    smooth = np.stack([np.convolve(axis, np.ones(5) / 5.0, "same") for axis in position.T], axis=1)
+    return position, steady, np.gradient(smooth, trial["position"].nominal_period, axis=0)
+
+
+def unit(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 2"]:
+    """Directions of these angles."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def seconds_of(result: Result) -> float:
+    """How long an identification took."""
+    return sum(float(f.value or 0.0) for f in result.figures if f.name == "wall_time_s")
+
+
+def figures(found: dict[str, list[Outcome]], rivals: dict[str, list[Outcome]]) -> list[Figure]:
+    """Medians over all walls, and how many intervals hold; each rival's own figures after them."""
+
+    def median(outcomes: list[Outcome], of: str) -> float:
+        return float(np.median([one.error[of] for one in outcomes]))
+
+    def beside(of: str) -> str:
+        return ", ".join(f"{name} {median(those, of):.2g}" for name, those in rivals.items())
+
+    listed = []
+    for name, outcomes in found.items():
+        share = float(np.mean([list(one.held.values()) for one in outcomes]))
+        listed += [
+            Figure(f"{name}.position_mm", median(outcomes, "position"), "mm", NEAR,
+                   rival=beside("position")),
+            Figure(f"{name}.stiffness_error", median(outcomes, "stiffness"), "", WRONG,
+                   rival=beside("stiffness")),
+            Figure(f"{name}.friction_error", median(outcomes, "friction"), "", WRONG,
+                   rival=beside("friction")),
+            Figure(f"{name}.coverage_90", share, "", COVERED, better="higher"),
+            Figure(f"{name}.coverage_90_over", share, "", COVERED_OVER),
+        ]  # fmt: skip
+        for of in FOUND:
+            hit = float(np.mean([one.held[of] for one in outcomes]))
+            worst = float(np.max([one.error[of] for one in outcomes]))
+            unit_of = "mm" if of == "position" else ""
+            listed += [
+                Figure(f"detail.{name}.{of}.worst", worst, unit_of),
+                Figure(f"detail.{name}.{of}.coverage_90", hit, "", better="higher"),
+            ]
+    for name, outcomes in rivals.items():
+        for of in FOUND:
+            unit_of = "mm" if of == "position" else ""
+            figure = f"rival.{name.replace(' ', '_')}.{of}"
+            listed.append(Figure(figure, median(outcomes, of), unit_of))
+    return listed

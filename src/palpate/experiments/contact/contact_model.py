@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from palpate.commands import identify, record
 from palpate.commands.identify.data import read
@@ -36,6 +36,7 @@ MINUTES = {"gradient": 1, "posterior": 4}  # of a set
 NEAR, WRONG, COVERED, COVERED_OVER = 1.0, 0.10, 0.80, 0.98  # the bars; mm and shares
 FOUND = ("position", "stiffness", "friction")
 TOUCHED, SLIDING = 1.5, 0.02  # N and m/s, from which on a textbook counts a frame
+STEEP = 0.8  # tangential over normal force, from which on it is another plate that rubs
 PRIOR = facing(NOMINAL)  # its values are the priors' medians
 
 Walls = dict[str, Float[np.ndarray, "walls"]]  # by what is found; SI units
@@ -49,7 +50,7 @@ class Outcome:
     """
 
     error: Walls
-    held: dict[str, Float[np.ndarray, "walls"]]
+    held: dict[str, Bool[np.ndarray, "walls"]]
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
@@ -151,7 +152,7 @@ def straight_line(recording: Recording) -> Walls:
         normal = unit(np.array(angle))
         across = np.array([-normal[1], normal[0]])
         pressed, rubbed = force @ normal, force @ across
-        touching = pressed > TOUCHED
+        touching = (pressed > TOUCHED) & (np.abs(rubbed) < STEEP * pressed)
         slope, height = np.polyfit(position[touching] @ normal, pressed[touching], 1)
         sliding = touching & (np.abs(velocity @ across) > SLIDING)
         ratio = -rubbed[sliding] * np.sign(velocity[sliding] @ across) / pressed[sliding]

@@ -12,4 +12,7 @@ FAMILY = Family(
         "record": {"contact": f"{_TOUCH}:RecordContact"},
         "identify": {"contact": f"{_TOUCH}:IdentifyContact"},
     },
+    experiments={
+        "contact-model": "palpate.experiments.contact.contact_model:reproduce",
+    },
 )

@@ -1,0 +1,67 @@
+"""What `reproduce contact-model` counts; the command is stood in for."""
+
+import numpy as np
+import pytest
+
+from palpate.experiments.contact import contact_model
+from palpate.runs import Figure, Result
+from palpate.runs.storage import write_json
+from palpate.worlds.contact.plates import PlatesWorld, plates_of
+from palpate.worlds.contact.touching import record_touches
+
+SEED = 7  # of no plates that are reproduced
+
+
+def test_a_straight_line_finds_plates_to_a_rough_size():
+    """The rival is no straw man: without noise it is near, and it is no better than that."""
+    recording = record_touches(PlatesWorld(), SEED, 8, 1.25)
+    truth = contact_model.truth_of(plates_of(SEED), np.zeros(2))
+    off = contact_model.errors(contact_model.straight_line(recording), truth)
+    assert np.all(off["position"] < 5.0)
+    assert np.all(off["stiffness"] < 0.6)
+    assert np.all(off["friction"] < 0.6)
+
+
+def test_positions_are_those_of_the_turned_plate_abreast_of_a_point():
+    plates = plates_of(SEED)
+    here, there = (contact_model.truth_of(plates, np.full(2, at))["position"] for at in (0.0, 0.1))
+    tilt = plates.angle - np.array(contact_model.NOMINAL)
+    # Walls that face against x and y: their lefts are against y and along x.
+    np.testing.assert_allclose(there - here, np.array([1.0, -1.0]) * 0.1 * np.tan(tilt), atol=1e-12)
+
+
+def test_figures_are_medians_and_the_share_of_intervals_that_hold(tmp_path, monkeypatch):
+    """The stand-in is 5 % off, and the draws miss the friction of both plates."""
+
+    def run(options):
+        drawn = options.method == contact_model.METHODS["posterior"]
+        truth = contact_model.truth_of(plates_of(options.seed), np.zeros(2))
+        rows = []
+        for name, true in truth.items():
+            value = true + 5e-4 if name == "position" else 1.05 * true
+            low, high = value - 0.1 * np.abs(true), value + 0.1 * np.abs(true)
+            high = 0.99 * true if drawn and name == "friction" else high
+            if drawn:
+                rows += [{"name": f"{name}[{i}]", "value": value[i], "lower": low[i],
+                          "upper": high[i]} for i in range(2)]  # fmt: skip
+            else:
+                rows.append({"name": name, "value": value, "lower": low, "upper": high})
+        result = Result("x", [Figure("wall_time_s", 3.0, "s")], {}, [0], None, 3.0, parameters=rows)
+        write_json(options.out / "result.json", result.to_dict())
+        return options.out
+
+    monkeypatch.setattr(contact_model.identify, "run", run)
+    monkeypatch.setattr(contact_model, "centre_of", lambda options: np.zeros(2))
+    result = contact_model.reproduce(tmp_path, quick=True, seed=3)
+    figures = {figure.name: figure for figure in result.figures}
+    for name in contact_model.METHODS:
+        assert figures[f"{name}.position_mm"].value == pytest.approx(0.5)
+        assert figures[f"{name}.stiffness_error"].value == pytest.approx(0.05)
+        assert figures[f"{name}.friction_error"].met
+    assert figures["gradient.coverage_90"].value == 1.0
+    assert not figures["gradient.coverage_90_over"].met
+    assert figures["posterior.coverage_90"].value == pytest.approx(2 / 3)
+    assert "straight line" in (figures["gradient.friction_error"].rival or "")
+    assert result.seeds == [3, 300_003]
+    assert result.settings["missed"]["posterior"] == [["friction", "friction"]]
+    assert result.wall_time_s == pytest.approx(6.0)

@@ -5,6 +5,7 @@ of a round are those of the agent before the updates of the round before it: so 
 the device while the environments step on the host.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -111,7 +112,7 @@ def train_off_policy(
             "pretraining needs transitions that were collected before and an agent that learns from"
             f" them: got {'none' if offline is None else type(agent).__name__}"
         )
-    compiled = Compiled(agent, settings)
+    compiled = compiled_for(agent, settings)
     key = jax.random.key(seed)
     start = TrainingState(
         compiled.init(jax.random.fold_in(key, 0), *sizes),
@@ -232,6 +233,12 @@ class Compiled:
         size, share = self._settings.batch, self._settings.violating_share
         risk = buffer.sample_violating(keys[1], size, share)
         return update(state, Batch(buffer.sample(keys[0], size), risk, episode_cost), keys[2])
+
+
+@functools.lru_cache(maxsize=8)
+def compiled_for(agent: Agent, settings: OffPolicyTraining) -> Compiled:
+    """The same for the same agent and settings: another seed need not be compiled anew."""
+    return Compiled(agent, settings)
 
 
 def _passes(step: int, count: int, every: int) -> bool:

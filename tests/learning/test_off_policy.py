@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from gymnasium.vector import SyncVectorEnv
 from safetensors import safe_open
@@ -42,11 +43,15 @@ def greedy(agent, state, observation) -> np.ndarray:
     return np.asarray(agent.propose(state, jnp.asarray(observation, jnp.float32), None))
 
 
-def test_a_bandit_is_solved() -> None:
+@pytest.mark.parametrize("actor_every", [1, 2])
+def test_a_bandit_is_solved(actor_every: int) -> None:
+    agent = dataclasses.replace(SMALL, actor_every=actor_every)
     settings = OffPolicyTraining(3000, warm_up=500, batch=64, capacity=3000, ratio=0.5)
-    state = train_off_policy(side_by_side(Bandit, 4), SMALL, settings, 0)
+    state = train_off_policy(side_by_side(Bandit, 8), agent, settings, 0)
     seen = np.linspace(-0.9, 0.9, 19)[:, None]
-    assert np.abs(greedy(SMALL, state, seen) - 0.5 * seen).max() < 0.1
+    assert np.abs(greedy(agent, state, seen) - 0.5 * seen).max() < 0.1
+    counts = [int(optax.tree.get(state.moments[name], "count")) for name in ("critic", "actor")]
+    assert counts == [1250, 1250 // actor_every]
 
 
 DETERMINISTIC = DeterministicPolicyGradient(width=32, learning_rate=3e-3, noise=0.1)

@@ -29,7 +29,7 @@ class SoftActorCritic:
     """Maximises the discounted reward and, times the temperature, the entropy of its actions.
 
     The temperature follows from `target_entropy` (None: less the number of actions); a number for
-    `temperature` fixes it instead.
+    `temperature` fixes it instead. Actor and temperature move in one update of `actor_every`.
     """
 
     learning_rate: float = 3e-4
@@ -37,6 +37,7 @@ class SoftActorCritic:
     target_rate: float = 0.005
     temperature: float | None = None
     target_entropy: float | None = None
+    actor_every: int = 1
     width: int = 256
     depth: int = 2
 
@@ -89,17 +90,26 @@ class SoftActorCritic:
                 loss = loss + penalty(lived.observation, action)
             return jnp.mean(loss), -jnp.mean(density)
 
-        moments: dict[str, Any] = {}
+        before = state.moments
         lost, gradient = jax.value_and_grad(critic_loss)(state.critic)
-        critic, moments["critic"] = descend(
-            optimiser, gradient, state.moments["critic"], state.critic
-        )
-        (_, entropy), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor, critic)
-        actor, moments["actor"] = descend(optimiser, gradient, state.moments["actor"], state.actor)
-        log_temperature, moments["temperature"] = self._cooled(state, entropy, optimiser)
+        critic, of_critic = descend(optimiser, gradient, before["critic"], state.critic)
+
+        def improved() -> tuple[Any, ...]:
+            gradient, entropy = jax.grad(actor_loss, has_aux=True)(state.actor, critic)
+            moved = descend(optimiser, gradient, before["actor"], state.actor)
+            return *moved, *self._cooled(state, entropy, optimiser)
+
+        if self.actor_every == 1:
+            acting = improved()
+        else:
+            held = state.actor, before["actor"], state.log_temperature, before["temperature"]
+            due = optax.tree.get(before["critic"], "count") % self.actor_every == 0
+            acting = jax.lax.cond(due, improved, lambda: held)
+        actor, of_actor, log_temperature, of_temperature = acting
+        moments = {"actor": of_actor, "critic": of_critic, "temperature": of_temperature}
         followed = follow(state.target, critic, self.target_rate)
         state = SoftActorCriticState(actor, critic, followed, log_temperature, moments)
-        figures = {"critic_loss": lost, "entropy": entropy, "temperature": temperature}
+        figures = {"critic_loss": lost, "entropy": -jnp.mean(density), "temperature": temperature}
         return state, {**figures, "value": jnp.mean(target)}
 
     def _cooled(

@@ -102,6 +102,15 @@ def test_the_point_stops_in_an_obstacle_and_succeeds_near_the_origin():
     assert np.abs(still - (3, 3)).max() < 0.1
 
 
+def test_scattered_points_begin_beside_the_walls():
+    world = Navigation(scattered=True)
+    places = np.array([world.reset(seed).position for seed in range(100)])
+    assert (np.abs(places[:, 1]) >= 2).all()
+    assert (np.abs(places[:, 1]) <= 5).all()
+    assert 30 < (places[:, 1] > 0).sum() < 70
+    assert np.ptp(places[:, 0]) > 100
+
+
 def test_a_straight_way_arrives_and_a_wrong_one_does_not():
     world, task = Navigation(), NavigationTask()
     world.reset(3)

@@ -76,6 +76,20 @@ def test_distance_is_finite_everywhere_and_steps_are_small():
         assert slope.max() < 1.2
 
 
+@pytest.mark.parametrize("layout", EVERY[:2], ids=lambda layout: layout.name)
+def test_scattered_starts_are_free_and_all_along_the_way(layout):
+    random = np.random.default_rng(0)
+    places = np.array([layout.drawn_place(random) for _ in range(400)])
+    assert (layout.clearance(places) >= TIP_RADIUS).all()
+    from_block = np.abs(places - layout.obstacle.position) - layout.obstacle.half_sizes
+    assert (from_block.max(-1) > TIP_RADIUS).all()
+    ways = layout.distance(places)
+    thirds = np.histogram(ways, 3, (0.06, layout.distance(np.array(layout.start))))[0]
+    assert thirds.min() > 60
+    at_the_block = (np.abs(places[:, 0]) < 0.07).sum()
+    assert at_the_block > 40
+
+
 def test_mazes_differ_and_keep_their_names():
     assert len({layout.walls for layout in EVERY}) == len(EVERY)
     assert drawn_layout(3) == drawn_layout(3)

@@ -219,6 +219,15 @@ def test_a_command_that_is_not_finite_gives_no_force(force):
     assert not world.truth().fault
 
 
+def test_episodes_may_begin_anywhere():
+    world = BlindMaze(noise=0.0, scattered=True)
+    for seed in range(30):
+        world.reset(seed)
+        world.step(np.zeros(3))
+        assert world.truth().peak_force < 3  # the base may bring it to a wall that is near
+    assert np.ptp([world.reset(seed).position[0] for seed in range(30)]) > 0.3
+
+
 def test_several_physics_steps_in_a_period_keep_the_peak():
     slow, fast = still(control_period=0.01), still()
     peaks = []

@@ -37,18 +37,19 @@ def maze_law(constant_stiffness: float | None = None) -> ImpedanceLaw:
 def _maze_parts(
     layouts: Sequence[str | Layout] = ("home",),
     noise: float = 1.0,
+    scattered: bool = False,
     constant_stiffness: float | None = None,
     decision_period: float = DECISION_PERIOD,
     count: int = 1,
 ) -> tuple[list[BlindMaze], MazeTask, ImpedanceLaw, int]:
-    worlds = [BlindMaze(layouts, noise=noise) for _ in range(count)]
+    worlds = [BlindMaze(layouts, noise=noise, scattered=scattered) for _ in range(count)]
     every = max(1, round(decision_period / worlds[0].control_period))
     return worlds, MazeTask(), maze_law(constant_stiffness), every
 
 
 def blind_maze(render_mode: str | None = None, **options: Any) -> GymnasiumWorld:
-    """One blind maze. `options`: `layouts` and `noise` as `BlindMaze` has them,
-    `constant_stiffness` as `ImpedanceLaw`, `decision_period` in s."""
+    """One blind maze. `options`: `layouts`, `noise` and `scattered` as `BlindMaze` has
+    them, `constant_stiffness` as `ImpedanceLaw`, `decision_period` in s."""
     worlds, task, law, every = _maze_parts(**options)
     return GymnasiumWorld(worlds[0], task, law, every, render_mode)
 
@@ -60,14 +61,16 @@ def blind_mazes(
     return GymnasiumWorlds(*_maze_parts(**options, count=num_envs), render_mode=render_mode)
 
 
-def navigation(render_mode: str | None = None) -> GymnasiumWorld:
-    """One point between obstacles."""
-    return GymnasiumWorld(Navigation(), NavigationTask(), None, PERIODS, render_mode)
+def navigation(render_mode: str | None = None, scattered: bool = False) -> GymnasiumWorld:
+    """One point between obstacles; `scattered` as `Navigation` has it."""
+    return GymnasiumWorld(Navigation(scattered), NavigationTask(), None, PERIODS, render_mode)
 
 
-def navigations(num_envs: int = 1, render_mode: str | None = None) -> GymnasiumWorlds:
-    """Points between obstacles, side by side."""
-    worlds = [Navigation() for _ in range(num_envs)]
+def navigations(
+    num_envs: int = 1, render_mode: str | None = None, scattered: bool = False
+) -> GymnasiumWorlds:
+    """Points between obstacles, side by side; `scattered` as `Navigation` has it."""
+    worlds = [Navigation(scattered) for _ in range(num_envs)]
     return GymnasiumWorlds(worlds, NavigationTask(), None, PERIODS, render_mode)
 
 

@@ -43,6 +43,7 @@ BLOCK_CLEARANCE = 0.05  # m
 START_X, START_HALF_SIZES = -0.245, (0.025, 0.02)  # m: the place where the tip starts
 GOAL_X, GOAL_RADIUS = 0.25, 0.03  # m
 CELL = 0.005  # m, of the grid that distances are computed on
+SCATTER = 0.015  # m, standard deviation of places beside the way to the goal
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Layout:
         5 mm whose ways have 16 directions, so at most 2.7 % too long; within a wall it is that of
         the nearest free place and the way there, outside that of the nearest place on the grid.
         """
-        table, low = self._table
+        table, low, _ = self._table
         place = (np.asarray(position, float)[..., :2] - low) / CELL
         place = np.clip(place, 0, np.array(table.shape) - 1.001)
         cell = place.astype(int)
@@ -95,6 +96,26 @@ class Layout:
         below = (1 - u) * table[i, j] + u * table[i + 1, j]
         above = (1 - u) * table[i, j + 1] + u * table[i + 1, j + 1]
         return np.asarray((1 - v) * below + v * above)
+
+    def drawn_place(self, random: np.random.Generator) -> np.ndarray:
+        """A place (2,) m near the way from start to goal, free of walls, block and goal.
+
+        Even along that way, so that the narrow channel is drawn as often as its length asks for,
+        and `SCATTER` m beside it.
+        """
+        way = self._table[2]
+        way = way[np.linalg.norm(way - self.goal, axis=1) > 3 * self.goal_radius]
+        place = way[random.integers(len(way))]
+        while True:
+            drawn = place + SCATTER * random.standard_normal(2)
+            beyond = np.abs(drawn - self.obstacle.position) - self.obstacle.half_sizes
+            if (
+                self.clearance(drawn) >= TIP_RADIUS
+                and beyond.max() > TIP_RADIUS
+                and drawn[0] > self.entrance + TIP_RADIUS
+                and math.dist(drawn, self.goal) > 2 * self.goal_radius
+            ):
+                return drawn
 
     def clearance(self, position: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, " *batch"]:
         """m from (x, y) to the nearest wall's surface, negative within one; no obstacle."""
@@ -108,8 +129,8 @@ class Layout:
         return np.asarray(nearest)
 
     @cached_property
-    def _table(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distances on the grid, and the place of its first corner."""
+    def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances on the grid, the place of its first corner, and the way from start to goal."""
         low = -np.array(ARENA) - (4 * CELL, 0)
         shape = np.rint((np.array(ARENA) - low) / CELL).astype(int) + 1
         places = low + CELL * np.moveaxis(np.indices(tuple(shape)), 0, -1)
@@ -128,10 +149,16 @@ class Layout:
         )
         to_goal = np.where(free, np.linalg.norm(places - self.goal, axis=-1), np.inf)
         goal = int(np.argmin(to_goal))
-        table = dijkstra(graph, directed=False, indices=goal).reshape(free.shape)
+        table, before = dijkstra(graph, directed=False, indices=goal, return_predecessors=True)
+        table = table.reshape(free.shape)
+        way = [
+            int(np.ravel_multi_index(np.rint((self.start - low) / CELL).astype(int), free.shape))
+        ]
+        while way[-1] != goal:
+            way.append(int(before[way[-1]]))
         reached = np.isfinite(table)
         away, nearest = distance_transform_edt(~reached, sampling=CELL, return_indices=True)
-        return table[tuple(nearest)] + away, low
+        return table[tuple(nearest)] + away, low, places.reshape(-1, 2)[way]
 
 
 def _shifted(step: tuple[int, int], shape: tuple[int, ...]) -> tuple[tuple, tuple]:

@@ -82,6 +82,7 @@ class BlindMaze(World):
     frequency about 1 Hz and a random phase; position and velocity are seen relative to it. The tip
     keeps its height by itself and gravity is compensated. `layouts` names mazes, one of which is
     drawn at each reset; `noise` scales the sensors' Ornstein-Uhlenbeck noise, 0 switches it off;
+    `scattered` lets episodes begin all along the way to the goal, to collect collisions;
     `control_period` is a whole number of milliseconds, in s.
 
     A command that is not finite is a fault of who commands: the drives give no force in that
@@ -96,6 +97,7 @@ class BlindMaze(World):
         *,
         sway: float = SWAY,
         noise: float = 1.0,
+        scattered: bool = False,
         control_period: float = TIME_STEP,
     ):
         self._layouts = tuple(map(_layout, layouts))
@@ -111,6 +113,7 @@ class BlindMaze(World):
             )
         self._substeps = round(substeps)
         self._sway_amplitude, self._noise_scale = float(sway), float(noise)
+        self._scattered = scattered
         self._models: dict[Layout, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         self._camera: OffscreenCamera | None = None
         self._ready = False
@@ -128,7 +131,7 @@ class BlindMaze(World):
         obstacle_friction: float | None = None,
         contact_friction: float | None = None,
     ) -> TipObservation:
-        """Put the tip at rest on the base, near the entrance or at `start` (x, y) m in the world.
+        """Put the tip at rest on the base, where episodes begin or at `start` (x, y) m, world.
 
         What is None is drawn by the seed: the maze among those of the world, the block's dry
         friction (N) and the tip's coefficient of friction; the block's mass is always drawn.
@@ -145,7 +148,9 @@ class BlindMaze(World):
         self._phase = random.uniform(0, 2 * math.pi)
         if layout is not None:
             drawn = _layout(layout)
-        if start is None:
+        if start is None and self._scattered:
+            place = drawn.drawn_place(random)
+        elif start is None:
             place = drawn.start + place * drawn.start_half_sizes
         else:
             place = np.asarray(start, float)

@@ -18,6 +18,8 @@ from palpate.worlds.world import World
 PERIODS = 10  # control periods in a step of the original
 NOISE = 0.05  # standard deviation of the motion's noise, of a whole step
 START, START_SPREAD = (-50.0, 0.0), 1.0
+# Where the original collects what a critic learns from before: beside either wall.
+SCATTERED_X, SCATTERED_Y = (-80.0, 50.0), (2.0, 5.0)
 # Rectangles (x from, to, y from, to) that may not be entered: two walls, and one that joins them.
 OBSTACLES = (
     (-100.0, 150.0, 5.0, 10.0),
@@ -46,11 +48,13 @@ class Navigation(World):
     """s' = s + a + N(0, .05^2), |a_i| <= 1, cut into ten: a tenth of the motion, noise / sqrt 10.
 
     The action (2,) is the motion of a whole step, of which a control period does a tenth; one that
-    is not finite moves nothing. Starts at (-50, 0) + N(0, 1), or at `start` (x, y). Inside an
-    obstacle the point stays where it is.
+    is not finite moves nothing. Starts at (-50, 0) + N(0, 1), or at `start` (x, y); `scattered`
+    lets episodes begin beside the walls, as those do that the original collects violations from.
+    Inside an obstacle the point stays where it is.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, scattered: bool = False) -> None:
+        self._scattered = scattered
         self._random: np.random.Generator | None = None
 
     @property
@@ -61,8 +65,13 @@ class Navigation(World):
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
             raise PalpateError(f"a seed is a whole number, 0 or greater, not {seed!r}")
         random = np.random.default_rng(seed)
-        place = START + START_SPREAD * random.standard_normal(2) if start is None else start
-        place = np.asarray(place, float)
+        if start is not None:
+            place = np.asarray(start, float)
+        elif self._scattered:
+            side = random.choice((-1.0, 1.0))
+            place = np.array([random.uniform(*SCATTERED_X), side * random.uniform(*SCATTERED_Y)])
+        else:
+            place = START + START_SPREAD * random.standard_normal(2)
         if place.shape != (2,) or not np.isfinite(place).all():
             raise PalpateError(f"a point starts at (x, y), not at {start}")
         self._random, self._position, self._count = random, place, 0

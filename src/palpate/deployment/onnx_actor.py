@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.deployment.onnx_export import EXTRA, Graph
+from palpate.deployment.onnx_graph import EXTRA, Graph
 from palpate.errors import extra_module
 from palpate.networks import ActorPolicy, Guard, GuardedPolicy, count_of
 from palpate.networks.actor import Perceptron
@@ -28,7 +28,7 @@ def actor_model(policy: ActorPolicy) -> Any:
 
     Raises `PalpateError` without the extra `deploy`.
     """
-    graph = Graph(extra_module("onnx", EXTRA))
+    graph = Graph()
     features, actions = count_of(policy.observations), count_of(policy.actions)
     proposed = _action(graph, policy.actor.network, "features", actions)
     outputs: dict[str, Any] = {}
@@ -47,7 +47,7 @@ def guard_model(policy: GuardedPolicy) -> Any:
     `command` (batch, actions) is the action, or the recovery's where `risk` (batch, 1) is above
     the threshold, and zero where it is not finite. Raises as `actor_model`.
     """
-    graph = Graph(extra_module("onnx", EXTRA))
+    graph = Graph()
     features, actions = count_of(policy.observations), count_of(policy.actions)
     executed = _overruled(graph, policy.guard, policy.threshold, "action")
     graph.add("Identity", _still(graph, executed), output="command")

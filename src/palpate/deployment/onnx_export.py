@@ -1,9 +1,4 @@
-"""A command policy as an ONNX graph.
-
-The graph is written with `onnx.helper`, node by node: a tanh network and two limits are about
-thirty nodes. A converter from JAX would pin a dozen packages for them and leave names and order to
-chance.
-"""
+"""A command policy as an ONNX graph."""
 
 from pathlib import Path
 from typing import Any
@@ -11,12 +6,10 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from palpate.deployment.onnx_graph import EXTRA, Graph
 from palpate.errors import PalpateError, extra_module
 from palpate.networks import Channel, CommandPolicy
 from palpate.runs.storage import write_bytes
-
-EXTRA = "deploy"
-_OPSET, _IR = 17, 8  # read by every ONNX Runtime from 1.12 (2022) on
 
 
 def onnx_model(policy: CommandPolicy) -> Any:
@@ -28,8 +21,7 @@ def onnx_model(policy: CommandPolicy) -> Any:
 
     Raises `PalpateError` without the extra `deploy`.
     """
-    onnx = extra_module("onnx", EXTRA)
-    graph = Graph(onnx)
+    graph = Graph()
     centred = graph.add("Sub", "features", graph.constant(policy.mean))
     seen = graph.add("Div", centred, graph.constant(policy.scale))
     shape = list(policy.action_shape)
@@ -54,7 +46,7 @@ def onnx_model(policy: CommandPolicy) -> Any:
     return graph.model(inputs, {"command": shape, "carry_out": shape})
 
 
-def _moved(graph: "Graph", channel: Channel, period: float, output: str, before: str) -> str:
+def _moved(graph: Graph, channel: Channel, period: float, output: str, before: str) -> str:
     """The next command of one channel, from the network's output and the command before."""
     limit, one = graph.constant(channel.bound), graph.constant(1.0)
     length = graph.add("Sqrt", graph.add("Add", graph.square(output), one))
@@ -131,59 +123,3 @@ def _limits(policy: CommandPolicy) -> np.ndarray:
     """Of every number of a command that of its channel, (commands,)."""
     limits = [channel.bound for channel in policy.actions]
     return np.repeat(limits, [channel.count for channel in policy.actions])
-
-
-class Graph:
-    """Nodes and constants in the order they were added, each result under a name of its own."""
-
-    def __init__(self, onnx: Any):
-        self._onnx = onnx
-        self._nodes: list[Any] = []
-        self._constants: list[Any] = []
-        self._sum_axis = self.constant([-1], np.int64)
-
-    def constant(self, value: Any, dtype: type = np.float32) -> str:
-        name = f"constant_{len(self._constants)}"
-        array = np.ascontiguousarray(value, dtype).reshape(np.shape(value))
-        self._constants.append(self._onnx.numpy_helper.from_array(array, name))
-        return name
-
-    def add(self, kind: str, *inputs: str, output: str = "", **attributes: Any) -> str:
-        output = output or f"{kind.lower()}_{len(self._nodes)}"
-        node = self._onnx.helper.make_node(kind, inputs, [output], **attributes)
-        self._nodes.append(node)
-        return output
-
-    def square(self, vector: str) -> str:
-        """The squared length along the last axis, which stays with size 1."""
-        return self.add("ReduceSum", self.add("Mul", vector, vector), self._sum_axis, keepdims=1)
-
-    def part(self, flat: str, first: int, channel: Channel) -> str:
-        """The numbers of a channel from `first` on, in its shape."""
-        places = [self.constant([place], np.int64) for place in (first, first + channel.count, 1)]
-        own = self.add("Slice", flat, *places)
-        return self.add("Reshape", own, self.constant([-1, *channel.shape], np.int64))
-
-    def flat(self, value: str, count: int) -> str:
-        """The value as rows of `count` numbers."""
-        return self.add("Reshape", value, self.constant([-1, count], np.int64))
-
-    def model(self, inputs: dict[str, Any], outputs: dict[str, Any]) -> Any:
-        helper = self._onnx.helper
-
-        def described(sizes: dict[str, Any]) -> list[Any]:
-            kind = self._onnx.TensorProto.FLOAT
-            return [
-                helper.make_tensor_value_info(name, kind, ["batch", *size])
-                for name, size in sizes.items()
-            ]
-
-        graph = helper.make_graph(
-            self._nodes, "policy", described(inputs), described(outputs), self._constants
-        )
-        opset = [helper.make_opsetid("", _OPSET)]
-        model = helper.make_model(
-            graph, opset_imports=opset, ir_version=_IR, producer_name="palpate"
-        )
-        self._onnx.checker.check_model(model, full_check=True)
-        return model

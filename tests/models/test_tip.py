@@ -24,8 +24,8 @@ FREE = {"damping_ratio": 0.0, "damping": 0.0, "friction": 0.0}
 
 
 def walled(directions, **values) -> Tip:
-    """Without dry friction of the arm unless some is given."""
-    return facing(directions, **{"arm_friction": 0.0} | values)
+    """Without dry friction of the arm, and walls without mass, unless some is given."""
+    return facing(directions, **{"arm_friction": 0.0, "wall_mass": 0.0} | values)
 
 
 def moving(position, velocity) -> TipState:
@@ -139,6 +139,16 @@ def test_no_contact_creates_energy_however_stiff_the_wall_and_wherever_a_step_me
     assert np.all(kept <= 1.0 + 1e-6)
     assert np.all(kept[stiffness <= 1e4] > 0.97)
     np.testing.assert_allclose(after[:, 1], 0.2)
+
+
+def test_a_plate_that_is_met_takes_its_share_of_the_momentum():
+    """Inelastic, as of two masses; then they swing together on the spring until it is relaxed."""
+    tip = walled([LEFT], **FREE, mass=1.0, wall_mass=0.25, stiffness=500.0)
+    tip = dataclasses.replace(tip, control_period=2e-4)
+    states = run(tip, moving([-1e-6, 0.0], [0.5, 0.0]), held([0.0, 0.0], [0.0, 0.0], 1000))
+    depth, speed = np.asarray(states.position[:, 0]), 0.5 / 1.25
+    assert depth.max() == pytest.approx(speed * np.sqrt(1.25 / 500.0), rel=2e-3)
+    assert float(states.velocity[-1, 0]) == pytest.approx(-speed, rel=2e-3)
 
 
 def test_the_error_of_a_bounce_falls_with_the_square_of_the_step():

@@ -26,6 +26,7 @@ class Surfaces(NamedTuple):
     stiffness: Numbers  # N/m
     damping: Numbers  # N s/m
     friction: Numbers
+    mass: Numbers  # kg, of a plate, which moves with the tip while they touch
 
 
 class Impedance(NamedTuple):
@@ -53,7 +54,7 @@ def advance(
 
     `slip` (m/s) is the sliding velocity at which friction has half its size.
     """
-    normal, place, stiffness, damping, friction = surfaces
+    normal, place, stiffness, damping, friction, plate = surfaces
     mass = impedance.mass
     depth = place - _along(normal, position)
     rate = -_along(normal, velocity)
@@ -66,16 +67,21 @@ def advance(
     share = jnp.where(stiffness * pressed + damping * rate >= 0.0, share, 0.0)
     implicit = jnp.where(after > 0.0, 0.5 * share, 0.0)
     spring = stiffness * (jnp.where(depth > 0.0, 0.5 * share, 0.0) + implicit) * depth
-    yielding = time * stiffness * implicit + damping * share  # N s/m of the mean velocity
+    # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy.
+    inertia = jnp.where(share > 0.0, plate / time, 0.0)
+    moved = jnp.where(depth > 0.0, 2.0, 1.0) * inertia * -rate
+    # N s/m of the mean velocity
+    yielding = time * stiffness * implicit + damping * share + 2.0 * inertia
 
     # Mean velocity w: (2 m / h + D + K h / 2 + sum of n n' yielding) w = 2 m / h v + forces.
     held = 2.0 * mass / time
     diagonal = held + impedance.damping + 0.5 * time * impedance.stiffness
     pull = impedance.stiffness * (impedance.setpoint - position)
     inverse = _inverse(diagonal, normal, yielding)
-    right = held * velocity + pull + jnp.sum(normal * spring[..., None], axis=-2)
+    push = spring + moved
+    right = held * velocity + pull + jnp.sum(normal * push[..., None], axis=-2)
     mean = _product(inverse, right)
-    force = jnp.maximum(spring - yielding * _along(normal, mean), 0.0)
+    force = jnp.maximum(push - yielding * _along(normal, mean), 0.0)
     total = jnp.sum(normal * force[..., None], axis=-2)
 
     # Friction as a further force, of the size that the velocity at the end asks for: of the arm,

@@ -21,6 +21,7 @@ Point = Float[Array, "*batch 2"]
 
 SUBSTEP = 2.5e-3  # s, of the integration, at most
 UNROLLED = 4  # so many of them in a control period are written out
+OF_WALLS = "position", "tilt", "stiffness", "damping", "friction", "wall_mass"
 SLIP = 1e-5  # m/s, the sliding velocity at which friction has half its size
 
 
@@ -44,8 +45,9 @@ class Tip(Model):
     al., ICRA 2003, of one mass), and the arm rubs. An action is x_d and K for one control period.
 
     Each wall is a plate on a spring: where the tip is pressed in by u, it pushes with
-    f_n = max(0, k u + d u'), along its outward normal, and rubs with Coulomb's friction mu f_n
-    against the sliding velocity (regularised: half of it at `slip` m/s).
+    f_n = max(0, k u + d u' + m_w u''), along its outward normal, and rubs with Coulomb's friction
+    mu f_n against the sliding velocity (regularised: half of it at `slip` m/s). Its mass m_w is met
+    at rest, and left behind without bouncing.
 
     How many walls there are, and the nominal `direction` (rad) of each outward normal, is data; a
     wall may be tilted about it. `position` is where the wall is along that direction, from the
@@ -77,6 +79,9 @@ class Tip(Model):
     friction: Walls = parameter(
         "", prior=LogNormal(0.3, 0.7), spread=0.3, about="Coulomb's coefficient on each wall"
     )
+    wall_mass: Walls = parameter(
+        "kg", prior=LogNormal(0.02, 1.0), about="of each wall's plate, which moves with the tip"
+    )
     force_bias: Point = parameter(
         "N", prior=Normal(0.0, 0.5), about="what the sensor shows without contact"
     )
@@ -95,7 +100,7 @@ class Tip(Model):
             return
         if not shape or shape[-1] < 1:
             raise PalpateError(f"expected the direction of at least one wall, got {shape}")
-        for name in ("position", "tilt", "stiffness", "damping", "friction"):
+        for name in OF_WALLS:
             own = getattr(getattr(self, name), "shape", shape)
             if own[-1:] != shape[-1:]:
                 raise PalpateError(
@@ -131,7 +136,7 @@ class Tip(Model):
         abreast = jnp.sum(across * self.centre[..., None, :], axis=-1)
         point = nominal * self.position[..., None] + across * abreast[..., None]
         place = jnp.sum(normal * point, axis=-1)
-        return Surfaces(normal, place, self.stiffness, self.damping, self.friction)
+        return Surfaces(normal, place, self.stiffness, self.damping, self.friction, self.wall_mass)
 
     def step(self, state: TipState, action: Float[Array, "*batch 4"]) -> TipState:
         """The state one control period later; the action is x and y of x_d (m) and of K (N/m)."""
@@ -192,7 +197,7 @@ def facing(directions: Sequence[float], **values: Any) -> Tip:
         for name, declared in parameters_of(Tip).items()
     }
     fields = {"centre": 0.0} | fields | values
-    for name in ("position", "tilt", "stiffness", "damping", "friction"):
+    for name in OF_WALLS:
         fields[name] = np.broadcast_to(fields[name], count)
     for name in ("force_bias", "centre"):
         fields[name] = np.broadcast_to(fields[name], 2)

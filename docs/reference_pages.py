@@ -14,6 +14,7 @@ STAGES = {
         *("commands.options", "families.options", "families.rope.options"),
         *("families.rope.control_options", "families.rope.demo"),
         *("families.furniture.options", "families.own.options"),
+        "families.contact.touch_options",
     ],
     "recordings": [
         *("recordings.recording", "recordings.trial", "recordings.channel", "recordings.facts"),
@@ -26,6 +27,7 @@ STAGES = {
         *("models.residual", "models.rope.rope", "models.rope.parameters"),
         *("models.planar.planar", "models.planar.parameters", "models.planar.shapes"),
         *("models.planar.wheels", "families.furniture.structures"),
+        *("models.contact.tip", "families.contact.touches"),
     ],
     "identification": [
         *("identification.identify", "identification.declarations", "identification.verdicts"),
@@ -66,6 +68,7 @@ STAGES = {
         *("worlds.furniture.pieces", "worlds.furniture.furniture", "worlds.furniture.robot"),
         *("worlds.furniture.handling", "worlds.gymnasium", "families.contact.environments"),
         *("worlds.maze.maze", "worlds.maze.layout", "worlds.maze.navigation"),
+        *("worlds.contact.plates", "worlds.contact.touching"),
         *("safety.impedance", "tasks.maze.maze", "tasks.maze.navigation"),
     ],
     "perception": [

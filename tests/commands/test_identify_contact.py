@@ -27,4 +27,4 @@ def test_stiffness_and_friction_are_found_from_a_few_seconds(tmp_path):
     np.testing.assert_allclose(rows["friction"]["value"], plates.friction, rtol=0.1)
     assert rows["stiffness"]["unit"] == "N/m"
     units = {figure.unit for figure in result.figures}
-    assert {"m", "N"} <= units
+    assert {"cm", "N"} <= units

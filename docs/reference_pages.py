@@ -14,6 +14,7 @@ STAGES = {
         *("commands.options", "families.options", "families.rope.options"),
         *("families.rope.control_options", "families.rope.demo"),
         *("families.furniture.options", "families.own.options"),
+        *("families.world_options", "families.contact.maze_options"),
         "families.contact.touch_options",
     ],
     "recordings": [

@@ -54,6 +54,7 @@ TRUTH_FILES = {
     *("experiments/rope/bound.py", "experiments/rope/swing.py"),
     "experiments/furniture/one_shot.py",
     "families/rope/robot.py",
+    "families/contact/path_picture.py",  # which draws what happened
 }
 
 # Tables of places: their strings name what is resolved when a command runs.
@@ -63,13 +64,14 @@ PLACE_KEEPERS = {"families", "family", "cli"}
 FAMILY_WORDS = {"rope", "ropes", "furniture", "appliance", "appliances", "maze", "mazes"}
 GENERAL = {
     *FOUNDATION,
-    "commands/identify",
+    "commands/identification",
     *("identification", "planning", "learning", "safety", "deployment", "report", "cli"),
     *(
         f"commands/{name}.py"
         for name in (
-            *("demo", "record", "convert", "track", "plan", "train", "evaluate"),
+            *("demo", "record", "convert", "track", "identify", "plan", "train", "evaluate"),
             *("export", "serve", "report", "reproduce", "folders", "parsing"),
+            *("train_in_world", "evaluate_in_world", "episodes"),
         )
     ),
     *("models/model.py", "models/residual.py", "models/files.py"),

@@ -167,15 +167,16 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "train rope-stabilisation",
             "unknown task 'rope-stabilisation'; did you mean 'rope-stabilization'? there are: "
-            "rope-stabilization, rope-tracking, FILE.py:CLASS",
+            "maze, rope-stabilization, rope-tracking, FILE.py:CLASS",
         ),
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
             "contact-model, namo-scenarios, namo-scaling, namo-online, calibration, one-shot, "
-            "cart-online, own-model, rope-model, rope-stabilization, rope-ablation, rope-rivals, "
-            "rope-bound, rope-generalization, rope-tracking, rope-dagger, rope-posterior, "
-            "own-rope, rope-residual, rope-markerless",
+            "cart-online, "
+            "own-model, rope-model, rope-stabilization, rope-ablation, rope-rivals, rope-bound, "
+            "rope-generalization, rope-tracking, rope-dagger, rope-posterior, own-rope, "
+            "rope-residual, rope-markerless",
         ),
         ("--completion fish", "unknown shell 'fish'; there are: bash, zsh"),
         ("reproduce rope-model --weights shipped", "rope-model has no --weights: leave it out"),

@@ -10,8 +10,8 @@ import pytest
 
 from palpate.cli import main
 from palpate.commands import demo, folders, identify, reproduce, train
-from palpate.commands.identify.data import read
-from palpate.commands.identify.fit import FitReport
+from palpate.commands.identification.data import read
+from palpate.commands.identification.fit import FitReport
 from palpate.commands.options import Reproduce
 from palpate.errors import PalpateError
 from palpate.families.options import Identify, Train

@@ -9,8 +9,8 @@ import pytest
 from numpy_rope import PERIOD, chain
 from palpate.cli import main
 from palpate.commands import folders
+from palpate.commands.identification.fit import shareable
 from palpate.commands.identify import run
-from palpate.commands.identify.fit import shareable
 from palpate.errors import DoubtfulResultError
 from palpate.families.rope.options import IdentifyRope
 from palpate.models.files import load_model

@@ -137,7 +137,7 @@ def test_a_decision_sends_the_tip_on_with_the_stiffness_it_chose():
     here = seen([[0.1, 0.2, 0.0]] * 3)
     impedance.begin(here, action, np.ones(3, bool))
     force = impedance.command(here)
-    middle = math.sqrt(50 * 1000)
+    middle = (50 + 1000) / 2
     shortened = 0.03 / math.sqrt(2)
     np.testing.assert_allclose(
         force, [[15, 0, 0], [middle * shortened] * 2 + [0], [0, 0, 0]], atol=1e-9

@@ -13,7 +13,7 @@ from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE
 
 AROUND = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 CIRCLE = 0.013 * np.stack([np.cos(AROUND), np.sin(AROUND)], -1)
-SOFT, SOFTEST, STIFFEST = -0.35, -1.0, 1.0
+SOFT, SOFTEST, STIFFEST = -0.83, -1.0, 1.0
 
 
 def decision(truth):
@@ -37,7 +37,7 @@ def decision(truth):
 def lived(layout, stiffness=None, most=250):
     environment = blind_maze(layouts=(layout,), constant_stiffness=stiffness)
     environment.reset(seed=1)
-    (world,) = environment._lockstep.worlds
+    (world,) = environment.lockstep.worlds
     for _ in range(most):
         action = decision(world.truth())
         if stiffness and action[2] == STIFFEST:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from palpate.tasks.maze.maze import DECISION_COST, ENTRANCE_COST, GOAL_BONUS, PROGRESS, MazeTask
+from palpate.tasks.maze.maze import ENTRANCE_COST, GOAL_BONUS, PROGRESS, MazeTask
 from palpate.tasks.maze.navigation import NavigationTask
 from palpate.worlds.gymnasium import WorldTask
 from palpate.worlds.maze.maze import FORCE_LIMIT, BlindMaze
@@ -30,8 +30,9 @@ def test_the_maze_rewards_the_way_to_the_goal(truth):
     before = at(truth, 0.2, 0.1)
     after = at(truth, 0.23, 0.06)  # 5 cm straight towards the goal at (.25, 0), almost
     way = np.hypot(0.05, 0.1) - np.hypot(0.02, 0.06)
-    assert task.reward(before, after, action) == pytest.approx(
-        PROGRESS * way - DECISION_COST, abs=0.02
+    assert task.reward(before, after, action) == pytest.approx(PROGRESS * way, abs=0.1)
+    assert task.progress(before, after) == pytest.approx(
+        1 - np.hypot(0.02, 0.06) / np.hypot(0.05, 0.1), abs=0.02
     )
     pushed = after._replace(peak_force=FORCE_LIMIT)
     assert task.reward(before, pushed, action) < task.reward(before, after, action)

@@ -57,6 +57,9 @@ class Climb:
     def violates(self, truth):
         return truth > 30
 
+    def progress(self, first, truth):
+        return (truth - first) / 100
+
     def force(self, truth):
         return truth
 
@@ -99,6 +102,7 @@ def test_a_decision_is_held_and_judged():
     np.testing.assert_array_equal(infos["cost"], [0, 0])
     np.testing.assert_array_equal(infos["force"], [13, 9])
     assert infos["end"].tolist() == ["", ""]
+    np.testing.assert_allclose(infos["progress"], [0.03, -0.03])
     assert "final_obs" not in infos
 
 
@@ -132,7 +136,7 @@ def test_a_violation_ends_the_episode_within_the_decision():
 def test_what_diverges_and_what_takes_too_long_is_cut_off():
     environments = lifts(2, Tenfold(), every=1)
     environments.reset(seed=0, options={"height": 10.0})
-    environments._lockstep.worlds[0].height = 95.0
+    environments.lockstep.worlds[0].height = 95.0
     _, _, terminated, truncated, infos = environments.step(actions(1, 0))
     assert infos["end"].tolist() == ["diverged", ""]
     assert truncated.tolist() == [True, False]

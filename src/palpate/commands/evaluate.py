@@ -6,9 +6,11 @@ from pathlib import Path
 import jax
 
 from palpate.commands import folders
+from palpate.commands.evaluate_in_world import evaluate_in_world
 from palpate.commands.train import lines_of, named_task
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate, Found
+from palpate.families.world_options import EvaluateInWorld
 from palpate.models.files import load_model
 from palpate.models.model import Model
 from palpate.networks import CommandPolicy, load_policy
@@ -20,7 +22,14 @@ from palpate.tasks.task import Task
 from palpate.trials.in_model import tried_in_model
 
 
-def run(options: Evaluate) -> Path:
+def run(options: Evaluate | EvaluateInWorld) -> Path:
+    """Evaluate and return the folder everything is in; see the two ways of it."""
+    if isinstance(options, EvaluateInWorld):
+        return evaluate_in_world(options)
+    return evaluate_trials_of(options)
+
+
+def evaluate_trials_of(options: Evaluate) -> Path:
     """Evaluate, print a table of all controllers, and return the folder everything is in.
 
     Raises `PalpateError` for a file that is no policy, or one for another task or model.

@@ -10,7 +10,9 @@ from types import MappingProxyType
 from typing import Any
 
 from palpate.commands import folders
+from palpate.commands.train_in_world import train_in_world
 from palpate.families.options import Train
+from palpate.families.world_options import TrainInWorld
 from palpate.family import find
 from palpate.learning import Training, train
 from palpate.models.files import load_model
@@ -28,7 +30,14 @@ from palpate.trials.in_model import EPISODES, tried_in_model
 POOR = 0.5  # share of successes below which a policy is warned of
 
 
-def run(options: Train) -> Path:
+def run(options: Train | TrainInWorld) -> Path:
+    """Train and return the folder everything is in; see the two ways of it."""
+    if isinstance(options, TrainInWorld):
+        return train_in_world(options)
+    return train_through_model(options)
+
+
+def train_through_model(options: Train) -> Path:
     """Train, say how well the policy does in the model, and return the folder everything is in.
 
     Raises `PalpateError` for a model the task cannot use, and for folders that cannot be used.

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from palpate.errors import PalpateError
 from palpate.networks.actor import Critic, DeterministicActor, GaussianActor
 from palpate.networks.channels import Channel, count_of
-from palpate.networks.controller import DeclaredController
+from palpate.networks.controller import DeclaredController, load_controller
 
 ACTORS = {"gaussian": GaussianActor, "deterministic": DeterministicActor}
 
@@ -145,6 +146,20 @@ class GuardedPolicy(ActorPolicy):
         guard = untrained_guard(jax.random.key(0), features, count_of(alone.actions), layers, seen)
         declared = {name: getattr(alone, name) for name in ("observations", "actions", "period")}
         return cls(actor=alone.actor, guard=guard, threshold=threshold, **declared)
+
+
+def load_actor(path: str | Path) -> tuple[ActorPolicy, dict[str, Any]]:
+    """The actor that `save_controller` wrote, guarded or not, and its manifest.
+
+    Raises `PalpateError` for a controller of another kind, and as `load_controller`.
+    """
+    policy, manifest = load_controller(path)
+    if not isinstance(policy, ActorPolicy):
+        raise PalpateError(
+            f"{path} holds a {manifest['controller']['kind']}: expected an actor that learnt in a "
+            "world"
+        )
+    return policy, manifest
 
 
 def untrained_guard(

@@ -93,8 +93,8 @@ class ImpedanceLaw:
 
     An action in [-1, 1]^4 is [dx, dy, k along, k across]. The first two times `displacement_limit`
     (m; a longer vector is shortened to it) lead from the position observed at the decision to the
-    set-point; the other two are the stiffness along that direction and across it, evenly in its
-    logarithm over `stiffness_range` (N/m). With `constant_stiffness` (N/m) they are ignored. The
+    set-point; the other two are the stiffness along that direction and across it, evenly
+    over `stiffness_range` (N/m). With `constant_stiffness` (N/m) they are ignored. The
     damping is `double_diagonalised_damping` for the effective `mass` (kg, or a (2, 2) matrix).
 
     `set_point_rate` (m/s) and `stiffness_rate` (N/m per s, in the Frobenius norm) are how fast both
@@ -145,7 +145,7 @@ class ImpedanceLaw:
         )  # fmt: skip
         self._low, self._span = (
             stiffness_range[0],
-            math.log(stiffness_range[1] / stiffness_range[0]),
+            stiffness_range[1] - stiffness_range[0],
         )
         self._most = tuple(
             math.inf if rate is None else rate * control_period
@@ -170,7 +170,7 @@ class ImpedanceLaw:
         size = np.linalg.norm(step, axis=1, keepdims=True)
         step *= np.minimum(1.0, self._limit / np.maximum(size, 1e-12))
         if self._constant is None:
-            along, across = self._low * np.exp(self._span * (action[:, 2:4].T + 1) / 2)
+            along, across = self._low + self._span * (action[:, 2:4].T + 1) / 2
         else:
             along = across = np.full(len(action), self._constant)
         self._sound, self._wanted = sound, (position + step, turned(along, across, step))

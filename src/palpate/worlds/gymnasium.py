@@ -55,12 +55,16 @@ class WorldTask(Protocol):
         """N: the greatest contact force in the last control period; 0 where there is none."""
         ...
 
+    def progress(self, first: Any, truth: Any) -> float:
+        """The share of the way that is behind it since the truth that its episode began with."""
+        ...
+
     def end(self, truth: Any) -> str:
         """Asked after a decision: "" while the episode goes on, else how it ended ("goal")."""
         ...
 
 
-class _Lockstep:
+class Lockstep:
     """Worlds side by side at the control rate, whose decisions are taken together."""
 
     def __init__(
@@ -73,19 +77,22 @@ class _Lockstep:
             raise PalpateError("environments side by side need at least one world")
         self.observations: list[Any] = [None] * count
         self._truths: list[Any] = [None] * count
+        self._first: list[Any] = [None] * count  # of the episodes under way
         self.fresh = np.ones(count, bool)
         self.decisions = np.zeros(count, int)
         one = np.ones(task.features, np.float32) * FEATURE_LIMIT
         self.observation_space = Box(-one, one)
         self.action_space = Box(-1.0, 1.0, (task.actions,), np.float32)
 
-    def reset(self, number: int, random: np.random.Generator, options: dict[str, Any]) -> None:
+    def begin(self, number: int, random: np.random.Generator, options: dict[str, Any]) -> None:
+        """Begin an episode of one world, from a seed that is drawn."""
         world = self.worlds[number]
         self.observations[number] = world.reset(int(random.integers(2**31)), **options)
-        self._truths[number] = world.truth()
+        self._truths[number] = self._first[number] = world.truth()
         self.fresh[number], self.decisions[number] = True, 0
 
     def features(self) -> np.ndarray:
+        """What the task sees of all worlds, (worlds, features) float32."""
         seen = self.task.observe(side_by_side(self.observations))
         return np.clip(seen, -FEATURE_LIMIT, FEATURE_LIMIT).astype(np.float32)
 
@@ -129,6 +136,7 @@ class _Lockstep:
         cut = (end == HORIZON) | (end == DIVERGED)
         told = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
         told["force"] = np.array(force)
+        told["progress"] = np.array([*map(task.progress, self._first, truths)])
         return reward, (end != "") & ~cut, cut, told
 
 
@@ -141,7 +149,8 @@ class GymnasiumWorlds(VectorEnv):
 
     The infos of a step hold, for all worlds: "cost" (0 or 1: a violation, which ends the episode at
     once, within the decision), "end" (str: "" while it goes on, else what the task says,
-    "violation", "horizon" or "diverged") and "force" (N, the greatest in this decision); and
+    "violation", "horizon" or "diverged"), "force" (N, the greatest in this decision) and "progress"
+    (the share of the way that is behind it); and
     "final_obs" where an episode ended. An episode that is cut off at the horizon, or whose
     simulation diverged, is truncated.
     """
@@ -158,10 +167,10 @@ class GymnasiumWorlds(VectorEnv):
         every: int,
         render_mode: str | None = None,
     ):
-        self._lockstep = _Lockstep(worlds, task, law, every)
+        self.lockstep = Lockstep(worlds, task, law, every)
         self.num_envs, self.render_mode = len(worlds), render_mode
-        self.single_observation_space = self._lockstep.observation_space
-        self.single_action_space = self._lockstep.action_space
+        self.single_observation_space = self.lockstep.observation_space
+        self.single_action_space = self.lockstep.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._randoms = [np_random(None)[0] for _ in range(self.num_envs)]
@@ -185,14 +194,14 @@ class GymnasiumWorlds(VectorEnv):
         for number, given in enumerate(seeds):
             if given is not None:
                 self._randoms[number] = np_random(given)[0]
-            self._lockstep.reset(number, self._randoms[number], options or {})
-        return self._lockstep.features(), {}
+            self.lockstep.begin(number, self._randoms[number], options or {})
+        return self.lockstep.features(), {}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One decision of every world, `actions` (worlds, actions) in [-1, 1]."""
-        lockstep = self._lockstep
+        lockstep = self.lockstep
         actions = _checked(actions, (self.num_envs, *(self.single_action_space.shape or ())))
         reward, terminated, truncated, infos = lockstep.decide(actions)
         features, ended = lockstep.features(), terminated | truncated
@@ -200,7 +209,7 @@ class GymnasiumWorlds(VectorEnv):
             final = np.full(self.num_envs, None, object)
             for number in np.flatnonzero(ended).tolist():
                 final[number] = features[number]
-                lockstep.reset(number, self._randoms[number], {})
+                lockstep.begin(number, self._randoms[number], {})
             infos |= {"final_obs": final, "_final_obs": ended}
             features = lockstep.features()
         return features, reward, terminated, truncated, infos
@@ -209,7 +218,7 @@ class GymnasiumWorlds(VectorEnv):
         """A picture (height, width, 3) uint8 of each world, with the render mode "rgb_array"."""
         if self.render_mode is None:
             return None
-        return tuple(world.render() for world in self._lockstep.worlds)
+        return tuple(world.render() for world in self.lockstep.worlds)
 
 
 class GymnasiumWorld(gymnasium.Env):
@@ -225,9 +234,9 @@ class GymnasiumWorld(gymnasium.Env):
         every: int,
         render_mode: str | None = None,
     ):
-        self._lockstep = _Lockstep([world], task, law, every)
-        self.observation_space = self._lockstep.observation_space
-        self.action_space = self._lockstep.action_space
+        self.lockstep = Lockstep([world], task, law, every)
+        self.observation_space = self.lockstep.observation_space
+        self.action_space = self.lockstep.action_space
         self.render_mode = render_mode
 
     def reset(
@@ -235,20 +244,20 @@ class GymnasiumWorld(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """The first observation (features,) float32; `options` go to the world's reset."""
         super().reset(seed=seed)
-        self._lockstep.reset(0, self.np_random, options or {})
-        return self._lockstep.features()[0], {}
+        self.lockstep.begin(0, self.np_random, options or {})
+        return self.lockstep.features()[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One decision, (actions,) in [-1, 1]."""
         action = _checked(action, self.action_space.shape or ())
-        reward, terminated, truncated, told = self._lockstep.decide(action[None])
+        reward, terminated, truncated, told = self.lockstep.decide(action[None])
         info = {name: values.tolist()[0] for name, values in told.items()}
-        features = self._lockstep.features()[0]
+        features = self.lockstep.features()[0]
         return features, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:
         """A picture (height, width, 3) uint8, with the render mode "rgb_array"."""
-        return None if self.render_mode is None else self._lockstep.worlds[0].render()
+        return None if self.render_mode is None else self.lockstep.worlds[0].render()
 
 
 def _checked(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from palpate.commands import identify, record
-from palpate.commands.identify.data import read
+from palpate.commands.identification.data import read
 from palpate.experiments.experiment import Experiment
 from palpate.families.contact.touch_options import IdentifyContact, RecordContact
 from palpate.families.options import Method

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from palpate.commands.identify.draws import LEVEL
+from palpate.commands.identification.draws import LEVEL
 from palpate.families.furniture.recording import POSE, WRENCH, prune_contacts, starting_furniture
 from palpate.families.furniture.structures import structures
 from palpate.identification.data.segments import Segments, cut, difference

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import identify
-from palpate.commands.identify.fit import CORRECTION
+from palpate.commands.identification.fit import CORRECTION
 from palpate.experiments.experiment import Experiment
 from palpate.experiments.rope.model import GRIPPED, RATE, captures, seen_capture
 from palpate.experiments.rope.simulated import simulated

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.commands.identify.data import read
+from palpate.commands.identification.data import read
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, share_of
 from palpate.experiments.rope.numpy_rope import drawn, recorded

@@ -2,6 +2,7 @@
 
 from palpate.family import Family
 
+_MAZE = "palpate.families.contact.maze_options"
 _TOUCH = "palpate.families.contact.touch_options"
 
 FAMILY = Family(
@@ -11,6 +12,8 @@ FAMILY = Family(
     options={
         "record": {"contact": f"{_TOUCH}:RecordContact"},
         "identify": {"contact": f"{_TOUCH}:IdentifyContact"},
+        "train": {"maze": f"{_MAZE}:TrainMaze"},
+        "evaluate": {"maze": f"{_MAZE}:EvaluateMaze"},
     },
     experiments={
         "contact-model": "palpate.experiments.contact.contact_model:reproduce",

@@ -51,8 +51,9 @@ def advance(
     """One step of all: the transitions, what is seen then, and what else was told of each.
 
     Actions lie in [-1, 1], which is stretched onto the environments' bounds. Told are "ended"
-    (bool), "end" (how, "" where it goes on or nothing says so) and "force" (N, the greatest in the
-    step; NaN where nothing says so), each (environments,).
+    (bool), "end" (how, "" where it goes on or nothing says so), "force" (N, the greatest in the
+    step) and "progress" (share of the way behind it; both NaN where nothing says so), each
+    (environments,).
 
     Raises `PalpateError` for observations, rewards and costs that are not finite.
     """
@@ -76,8 +77,11 @@ def advance(
         np.asarray(terminated, np.float32),
     )
     end = _told(infos, "end", ended, np.full(len(ended), "", object))
-    force = _told(infos, "force", ended, np.full(len(ended), np.nan))
-    return lived, _finite("observation", after), {"ended": ended, "end": end, "force": force}
+    told = {
+        name: _told(infos, name, ended, np.full(len(ended), np.nan))
+        for name in ("force", "progress")
+    }
+    return lived, _finite("observation", after), {"ended": ended, "end": end, **told}
 
 
 def _told(infos: dict[str, Any], name: str, ended: np.ndarray, default: np.ndarray) -> np.ndarray:

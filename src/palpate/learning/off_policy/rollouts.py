@@ -58,8 +58,9 @@ def evaluate(
 ) -> dict[str, np.ndarray]:
     """What exactly `episodes` episodes gave, each array (episodes,).
 
-    "return", "cost" (sums), "length" (decisions), "end" (how, "" if the environments do not say)
-    and "force" (the greatest of the episode, NaN if they do not say). `act` gives actions
+    "return", "cost" (sums), "length" (decisions), "end" (how, "" if the environments do not say),
+    "force" (the greatest of the episode) and "progress" (in the end; both NaN if they do not say).
+    `act` gives actions
     (environments, actions) in [-1, 1] for observations (environments, features).
 
     Which environment plays how many is settled beforehand, in turns: were the first to end the ones
@@ -73,7 +74,8 @@ def evaluate(
         raise PalpateError(f"{episodes} episodes were asked for: expected at least one")
     count = environments.num_envs
     found = {name: np.zeros(episodes) for name in ("return", "cost", "length")}
-    found["force"], found["end"] = np.full(episodes, np.nan), np.full(episodes, "", object)
+    found |= {name: np.full(episodes, np.nan) for name in ("force", "progress")}
+    found["end"] = np.full(episodes, "", object)
     playing = np.arange(count)  # the number of the episode that each environment plays
     observation, due = begun(environments, seed, 0), iter(watch(range(episodes)))
     while np.any(playing < episodes):
@@ -85,6 +87,7 @@ def evaluate(
         found["cost"][those] += np.asarray(lived.cost)[counts]
         found["length"][those] += 1
         found["force"][those] = np.fmax(found["force"][those], told["force"][counts])
+        found["progress"][those] = told["progress"][counts]
         over = counts & told["ended"]
         found["end"][playing[over]] = told["end"][over]
         playing[over] += count

@@ -14,11 +14,12 @@ from palpate.worlds.maze.scene import REFERENCE_HEIGHT
 # Papers print what a reward is made of (progress to the goal, a penalty of force, one for leaving
 # by the entrance, a bonus at the goal), but no number of it: these are our own.
 HORIZON = 500  # decisions, as printed
-PROGRESS = 10.0  # per m of the way to the goal, around walls: the whole way is worth about 6
-DECISION_COST = 0.01  # so that standing still for the whole horizon costs about as much
-FORCE_COST = 0.02  # of the force limit, squared: pushing the obstacle may cost a fifth of a bonus
-GOAL_BONUS = 5.0
-ENTRANCE_COST = 2.0  # twice what standing still costs in the long run, so that none walks out
+PROGRESS = 50.0  # per m of the way to the goal, around walls: the whole way is worth about 35
+FORCE_COST = 0.025  # of the force limit, squared: to push the obstacle for 30 decisions costs 0.5
+GOAL_BONUS = 25.0
+ENTRANCE_COST = 10.0
+# Time costs nothing but the discount: where standing still is worse than nothing, a violation,
+# which ends it, would be the way out.
 
 # What brings features to about 1.
 WRENCH_SCALE = np.array([FORCE_LIMIT] * 3 + [FORCE_LIMIT * REFERENCE_HEIGHT] * 3)
@@ -48,7 +49,7 @@ class MazeTask(WorldTask):
         """What the decision brought, by the way to the goal in the world's frame."""
         layout = before.layout
         way = layout.distance(np.stack([before.position, after.position]))
-        reward = PROGRESS * (way[0] - way[1]) - DECISION_COST
+        reward = PROGRESS * (way[0] - way[1])
         reward -= FORCE_COST * (after.peak_force / self.force_limit) ** 2
         ended = self.end(after)
         return float(
@@ -60,6 +61,10 @@ class MazeTask(WorldTask):
 
     def force(self, truth: TipTruth) -> float:
         return truth.peak_force
+
+    def progress(self, first: TipTruth, truth: TipTruth) -> float:
+        way = first.layout.distance(np.stack([first.position, truth.position]))
+        return float(1.0 - way[1] / way[0])
 
     def end(self, truth: TipTruth) -> str:
         x, y = float(truth.position[0]), float(truth.position[1])

@@ -39,5 +39,8 @@ class NavigationTask(WorldTask):
     def force(self, truth: PointTruth) -> float:
         return 0.0
 
+    def progress(self, first: PointTruth, truth: PointTruth) -> float:
+        return 1.0 - math.hypot(*truth.position) / math.hypot(*first.position)
+
     def end(self, truth: PointTruth) -> str:
         return "goal" if math.hypot(*truth.position) < GOAL_RADIUS else ""

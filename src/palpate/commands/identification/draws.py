@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.identify.tables import (
+from palpate.commands.identification.tables import (
     doubted,
     informed_parameters,
     or_none,

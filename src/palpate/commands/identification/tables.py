@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.identify.data import Data
+from palpate.commands.identification.data import Data
 from palpate.identification.verdicts import uninformed
 from palpate.models.model import Model
 from palpate.report.evidence import parameter_of

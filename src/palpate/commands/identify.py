@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.identify import draws, fit, tables
-from palpate.commands.identify.data import Data, read
+from palpate.commands.identification import draws, fit, tables
+from palpate.commands.identification.data import Data, read
 from palpate.errors import DoubtfulResultError, PalpateError
 from palpate.families.options import Hypotheses, Identify
 from palpate.identification.declarations import with_values_of

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.commands.identify.data import Data
-from palpate.commands.identify.tables import (
+from palpate.commands.identification.data import Data
+from palpate.commands.identification.tables import (
     doubted,
     informed_parameters,
     or_none,

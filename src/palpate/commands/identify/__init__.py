@@ -1,3 +1,0 @@
-"""`palpate identify`."""
-
-from palpate.commands.identify.command import run as run

@@ -1,0 +1,36 @@
+"""What counts of episodes in a maze."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from palpate.runs import Figure
+from palpate.trials.trial import wilson_interval
+
+GOAL, VIOLATION = "goal", "violation"
+
+
+def figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
+    """Shares of episodes that reached the goal and that violated the limit, and how they went.
+
+    `episodes` are as `palpate.learning.off_policy.evaluate` gives them. Success is to reach the
+    goal, which no violation lets happen.
+    """
+    end, count = episodes["end"], len(episodes["end"])
+    found = []
+    for name, which, better in (
+        ("success_rate", GOAL, "higher"),
+        ("violation_rate", VIOLATION, "lower"),
+    ):
+        number = int(np.sum(end == which))
+        low, high = wilson_interval(number, count)
+        found.append(
+            Figure(f"{name}{suffix}", number / count, "", better=better, spread=(high - low) / 2)
+        )
+    arrived = episodes["length"][end == GOAL]
+    return [
+        *found,
+        Figure(f"progress{suffix}", float(episodes["progress"].mean()), "", better="higher"),
+        Figure(f"decisions_to_goal{suffix}", float(arrived.mean()) if len(arrived) else None, ""),
+        Figure(f"greatest_force_n{suffix}", float(np.median(episodes["force"])), "N"),
+    ]

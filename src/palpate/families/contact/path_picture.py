@@ -1,0 +1,174 @@
+"""One episode in a maze, to look at: way, stiffness and force along it, as picture and film."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from matplotlib.patches import Circle, Ellipse, Rectangle
+from matplotlib.transforms import Affine2D
+
+from palpate.networks.guarded import ActorPolicy, GuardedPolicy
+from palpate.report.picture import canvas_of, save_animation, save_picture
+from palpate.worlds.gymnasium import GymnasiumWorlds
+from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
+
+PICTURE, FILM = "path.png", "rendering.webp"
+_INK, _WALL, _BLOCK, _WAY, _FORCE = "#1c2127", "#8a94a0", "#e8a33d", "#0062a8", "#c04d00"
+_GOAL = "#007a59"
+_STIFFEST = 0.022  # m: how long an ellipse's half axis is drawn at the greatest stiffness
+_NEWTON = 0.0025  # m of an arrow for each N
+_EVERY = 4  # decisions from one ellipse to the next
+_WHOLE = {"shrinkA": 0, "shrinkB": 0}
+_SETTINGS: Any = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What happened in one, at each of its decisions; positions in the world."""
+
+    layout: Layout
+    period: float  # s, of a decision
+    force_limit: float  # N
+    end: str
+    position: np.ndarray  # (decisions, 2) m, at the decision
+    block: np.ndarray  # (decisions,) m by which the obstacle has been pushed
+    stiffness: np.ndarray  # (decisions, 2, 2) N/m
+    force: np.ndarray  # (decisions, 2) N, at the decision
+    greatest: np.ndarray  # (decisions,) N, within it
+    risk: np.ndarray | None  # (decisions,) of what the policy proposed
+
+
+def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Episode:
+    """The episode that the seed begins, of an environment with one world."""
+    observation, _ = environment.reset(seed=seed)
+    inside: Any = environment.lockstep
+    (world,), task, law = inside.worlds, inside.task, inside.law
+    layout, end, rows = world.truth().layout, "", []
+
+    @jax.jit
+    def decide(observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        risk = jnp.full(1, jnp.nan)
+        if isinstance(policy, GuardedPolicy):
+            risk = policy.risk(observation, policy.propose(observation))
+        return risk, policy(None, observation)[1]
+
+    while not end:
+        truth = world.truth()
+        risk, action = (np.asarray(one) for one in decide(jnp.asarray(observation)))
+        observation, _, _, _, infos = environment.step(action)
+        end = infos["end"][0]
+        felt = infos["force"][0]
+        before = truth.position[:2], truth.obstacle, truth.force[:2]
+        rows.append((*before, law.stiffness[0].copy(), felt, float(risk[0])))
+    position, block, force, stiffness, greatest, risk = map(np.array, zip(*rows, strict=True))
+    period = inside.every * world.control_period
+    risk = None if np.isnan(risk).all() else risk
+    return Episode(
+        layout, period, task.force_limit, end, position, block, stiffness, force, greatest, risk
+    )
+
+
+def show_path(folder: Path, policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> None:
+    """Draw the first episode of the seed, which was not chosen, into the run's folder."""
+    episode = watched(policy, environment, seed)
+    environment.close()
+    path_picture(folder / PICTURE, episode)
+    film(folder / FILM, episode)
+
+
+def path_picture(out: Path, episode: Episode) -> None:
+    """The way with ellipses of stiffness and arrows of force; beside it force and risk."""
+    time = episode.period * np.arange(len(episode.position))
+    with matplotlib.rc_context(_SETTINGS):
+        canvas = canvas_of(9.0, 3.9)
+        panels = canvas.subplot_mosaic([["way", "force"], ["way", "last"]], width_ratios=[1.35, 1])
+        _draw_maze(panels["way"], episode.layout, episode.block[-1])
+        _draw_way(panels["way"], episode, len(time))
+        force, last = panels["force"], panels["last"]
+        force.plot(time, episode.greatest, color=_FORCE, lw=1)
+        force.axhline(episode.force_limit, color=_INK, lw=1, ls=(0, (4, 3)))
+        force.annotate(
+            f"limit {episode.force_limit:g} N", (time[-1], episode.force_limit), ha="right",
+            va="bottom", color=_INK,
+        )  # fmt: skip
+        force.set(ylabel="greatest force (N)", ylim=(0, 1.2 * episode.force_limit))
+        if episode.risk is None:
+            along, across = principal(episode)
+            last.semilogy(time, along, color=_WAY, lw=1.2, label="stiffer axis")
+            last.semilogy(time, across, color=_WAY, lw=1.2, ls=(0, (4, 3)), label="softer axis")
+            last.legend(frameon=False, loc="upper left")
+            last.set(ylabel="stiffness (N/m)")
+        else:
+            last.plot(time, episode.risk, color=_WAY, lw=1)
+            last.set(ylabel="risk of what is proposed", ylim=(0, 1))
+        last.set(xlabel="time (s)")
+        save_picture(out, canvas)
+
+
+def film(out: Path, episode: Episode) -> None:
+    """The same way as it went, a frame for every second decision, about as fast as it was."""
+    from PIL import Image
+
+    pictures = []
+    with matplotlib.rc_context(_SETTINGS):
+        for count in [*range(1, len(episode.position), 2), len(episode.position)]:
+            canvas = canvas_of(5.2, 4.3, dpi=80)
+            axis = canvas.subplots()
+            _draw_maze(axis, episode.layout, episode.block[count - 1])
+            _draw_way(axis, episode, count, last=True)
+            pictures.append(_image(canvas, Image))
+    save_animation(out, pictures, round(2000 * episode.period), quality=70)
+
+
+def principal(episode: Episode) -> tuple[np.ndarray, np.ndarray]:
+    """The greater and the lesser of each decision's two stiffnesses, N/m."""
+    values = np.linalg.eigvalsh(episode.stiffness)
+    return values[:, 1], values[:, 0]
+
+
+def _image(canvas: Any, image: Any) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    drawn = FigureCanvasAgg(canvas)
+    drawn.draw()
+    return image.fromarray(np.asarray(drawn.buffer_rgba())[..., :3].copy())
+
+
+def _draw_maze(axis: Any, layout: Layout, pushed: float) -> None:
+    boxes = [(wall.position, wall.half_sizes, wall.yaw, _WALL) for wall in layout.walls]
+    x, y = layout.obstacle.position
+    boxes.append(((x + pushed, y), layout.obstacle.half_sizes, 0.0, _BLOCK))
+    for (x, y), (width, height), yaw, colour in boxes:
+        box = Rectangle((-width, -height), 2 * width, 2 * height, fc=colour, ec="none")
+        box.set_transform(Affine2D().rotate(yaw).translate(x, y) + axis.transData)
+        axis.add_patch(box)
+    axis.add_patch(Circle(layout.goal, layout.goal_radius, fc="none", ec=_GOAL, lw=1.5))
+    axis.annotate("goal", layout.goal, ha="center", va="center", color=_GOAL)
+    width, height = ARENA
+    axis.set(xlim=(-width - 0.02, width + 0.02), ylim=(-height - 0.02, height + 0.02))
+    axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+
+
+def _draw_way(axis: Any, episode: Episode, count: int, last: bool = False) -> None:
+    way = episode.position[:count]
+    axis.plot(*way.T, color=_WAY, lw=1.2)
+    axis.add_patch(Circle(tuple(way[-1]), TIP_RADIUS, fc=_WAY, ec="none", alpha=0.6))
+    shown = [count - 1] if last else range(0, count, _EVERY)
+    values, axes = np.linalg.eigh(episode.stiffness)
+    scale = 2 * _STIFFEST / np.sqrt(1000.0)
+    for number in shown:
+        turn = np.degrees(np.arctan2(axes[number, 1, 1], axes[number, 0, 1]))
+        softer, stiffer = scale * np.sqrt(np.maximum(values[number], 0.0))
+        axis.add_patch(
+            Ellipse(tuple(way[number]), stiffer, softer, angle=turn, fc="none", ec=_INK, lw=0.5)
+        )
+        force = _NEWTON * episode.force[number]
+        if np.hypot(*force) > 1e-3:
+            axis.annotate(
+                "", way[number] + force, way[number],
+                arrowprops={"arrowstyle": "-|>", "color": _FORCE, "lw": 0.8} | _WHOLE,
+            )  # fmt: skip

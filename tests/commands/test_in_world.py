@@ -1,0 +1,103 @@
+"""`palpate train` and `palpate evaluate` of what learns in a world, on a tiny budget."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from palpate.commands import evaluate, train
+from palpate.errors import PalpateError
+from palpate.families.contact import methods
+from palpate.families.contact.episodes import figures
+from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
+from palpate.networks.guarded import GuardedPolicy, load_actor
+from palpate.runs.result import read_result
+from palpate.runs.run import RESULT
+from palpate.tasks.maze.maze import MazeTask
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Episodes of six decisions, and few of everything."""
+    monkeypatch.setattr(MazeTask, "horizon", 6)
+    monkeypatch.setattr(TrainMaze, "tried", 3)
+    monkeypatch.setattr(methods, "PRETRAINING_UPDATES", 2)
+
+    def training_of(steps, method, real=methods.training_of):
+        return dataclasses.replace(real(steps, method), batch=8, capacity=200)
+
+    monkeypatch.setattr(methods, "training_of", training_of)
+
+
+def test_a_policy_is_trained_kept_tried_and_evaluated_again(short, tmp_path, capsys):
+    options = TrainMaze(steps=24, environments=2, out=tmp_path / "trained", seed=3)
+    folder = train.run(options)
+    result = read_result(folder / RESULT)
+    found = {figure.name: figure.value for figure in result.figures}
+    assert found["pretraining.steps"] == 24
+    assert found["training.episodes"] == 4  # two side by side, each twice of six decisions
+    assert 0 <= found["success_rate.tried"] <= 1
+    assert (folder / "path.png").exists()
+    assert (folder / "rendering.webp").exists()
+    policy, manifest = load_actor(folder / "policy.safetensors")
+    assert isinstance(policy, GuardedPolicy)
+    assert policy.guard.seen == methods.WRENCH
+    assert manifest["options"]["method"] == "srl-vic"
+    assert manifest["constants"]["world.force_limit"] == 26
+    train.run(options)  # finished: it is only read
+    asked = EvaluateMaze(policy=folder, episodes=2, mazes=("unseen-1",), out=tmp_path / "evaluated")
+    evaluate.run(asked)
+    said = capsys.readouterr().out
+    assert "tried in the maze unseen-1" in said
+    assert "held still" in said
+    values = {f.name: f.value for f in read_result(tmp_path / "evaluated" / RESULT).figures}
+    assert values["success_rate.held_still"] == 0
+
+
+def test_a_policy_of_another_task_is_refused(short, tmp_path):
+    folder = train.run(
+        TrainMaze(method="no-recovery", steps=12, environments=2, out=tmp_path / "trained")
+    )
+    options = EvaluateMaze(policy=folder, episodes=2, out=tmp_path / "evaluated")
+    object.__setattr__(options, "task", "rope-stabilization")
+    with pytest.raises(PalpateError, match="was trained for 'maze', not for rope-stabilization"):
+        evaluate.run(options)
+
+
+def test_every_method_is_made_of_the_same_agent():
+    agents = {name: make() for name, make in methods.METHODS.items()}
+    task = agents["no-recovery"].agent
+    guarded = {name for name, one in agents.items() if one.guarded}
+    assert guarded == set(agents) - {"no-recovery", "lagrangian", "penalty"}
+    for one in agents.values():
+        own = one.agent.task if one.guarded else getattr(one.agent, "agent", one.agent)
+        assert own == task
+    assert agents["k300"].stiffness == 300
+    assert agents["srl-vic"].stiffness is None
+    with pytest.raises(PalpateError, match="unknown method 'sac'; there are: srl-vic, "):
+        methods.method_named("sac")
+
+
+def test_scripted_collisions_keep_their_direction_for_a_while():
+    script, random = methods.ScriptedCollisions(), np.random.default_rng(0)
+    seen, fresh = np.zeros((3, 9)), np.ones(3, bool)
+    actions = np.stack([script(seen, fresh & (step == 0), random) for step in range(60)])
+    assert np.abs(actions).max() <= 1
+    changes = (np.diff(actions, axis=0) != 0).any(-1).sum(0)
+    assert (changes >= 60 // methods.HELD[1]).all()
+    assert (changes <= 60 // methods.HELD[0]).all()
+
+
+def test_figures_count_goals_and_violations():
+    episodes = {
+        "end": np.array(["goal", "goal", "violation", "horizon"], object),
+        "length": np.array([40.0, 60, 10, 500]),
+        "progress": np.array([1.0, 1, 0.2, 0.6]),
+        "force": np.array([20.0, 22, 27, 10]),
+    }
+    found = {figure.name: figure.value for figure in figures(episodes, ".x")}
+    assert found["success_rate.x"] == 0.5
+    assert found["violation_rate.x"] == 0.25
+    assert found["decisions_to_goal.x"] == 50
+    assert found["progress.x"] == pytest.approx(0.7)
+    assert found["greatest_force_n.x"] == 21

@@ -41,11 +41,7 @@ def test_figures_are_medians_and_the_share_of_intervals_that_hold(tmp_path, monk
             value = true + 5e-4 if name == "position" else 1.05 * true
             low, high = value - 0.1 * np.abs(true), value + 0.1 * np.abs(true)
             high = 0.99 * true if drawn and name == "friction" else high
-            if drawn:
-                rows += [{"name": f"{name}[{i}]", "value": value[i], "lower": low[i],
-                          "upper": high[i]} for i in range(2)]  # fmt: skip
-            else:
-                rows.append({"name": name, "value": value, "lower": low, "upper": high})
+            rows.append({"name": name, "value": value, "lower": low, "upper": high})
         result = Result("x", [Figure("wall_time_s", 3.0, "s")], {}, [0], None, 3.0, parameters=rows)
         write_json(options.out / "result.json", result.to_dict())
         return options.out

@@ -113,18 +113,11 @@ def judged(result: Result, hidden: Plates, centre: Float[np.ndarray, "2"]) -> Ou
     rows = {row["name"]: row for row in result.parameters}
     truth = truth_of(hidden, centre)
     value, lower, upper = (
-        {of: np.asarray(values_of(rows, of, key)) for of in FOUND}
+        {of: np.asarray(rows[of][key], float) for of in FOUND}
         for key in ("value", "lower", "upper")
     )
     held = {of: (lower[of] <= true) & (true <= upper[of]) for of, true in truth.items()}
     return Outcome(errors(value, truth), held)
-
-
-def values_of(rows: dict[str, dict[str, Any]], name: str, key: str) -> list[float]:
-    """Of each wall: draws have a row for each element, a fit one for all."""
-    if name in rows:
-        return np.ravel(rows[name][key]).tolist()
-    return [rows[f"{name}[{wall}]"][key] for wall in range(len(NOMINAL))]
 
 
 def errors(value: Walls, truth: Walls) -> Walls:

@@ -45,7 +45,7 @@ def trained_in_world(options: TrainInWorld, run: Run) -> tuple[ActorPolicy, list
     """The policy that is trained in `run`, which keeps it; and what the training cost."""
     path = run.path / folders.POLICY
     offline = options.collected()
-    environments = options.make(options.environments)
+    environments = options.make_for_training()
     try:
         state = train_off_policy(
             environments,

@@ -49,6 +49,10 @@ class TrainInWorld(Options, ABC):
     def make(self, count: int) -> VectorEnv:
         """So many environments side by side."""
 
+    def make_for_training(self) -> VectorEnv:
+        """Those that it is trained in, which may begin where a task does not."""
+        return self.make(self.environments)
+
     @abstractmethod
     def agent(self) -> Agent:
         """What learns."""

@@ -37,19 +37,23 @@ def maze_law(constant_stiffness: float | None = None) -> ImpedanceLaw:
 def _maze_parts(
     layouts: Sequence[str | Layout] = ("home",),
     noise: float = 1.0,
-    scattered: bool = False,
+    scattered: float = 0.0,
     constant_stiffness: float | None = None,
     decision_period: float = DECISION_PERIOD,
     count: int = 1,
 ) -> tuple[list[BlindMaze], MazeTask, ImpedanceLaw, int]:
-    worlds = [BlindMaze(layouts, noise=noise, scattered=scattered) for _ in range(count)]
+    worlds = [
+        BlindMaze(layouts, noise=noise, scattered=number < scattered * count)
+        for number in range(count)
+    ]
     every = max(1, round(decision_period / worlds[0].control_period))
     return worlds, MazeTask(), maze_law(constant_stiffness), every
 
 
 def blind_maze(render_mode: str | None = None, **options: Any) -> GymnasiumWorld:
-    """One blind maze. `options`: `layouts`, `noise` and `scattered` as `BlindMaze` has
-    them, `constant_stiffness` as `ImpedanceLaw`, `decision_period` in s."""
+    """One blind maze. `options`: `layouts` and `noise` as `BlindMaze` has them, `scattered`, the
+    share of the worlds side by side that begin anywhere, `constant_stiffness` as `ImpedanceLaw`,
+    `decision_period` in s."""
     worlds, task, law, every = _maze_parts(**options)
     return GymnasiumWorld(worlds[0], task, law, every, render_mode)
 

@@ -49,14 +49,22 @@ class TrainMaze(TrainInWorld):
     noise: float = 1.0
     """Of the sensors, as a multiple of what the world has; 0: none."""
 
-    def make(self, count: int) -> GymnasiumWorlds:
+    def make(self, count: int, scattered: float = 0.0) -> GymnasiumWorlds:
         from palpate.families.contact.environments import blind_mazes
         from palpate.families.contact.methods import method_named
 
-        stiffness = method_named(self.method).stiffness
         return blind_mazes(
-            count, layouts=self.mazes, noise=self.noise, constant_stiffness=stiffness
+            count,
+            layouts=self.mazes,
+            noise=self.noise,
+            scattered=scattered,
+            constant_stiffness=method_named(self.method).stiffness,
         )
+
+    def make_for_training(self) -> GymnasiumWorlds:
+        from palpate.families.contact.methods import SCATTERED
+
+        return self.make(self.environments, SCATTERED)
 
     def agent(self) -> Agent:
         from palpate.families.contact.methods import method_named
@@ -78,7 +86,7 @@ class TrainMaze(TrainInWorld):
 
         if not method_named(self.method).guarded:
             return None
-        environments = self.make(self.environments)
+        environments = self.make(self.environments, scattered=1.0)
         try:
             steps = min(PRETRAINING_STEPS, self.steps)
             return collect(environments, ScriptedCollisions(), steps, self.seed)

@@ -36,6 +36,7 @@ VIOLATION_PRICE = (
 )
 COST_LIMIT = 0.02  # Lagrangian: violations an episode
 PRETRAINING_STEPS, PRETRAINING_UPDATES = 20_000, 5_000
+SCATTERED = 0.5  # share of the episodes of a training that begin anywhere on the way to the goal
 HELD = (3, 15)  # decisions for which a scripted collision keeps its direction
 
 OBSERVATIONS = (  # each as a share of what `palpate.tasks.maze.maze` divides it by

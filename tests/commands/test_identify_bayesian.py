@@ -8,7 +8,8 @@ import pytest
 
 from bayesian_toys import NOISE, Sled
 from palpate.commands import identify
-from palpate.commands.identify import tables
+from palpate.commands.identification import draws as of_draws
+from palpate.commands.identification import tables
 from palpate.errors import PalpateError
 from palpate.families.furniture.options import IdentifyFurniture
 from palpate.families.furniture.recording import POSE, WRENCH
@@ -104,18 +105,18 @@ def test_the_error_of_what_nobody_saw_is_said_to_be_unknown(capsys):
     draws = Draws(position, np.zeros((2, 20)), np.ones(2), 0, 40, 1.0, 0.0)
     posterior = Posterior(Settled(target, ()), draws, pieces)
     found = score(target, predicted, pieces)
-    figures = draws.drawn_figures(posterior, found, SLED, 1.0, "m, m, rad")
+    figures = of_draws.drawn_figures(posterior, found, SLED, 1.0, "m, m, rad")
     values = {figure.name: figure.value for figure in figures}
     assert values["rmse_m"] == pytest.approx(np.sqrt((14 * 3**2 + 4 * 6**2) / 18))
     assert values["rmse_rad"] is None
     settings = {"structure": "sled", "scored_on": "what was fitted", "doubts": []}
-    rows = draws.drawn_rows(posterior)
-    settings["summary"] = draws.summary_of_draws(figures, settings, rows)
+    rows = of_draws.drawn_rows(posterior)
+    settings["summary"] = of_draws.summary_of_draws(figures, settings, rows)
     tables.show(Result("x", figures, settings, [0], None, 1.0, parameters=rows))
     said = capsys.readouterr().out
     assert f"within {values['rmse_m']:.4g} m and unknown (root" in said
     assert "of what was seen, too little to rely on them. The data" in said  # 3 m off, noise of 1 m
-    horizon = draws.expected_errors(predicted, pieces, SLED)
+    horizon = of_draws.expected_errors(predicted, pieces, SLED)
     for name in ("horizon.error", "horizon.expected"):
         assert np.isfinite(horizon[name]).tolist() == [True] * 7 + [False]
     assert horizon["horizon.error"][6] == pytest.approx(3.0)

@@ -130,7 +130,10 @@ def test_one_interrupt_ends_the_loop_and_the_simulated_robot(tmp_path):
     pytest.importorskip("zenoh")
     own_policy()
     words = "-m palpate serve policy.safetensors --simulate --seconds 40 --out served"
+    # Where the tests run in the background their shell has them ignore it, and all they start.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     loop = subprocess.Popen([sys.executable, *words.split()], stdout=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
     try:
         assert loop.stdout is not None
         said = []

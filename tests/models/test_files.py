@@ -18,6 +18,8 @@ from toys import Cart
 
 REMOVED = object()
 
+KNOWN = "there are: tip, planar, rope"
+
 
 def rope() -> Rope:
     """Nothing in it is a default, and no two elements are equal."""
@@ -127,7 +129,7 @@ def test_a_model_that_nobody_could_read_again_is_not_saved(tmp_path):
         save_model(tmp_path / "model.json", Hidden(1.0, 0.5))
     assert str(error.value) == (
         "a model of type Hidden cannot be saved: expected a class at the top of a Python file, or "
-        "one of planar, rope"
+        "one of tip, planar, rope"
     )
     assert not (tmp_path / "model.json").exists()
 
@@ -183,9 +185,9 @@ def test_other_json_is_no_model(file, text):
         (("version",), [1], "FILE has version [1]; this palpate reads versions 1 and 2"),
         (("version",), True, "FILE has version True; this palpate reads versions 1 and 2"),
         (("version",), REMOVED, "FILE has version None; this palpate reads versions 1 and 2"),
-        (("model",), "string", "FILE holds the unknown model 'string'; there are: planar, rope"),
-        (("model",), ["rope"], "FILE holds the unknown model '['rope']'; there are: planar, rope"),
-        (("model",), REMOVED, "FILE holds the unknown model 'None'; there are: planar, rope"),
+        (("model",), "string", f"FILE holds the unknown model 'string'; {KNOWN}"),
+        (("model",), ["rope"], f"FILE holds the unknown model '['rope']'; {KNOWN}"),
+        (("model",), REMOVED, f"FILE holds the unknown model 'None'; {KNOWN}"),
         (
             ("value", "node_mass"),
             [-0.01, *[0.01] * 5],

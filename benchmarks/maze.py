@@ -11,10 +11,8 @@ the buffer counts in both. `train_steps_per_s` are decisions of a whole training
 second step, in environments that cost next to nothing.
 """
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -24,6 +22,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from benchmarks import run
 from palpate.errors import PalpateError, extra_module
 from palpate.learning.off_policy import (
     OffPolicyTraining,
@@ -36,7 +35,6 @@ from palpate.learning.off_policy.buffer import ReplayBuffer
 from palpate.learning.off_policy.loop import Compiled
 from palpate.numerics import devices
 from palpate.runs import Figure, Result
-from palpate.runs.storage import write_json
 
 FEATURES, ACTIONS = 9, 4  # of the maze's task
 BATCH, WIDTH, DEPTH, FILLED = 256, 256, 2, 100_000
@@ -223,17 +221,5 @@ def benchmark(quick: bool = False) -> Result:
     )
 
 
-def main() -> None:
-    """Print the figures, and write them with `--out`."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--quick", action="store_true", help="fewer rounds")
-    options = parser.parse_args()
-    result = benchmark(options.quick)
-    print("\n".join(result.lines()))
-    if options.out:
-        write_json(options.out, result.to_dict())
-
-
 if __name__ == "__main__":
-    main()
+    run(benchmark, __doc__ or "")

@@ -10,23 +10,21 @@ What is timed: `mj_step` in a loop within one call (`mujoco.rollout` would add t
 our rollouts as a user calls them, over all cores, compiled beforehand. A step is one rope, 1 ms.
 """
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from benchmarks import run
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
 from palpate.numerics import devices
 from palpate.runs import Figure, Result
-from palpate.runs.storage import write_json
 from palpate.tasks.rope import RopeStabilization
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 
@@ -268,17 +266,5 @@ def _figure(name: str, values, unit: str, bar: float | None, better: str) -> Fig
     return Figure(name, float(np.median(values)), unit, bar=bar, better=better, spread=half)
 
 
-def main() -> None:
-    """Print the figures, and write them with `--out`."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--quick", action="store_true", help="fewer rounds")
-    options = parser.parse_args()
-    result = benchmark(options.quick)
-    print("\n".join(result.lines()))
-    if options.out:
-        write_json(options.out, result.to_dict())
-
-
 if __name__ == "__main__":
-    main()
+    run(benchmark, __doc__ or "")

@@ -268,7 +268,9 @@ def test_a_picture_shows_the_maze():
     try:
         picture = world.render(64, 48)
     except PalpateError as error:
-        pytest.skip(str(error))
+        if "needs OpenGL" not in str(error):
+            raise
+        pytest.skip(str(error))  # what no package of Python can bring
     assert picture.shape == (48, 64, 3)
     assert picture.std() > 5
 

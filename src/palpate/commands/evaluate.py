@@ -7,14 +7,14 @@ import jax
 
 from palpate.commands import folders
 from palpate.commands.evaluate_in_world import evaluate_in_world
-from palpate.commands.train import lines_of, named_task
+from palpate.commands.train import named_task
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate, Found
 from palpate.families.world_options import EvaluateInWorld
 from palpate.models.files import load_model
 from palpate.models.model import Model
 from palpate.networks import CommandPolicy, load_policy
-from palpate.runs.figure_names import name_in_words, value_in_words
+from palpate.runs.figure_names import lines_of, name_in_words, value_in_words
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import write_text

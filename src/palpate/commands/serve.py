@@ -13,7 +13,6 @@ import numpy as np
 
 from palpate.commands import folders
 from palpate.commands.options import Serve
-from palpate.commands.train import lines_of
 from palpate.deployment.deployment import Deployment, deployment_of
 from palpate.deployment.intake import MISSING, Intake
 from palpate.deployment.loop import Record, run_loop
@@ -24,6 +23,7 @@ from palpate.errors import PalpateError, StoppedError
 from palpate.family import check_name
 from palpate.networks import CommandPolicy, load_policy
 from palpate.runs import Figure
+from palpate.runs.figure_names import lines_of
 from palpate.runs.progress import Stop, interruptible
 from palpate.runs.storage import write_json
 

@@ -4,7 +4,7 @@ Nothing here knows the task but by its name: `options.prepare` does.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -21,7 +21,7 @@ from palpate.networks import CommandPolicy, load_policy, save_controller
 from palpate.parameters import describe
 from palpate.report import write_evidence
 from palpate.runs import Figure, Run
-from palpate.runs.figure_names import name_in_words, value_in_words
+from palpate.runs.figure_names import lines_of, value_in_words
 from palpate.runs.result import machine, read_result
 from palpate.runs.run import RESULT
 from palpate.tasks.task import Task
@@ -151,12 +151,6 @@ def summary_of(figures: Sequence[Figure], warnings: Sequence[str]) -> list[str]:
         tried = f"In a few trials in a simulated world it succeeds in {value_in_words(outside)}"
     said.append(f"{tried}; it is not to be trusted yet" if warnings else tried)
     return [f"{sentence}." for sentence in said]
-
-
-def lines_of(figures: Iterable[Figure]) -> list[str]:
-    """For a person: what never came is said once, not in each unit."""
-    lines = (f"{name_in_words(figure)}: {value_in_words(figure)}" for figure in figures)
-    return list(dict.fromkeys(lines))
 
 
 def constants(task: Task) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from palpate.learning.off_policy import train_off_policy
 from palpate.networks import save_controller
 from palpate.networks.guarded import ActorPolicy, load_actor
 from palpate.runs import Figure, Run
-from palpate.runs.figure_names import name_in_words, value_in_words
+from palpate.runs.figure_names import lines_of
 from palpate.runs.result import machine, read_result
 from palpate.runs.run import RESULT
 
@@ -85,8 +85,3 @@ def trained_in_world(options: TrainInWorld, run: Run) -> tuple[ActorPolicy, list
         },
     )
     return load_actor(path)[0], figures
-
-
-def lines_of(figures: list[Figure]) -> list[str]:
-    """For a person, one line a figure."""
-    return [f"{name_in_words(figure)}: {value_in_words(figure)}" for figure in figures]

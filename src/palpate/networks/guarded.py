@@ -85,11 +85,13 @@ class ActorPolicy(DeclaredController):
         key: Key[Array, "*batch"] | None = None,
     ) -> tuple[Any, Array]:
         """Nothing to carry, and the action: (*batch, *shape) of one channel, else flat."""
-        return carry, self._shaped(still(self.propose(observation)))
-
-    def _shaped(self, action: Array) -> Array:
+        action = still(self.execute(observation))
         shape = self.actions[0].shape if len(self.actions) == 1 else action.shape[-1:]
-        return action.reshape(*action.shape[:-1], *shape)
+        return carry, action.reshape(*action.shape[:-1], *shape)
+
+    def execute(self, observation: Float[Array, "*batch features"]) -> Array:
+        """What is done of what is proposed, (*batch, actions): here all of it."""
+        return self.propose(observation)
 
     def settings(self, folder: Path) -> dict[str, Any]:
         """See `DeclaredController.settings`: what kind of actor, and its layers."""
@@ -119,17 +121,9 @@ class GuardedPolicy(ActorPolicy):
         """The guard's, of a flat action in [-1, 1]; see `Guard.risk`."""
         return self.guard.risk(observation, action)
 
-    def __call__(
-        self,
-        carry: Any,
-        observation: Float[Array, "*batch features"],
-        goal: Any = None,
-        key: Key[Array, "*batch"] | None = None,
-    ) -> tuple[Any, Array]:
-        """As of `ActorPolicy`, after recovery."""
-        proposed = self.propose(observation)
-        executed = self.guard.overrule(observation, proposed, self.threshold)
-        return carry, self._shaped(still(executed))
+    def execute(self, observation: Float[Array, "*batch features"]) -> Array:
+        """The proposed action (*batch, actions), or the recovery's where it is risky."""
+        return self.guard.overrule(observation, self.propose(observation), self.threshold)
 
     def settings(self, folder: Path) -> dict[str, Any]:
         """See `DeclaredController.settings`: those of the actor, and of the guard."""

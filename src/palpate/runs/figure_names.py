@@ -1,5 +1,7 @@
 """What figures are called when a person reads them; `result.json` keeps their own names."""
 
+from collections.abc import Iterable
+
 from palpate.runs.result import Figure
 
 # Of each part of a name ("in_model.success"), without the unit that it ends in ("time_to_1pct_s").
@@ -58,6 +60,12 @@ def value_in_words(figure: Figure) -> str:
     if figure.value is None:
         return "never" if name_in_words(figure).startswith("time") else "unknown"
     return f"{number_in_words(figure, figure.value)} {figure.unit}".rstrip()
+
+
+def lines_of(figures: Iterable[Figure]) -> list[str]:
+    """For a person: what never came is said once, not in each unit."""
+    lines = (f"{name_in_words(figure)}: {value_in_words(figure)}" for figure in figures)
+    return list(dict.fromkeys(lines))
 
 
 def number_in_words(figure: Figure, number: int | float | str | None) -> str:

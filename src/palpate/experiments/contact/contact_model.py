@@ -34,7 +34,12 @@ SETS, QUICK = 10, 1
 METHODS: dict[str, Method] = {"gradient": "levenberg-marquardt", "posterior": "local-global"}
 MINUTES = {"gradient": 1, "posterior": 4}  # of a set
 NEAR, WRONG, COVERED, COVERED_OVER = 1.0, 0.10, 0.80, 0.98  # the bars; mm and shares
-FOUND = ("position", "stiffness", "friction")
+JUDGED = {  # what is found: how its error is called, in which unit, and its bar
+    "position": ("mm", "mm", NEAR),
+    "stiffness": ("error", "", WRONG),
+    "friction": ("error", "", WRONG),
+}
+FOUND = tuple(JUDGED)
 TOUCHED, SLIDING = 1.5, 0.02  # N and m/s, from which on a textbook counts a frame
 STEEP = 0.8  # tangential over normal force, from which on it is another plate that rubs
 PRIOR = facing(NOMINAL)  # its values are the priors' medians
@@ -72,7 +77,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
                 recordings=(file,), method=method, seed=plates, out=file.parent / name
             )
             result = read_result(identify.run(asked) / RESULT)
-            experiment.seconds += seconds_of(result)
+            experiment.seconds += result.wall_time_s
             found[name].append(judged(result, hidden, centre_of(asked)))
         guesses = prior_of(recording), straight_line(recording)
         for outcomes, guess in zip(rivals.values(), guesses, strict=True):
@@ -167,11 +172,6 @@ def unit(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 2"]:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def seconds_of(result: Result) -> float:
-    """How long an identification took."""
-    return sum(float(f.value or 0.0) for f in result.figures if f.name == "wall_time_s")
-
-
 def figures(found: dict[str, list[Outcome]], rivals: dict[str, list[Outcome]]) -> list[Figure]:
     """Medians over all walls, and how many intervals hold; each rival's own figures after them."""
 
@@ -184,27 +184,21 @@ def figures(found: dict[str, list[Outcome]], rivals: dict[str, list[Outcome]]) -
     listed = []
     for name, outcomes in found.items():
         share = float(np.mean([list(one.held.values()) for one in outcomes]))
-        listed += [
-            Figure(f"{name}.position_mm", median(outcomes, "position"), "mm", NEAR,
-                   rival=beside("position")),
-            Figure(f"{name}.stiffness_error", median(outcomes, "stiffness"), "", WRONG,
-                   rival=beside("stiffness")),
-            Figure(f"{name}.friction_error", median(outcomes, "friction"), "", WRONG,
-                   rival=beside("friction")),
-            Figure(f"{name}.coverage_90", share, "", COVERED, better="higher"),
-            Figure(f"{name}.coverage_90_over", share, "", COVERED_OVER),
-        ]  # fmt: skip
-        for of in FOUND:
-            hit = float(np.mean([one.held[of] for one in outcomes]))
+        for of, (label, unit_of, bar) in JUDGED.items():
             worst = float(np.max([one.error[of] for one in outcomes]))
-            unit_of = "mm" if of == "position" else ""
+            hit = float(np.mean([one.held[of] for one in outcomes]))
+            value = median(outcomes, of)
             listed += [
+                Figure(f"{name}.{of}_{label}", value, unit_of, bar, rival=beside(of)),
                 Figure(f"detail.{name}.{of}.worst", worst, unit_of),
                 Figure(f"detail.{name}.{of}.coverage_90", hit, "", better="higher"),
             ]
+        listed += [
+            Figure(f"{name}.coverage_90", share, "", COVERED, better="higher"),
+            Figure(f"{name}.coverage_90_over", share, "", COVERED_OVER),
+        ]
     for name, outcomes in rivals.items():
-        for of in FOUND:
-            unit_of = "mm" if of == "position" else ""
+        for of, (_, unit_of, _) in JUDGED.items():
             figure = f"rival.{name.replace(' ', '_')}.{of}"
             listed.append(Figure(figure, median(outcomes, of), unit_of))
     return listed

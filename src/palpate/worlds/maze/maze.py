@@ -15,6 +15,7 @@ from palpate.worlds.maze.layout import TIP_RADIUS, Layout, named_layout
 from palpate.worlds.maze.scene import (
     BASE_MASS,
     BLOCK,
+    FEELER,
     REFERENCE_HEIGHT,
     TIME_STEP,
     TIP,
@@ -174,7 +175,7 @@ class BlindMaze(World):
     def _place(self, place: np.ndarray) -> None:
         """A maze's engine with the constants of this episode, the tip at rest on its base."""
         if self._layout not in self._models:
-            model = maze_scene(self._layout).compile()
+            model = self._compiled(self._layout)
             self._models[self._layout] = (model, mujoco.MjData(model))
         model, data = self._model, self._data = self._models[self._layout]
         tip, block = model.body(TIP).id, model.body(BLOCK).id
@@ -184,14 +185,63 @@ class BlindMaze(World):
         inverse_mass = model.body_invweight0[tip, 0] + model.body_invweight0[block, 0]
         model.pair_solref[model.pair(BLOCK).id] = contact_solref(inverse_mass)
         model.pair_friction[:, :2] = self._contact_friction
-        model.dof_frictionloss[4] = self._obstacle_friction
-        offset, speed, _ = self._sway(0.0)
-        data.qpos[:3] = offset, place[0], place[1] - offset
-        data.qvel[0] = speed
-        mujoco.mj_forward(model, data)
+        model.dof_frictionloss[-1] = self._obstacle_friction
         self._position, self._velocity = data.qpos, data.qvel
-        self._applied, self._felt = data.qfrc_applied, data.sensordata
+        self._applied, self._felt = data.qfrc_applied, data.sensor(FEELER).data
         self._constraint, self._tip_place = data.qfrc_constraint, data.xpos[tip]
+        offset, data.qvel[0], _ = self._sway(0.0)
+        data.qpos[0] = offset
+        self._seat(place[0], place[1] - offset)
+        mujoco.mj_forward(model, data)
+
+    # --- what another carrier of the tip does in a way of its own -----------------------------
+
+    _carried = TIP_MASS  # kg on the base
+    # Of the camera: what it looks at (m), how far away it is (m), azimuth and elevation (degrees).
+    _view = (0.0, 0.0, 0.0), 0.75, 90.0, -80.0
+
+    def _compiled(self, layout: Layout) -> mujoco.MjModel:
+        return maze_scene(layout).compile()
+
+    def _seat(self, x: float, y: float) -> None:
+        """Put the tip at (x, y) m relative to the base, at rest."""
+        self._position[1:3] = x, y
+
+    def _advance(self, x: float, y: float, z: float) -> float:
+        """Drive the tip by a force in N for a control period; the greatest horizontal contact
+        force, squared."""
+        model, data, constraint = self._model, self._data, self._constraint
+        self._applied[1:4] = x, y, z
+        peak = 0.0
+        for _ in range(self._substeps):
+            self._applied[0] = self._swaying_force()
+            mujoco.mj_step(model, data)
+            peak = max(peak, constraint.item(1) ** 2 + constraint.item(2) ** 2)
+        return peak
+
+    def _motion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position (3,) m and velocity (3,) m/s of the tip relative to the base."""
+        return self._position[1:4].copy(), self._velocity[1:4].copy()
+
+    def _force(self) -> np.ndarray:
+        """(3,) N: net contact force on the tip, in world axes."""
+        return self._constraint[1:4].copy()
+
+    def _wrench(self) -> np.ndarray:
+        """(6,) N, N m, as `TipObservation` has it, without noise."""
+        wrench = np.zeros(6)
+        if self._data.ncon:
+            # The sensor tells what the tip does, and the point that all contacts act at together.
+            fx, fy, fz, tx, ty, tz, *point = self._felt.tolist()
+            x, y, z = (a - b for a, b in zip(point, self._tip_place.tolist(), strict=True))
+            z -= REFERENCE_HEIGHT
+            wrench[:] = (
+                -fx, -fy, -fz,
+                z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz,
+            )  # fmt: skip
+        return wrench
+
+    # -------------------------------------------------------------------------------------------
 
     def _sway(self, time: float) -> tuple[float, float, float]:
         """Where the base should be, m, how fast, m/s, and its acceleration, m/s^2."""
@@ -199,6 +249,15 @@ class BlindMaze(World):
         angle = rate * time + self._phase
         offset = amplitude * math.sin(angle)
         return offset, amplitude * rate * math.cos(angle), -rate * rate * offset
+
+    def _swaying_force(self) -> float:
+        """N: what the base's servo gives in the next millisecond."""
+        offset, speed, acceleration = self._sway(self._data.time)
+        return (BASE_MASS + self._carried) * (
+            acceleration
+            + 2 * SERVO * (speed - self._velocity.item(0))
+            + SERVO * SERVO * (offset - self._position.item(0))
+        )
 
     def step(self, action: np.ndarray) -> TipObservation:
         """Drive the tip with the force `action` (3,) N for one control period."""
@@ -216,23 +275,9 @@ class BlindMaze(World):
             x = y = z = 0.0
         elif size > DRIVE_LIMIT:
             x, y, z = (value * DRIVE_LIMIT / size for value in (x, y, z))
-        model, data, constraint = self._model, self._data, self._constraint
-        position, velocity, applied = self._position, self._velocity, self._applied
-        applied[1:4] = x, y, z
-        peak = 0.0
-        for _ in range(self._substeps):
-            offset, speed, acceleration = self._sway(data.time)
-            applied[0] = (BASE_MASS + TIP_MASS) * (
-                acceleration
-                + 2 * SERVO * (speed - velocity.item(0))
-                + SERVO * SERVO * (offset - position.item(0))
-            )
-            mujoco.mj_step(model, data)
-            peak = max(peak, constraint.item(1) ** 2 + constraint.item(2) ** 2)
-        self._peak = math.sqrt(peak)
+        self._peak = math.sqrt(self._advance(x, y, z))
         self._count += 1
-        _, speed_x, speed_y, _, speed_block = velocity.tolist()
-        if not speed_x**2 + speed_y**2 + speed_block**2 < FASTEST**2:
+        if not float(self._velocity @ self._velocity) < FASTEST**2:
             self._ready = False
             raise DivergedError(
                 f"the maze's simulation diverged at {self._data.time:.3f} s; gentler forces would "
@@ -241,23 +286,12 @@ class BlindMaze(World):
         return self._observe()
 
     def _observe(self) -> TipObservation:
-        wrench, position = np.zeros(6), self._position[1:4].copy()
-        if self._data.ncon:
-            # The sensor tells what the tip does, and the point that all contacts act at together.
-            fx, fy, fz, tx, ty, tz, *point = self._felt.tolist()
-            x, y, z = (a - b for a, b in zip(point, self._tip_place.tolist(), strict=True))
-            z -= REFERENCE_HEIGHT
-            wrench[:] = (
-                -fx, -fy, -fz,
-                z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz,
-            )  # fmt: skip
+        wrench, (position, velocity) = self._wrench(), self._motion()
         if self._noise_scale:
             noise = self._next_noise()
             wrench += noise[:6]
             position += noise[6:]
-        return TipObservation(
-            self._count * self.control_period, wrench, position, self._velocity[1:4].copy()
-        )
+        return TipObservation(self._count * self.control_period, wrench, position, velocity)
 
     def _next_noise(self) -> np.ndarray:
         """(9,) of the Ornstein-Uhlenbeck processes, sampled exactly at the control period."""
@@ -282,12 +316,12 @@ class BlindMaze(World):
     def truth(self) -> TipTruth:
         if not self._ready:
             raise PalpateError("a maze world has a truth after reset(seed), not before")
-        sway, _, _, _, obstacle = self._position.tolist()
-        position, velocity = self._position[1:4].copy(), self._velocity[1:4].copy()
+        sway, obstacle = self._position.item(0), self._position.item(-1)
+        position, velocity = self._motion()
         position[1] += sway
         velocity[1] += self._velocity[0]
         return TipTruth(
-            self._count * self.control_period, position, velocity, self._constraint[1:4].copy(),
+            self._count * self.control_period, position, velocity, self._force(),
             self._peak, sway, obstacle, self._fault,
             self._layout, self._obstacle_friction, self._obstacle_mass, self._contact_friction,
         )  # fmt: skip
@@ -301,7 +335,7 @@ class BlindMaze(World):
         ):  # fmt: skip
             self._camera = camera = OffscreenCamera(self._model, width, height)
         view = mujoco.MjvCamera()
-        view.lookat, view.distance, view.azimuth, view.elevation = (0, 0, 0), 0.75, 90, -80
+        view.lookat, view.distance, view.azimuth, view.elevation = self._view
         return camera.picture(self._data, view)
 
 

@@ -1,6 +1,7 @@
 """The MuJoCo scene of a maze: a tip on a swaying base, soft walls and a block that slides."""
 
 import math
+from collections.abc import Callable
 
 import mujoco
 
@@ -36,8 +37,44 @@ def contact_solref(inverse_mass: float) -> tuple[float, float]:
     return (-CONTACT_STIFFNESS * inverse_mass, -CONTACT_DAMPING * inverse_mass)
 
 
-def maze_scene(layout: Layout) -> mujoco.MjSpec:
-    """The scene, uncompiled: joints base y, tip x, y, z (relative to the base), block x."""
+def add_sliding_tip(spec: mujoco.MjSpec, base: mujoco.MjsBody) -> None:
+    """A tip on three slides: x, y, and z, in which a spring holds it at its height."""
+    tip = base.add_body(name=TIP, mass=TIP_MASS, inertia=(1e-3, 1e-3, 1e-3))
+    tip.explicitinertial = True
+    slide = mujoco.mjtJoint.mjJNT_SLIDE
+    for axis, name in zip(((1, 0, 0), (0, 1, 0)), "xy", strict=True):
+        tip.add_joint(name=f"tip {name}", type=slide, axis=axis)
+    tip.add_joint(
+        name="tip z", type=slide, axis=(0, 0, 1), stiffness=PLANE_STIFFNESS,
+        damping=2 * math.sqrt(PLANE_STIFFNESS * TIP_MASS),
+    )  # fmt: skip
+    add_peg(tip)
+
+
+def add_peg(tip: mujoco.MjsBody, up: float = 1.0) -> None:
+    """What touches: a vertical capsule whose lower end, a ball at the body's origin, is the tip.
+
+    A whole capsule would touch a wall at one or two points, and be twice as stiff at two. `up` is
+    1 or -1: where the body's z axis points.
+    """
+    tip.add_geom(
+        name=TIP, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(TIP_RADIUS, 0, 0),
+        contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
+    )  # fmt: skip
+    tip.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(TIP_RADIUS, 0, 0),
+        fromto=(0, 0, 0, 0, 0, up * 2 * REFERENCE_HEIGHT),
+        contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
+    )  # fmt: skip
+
+
+def maze_scene(
+    layout: Layout, add_tip: Callable[[mujoco.MjSpec, mujoco.MjsBody], None] = add_sliding_tip
+) -> mujoco.MjSpec:
+    """The scene, uncompiled: joints of the base (y), of what carries the tip, of the block (x).
+
+    `add_tip` puts what carries the tip on the base: a body and a geom called `TIP` (`add_peg`).
+    """
     spec = mujoco.MjSpec()
     spec.modelname = "maze"
     spec.compiler.degree = False
@@ -65,7 +102,10 @@ def maze_scene(layout: Layout) -> mujoco.MjSpec:
             pos=(*wall.position, 0), quat=(math.cos(wall.yaw / 2), 0, 0, math.sin(wall.yaw / 2)),
             contype=0, conaffinity=0, rgba=(0.55, 0.55, 0.6, 1),
         )  # fmt: skip
-    _add_tip(spec)
+    base = world.add_body(name="base", mass=BASE_MASS, inertia=(1, 1, 1))
+    base.explicitinertial = True
+    base.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 1, 0))
+    add_tip(spec, base)
     block = world.add_body(name=BLOCK, pos=(*layout.obstacle.position, 0))
     block.add_joint(
         name=BLOCK, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0),
@@ -96,31 +136,3 @@ def maze_scene(layout: Layout) -> mujoco.MjSpec:
         ),
     )  # fmt: skip
     return spec
-
-
-def _add_tip(spec: mujoco.MjSpec) -> None:
-    """The base on its slide, and on it the tip on three slides.
-
-    The tip is a vertical capsule whose lower end, a ball, is what touches: a whole capsule would
-    touch a wall at one or two points, and be twice as stiff at two.
-    """
-    slide, capsule = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtGeom.mjGEOM_CAPSULE
-    base = spec.worldbody.add_body(name="base", mass=BASE_MASS, inertia=(1, 1, 1))
-    base.explicitinertial = True
-    base.add_joint(name="base", type=slide, axis=(0, 1, 0))
-    tip = base.add_body(name=TIP, mass=TIP_MASS, inertia=(1e-3, 1e-3, 1e-3))
-    tip.explicitinertial = True
-    for axis, name in zip(((1, 0, 0), (0, 1, 0)), "xy", strict=True):
-        tip.add_joint(name=f"tip {name}", type=slide, axis=axis)
-    tip.add_joint(
-        name="tip z", type=slide, axis=(0, 0, 1), stiffness=PLANE_STIFFNESS,
-        damping=2 * math.sqrt(PLANE_STIFFNESS * TIP_MASS),
-    )  # fmt: skip
-    tip.add_geom(
-        name=TIP, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(TIP_RADIUS, 0, 0),
-        contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
-    )  # fmt: skip
-    tip.add_geom(
-        type=capsule, size=(TIP_RADIUS, 0, 0), fromto=(0, 0, 0, 0, 0, 2 * REFERENCE_HEIGHT),
-        contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
-    )  # fmt: skip

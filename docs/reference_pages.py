@@ -69,6 +69,7 @@ STAGES = {
         *("worlds.furniture.pieces", "worlds.furniture.furniture", "worlds.furniture.robot"),
         *("worlds.furniture.handling", "worlds.gymnasium", "families.contact.environments"),
         *("worlds.maze.maze", "worlds.maze.layout", "worlds.maze.navigation"),
+        *("worlds.arm.maze", "worlds.arm.panda", "worlds.arm.control"),
         *("worlds.contact.plates", "worlds.contact.touching"),
         *("safety.impedance", "tasks.maze.maze", "tasks.maze.navigation"),
     ],

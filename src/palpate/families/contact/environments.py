@@ -18,6 +18,7 @@ import gymnasium
 from palpate.safety.impedance import ImpedanceLaw
 from palpate.tasks.maze.maze import MazeTask
 from palpate.tasks.maze.navigation import NavigationTask
+from palpate.worlds.arm.maze import ArmMaze
 from palpate.worlds.gymnasium import GymnasiumWorld, GymnasiumWorlds
 from palpate.worlds.maze.layout import Layout
 from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE, BlindMaze
@@ -41,10 +42,10 @@ def _maze_parts(
     constant_stiffness: float | None = None,
     decision_period: float = DECISION_PERIOD,
     count: int = 1,
+    world: type[BlindMaze] = BlindMaze,
 ) -> tuple[list[BlindMaze], MazeTask, ImpedanceLaw, int]:
     worlds = [
-        BlindMaze(layouts, noise=noise, scattered=number < scattered * count)
-        for number in range(count)
+        world(layouts, noise=noise, scattered=number < scattered * count) for number in range(count)
     ]
     every = max(1, round(decision_period / worlds[0].control_period))
     return worlds, MazeTask(), maze_law(constant_stiffness), every
@@ -65,6 +66,18 @@ def blind_mazes(
     return GymnasiumWorlds(*_maze_parts(**options, count=num_envs), render_mode=render_mode)
 
 
+def arm_maze(render_mode: str | None = None, **options: Any) -> GymnasiumWorld:
+    """One maze that an arm feels, under the same law as the tip; options as `blind_maze`."""
+    worlds, task, law, every = _maze_parts(**options, world=ArmMaze)
+    return GymnasiumWorld(worlds[0], task, law, every, render_mode)
+
+
+def arm_mazes(num_envs: int = 1, render_mode: str | None = None, **options: Any) -> GymnasiumWorlds:
+    """Mazes that arms feel, side by side; options as `blind_maze`."""
+    parts = _maze_parts(**options, count=num_envs, world=ArmMaze)
+    return GymnasiumWorlds(*parts, render_mode=render_mode)
+
+
 def navigation(render_mode: str | None = None, scattered: bool = False) -> GymnasiumWorld:
     """One point between obstacles; `scattered` as `Navigation` has it."""
     return GymnasiumWorld(Navigation(scattered), NavigationTask(), None, PERIODS, render_mode)
@@ -80,6 +93,7 @@ def navigations(
 
 ENVIRONMENTS = {
     "palpate/BlindMaze-v0": (blind_maze, blind_mazes),
+    "palpate/ArmMaze-v0": (arm_maze, arm_mazes),
     "palpate/Navigation2D-v0": (navigation, navigations),
 }
 

@@ -121,6 +121,7 @@ class EvaluateMaze(EvaluateInWorld):
     1. Where it was trained:                    palpate evaluate maze --policy P
     2. In mazes kept for testing:               palpate evaluate maze --policy P
                                                     --mazes unseen-1 unseen-2
+    3. By a seven-axis arm, not trained anew:   palpate evaluate maze --policy P --world arm
     """
 
     task: ClassVar[str] = "maze"
@@ -129,17 +130,20 @@ class EvaluateMaze(EvaluateInWorld):
         tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="(default: as trained)")
     ] = ()
     """To try it in, one drawn for each episode."""
+    world: Literal["tip", "arm"] = "tip"
+    """What feels its way: a tip of its own, or the peg in the gripper of an arm."""
     noise: float = 1.0
     """Of the sensors, as a multiple of what the world has; 0: none."""
 
     def make(self, count: int, manifest: Mapping[str, Any]) -> GymnasiumWorlds:
-        from palpate.families.contact.environments import blind_mazes
+        from palpate.families.contact.environments import arm_mazes, blind_mazes
         from palpate.families.contact.methods import method_named
 
         trained = manifest["options"]
         named = self.mazes or tuple(trained["mazes"])
         stiffness = method_named(trained["method"]).stiffness
-        return blind_mazes(count, layouts=named, noise=self.noise, constant_stiffness=stiffness)
+        make = arm_mazes if self.world == "arm" else blind_mazes
+        return make(count, layouts=named, noise=self.noise, constant_stiffness=stiffness)
 
     def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
         from palpate.families.contact.episodes import figures
@@ -148,7 +152,8 @@ class EvaluateMaze(EvaluateInWorld):
 
     def about(self, manifest: Mapping[str, Any]) -> str:
         mazes = self.mazes or manifest["options"]["mazes"]
-        return f"tried in the maze {', '.join(mazes)}, with {self.noise:g} times the sensors' noise"
+        noise = f"with {self.noise:g} times the sensors' noise"
+        return f"tried in the maze {', '.join(mazes)}, felt by the {self.world}, {noise}"
 
     def show(self, run: Run, policy: ActorPolicy, manifest: Mapping[str, Any]) -> None:
         from palpate.families.contact.path_picture import show_path

@@ -167,7 +167,7 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "train rope-stabilisation",
             "unknown task 'rope-stabilisation'; did you mean 'rope-stabilization'? there are: "
-            "maze, rope-stabilization, rope-tracking, FILE.py:CLASS",
+            "maze, navigation, rope-stabilization, rope-tracking, FILE.py:CLASS",
         ),
         (
             "reproduce rope-modle",

@@ -1,6 +1,7 @@
 """`palpate train` and `palpate evaluate` of what learns in a world, on a tiny budget."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,21 +11,26 @@ from palpate.errors import PalpateError
 from palpate.families.contact import methods
 from palpate.families.contact.episodes import figures
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
+from palpate.families.contact.navigation_options import EvaluateNavigation, TrainNavigation
+from palpate.families.world_options import TrainInWorld
 from palpate.networks.guarded import GuardedPolicy, load_actor
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
+from palpate.safety.reflex import Reflex
 from palpate.tasks.maze.maze import MazeTask
+from palpate.tasks.maze.navigation import NavigationTask
 
 
 @pytest.fixture
 def short(monkeypatch):
     """Episodes of six decisions, and few of everything."""
     monkeypatch.setattr(MazeTask, "horizon", 6)
-    monkeypatch.setattr(TrainMaze, "tried", 3)
+    monkeypatch.setattr(NavigationTask, "horizon", 6)
+    monkeypatch.setattr(TrainInWorld, "tried", 3)
     monkeypatch.setattr(methods, "PRETRAINING_UPDATES", 2)
 
     def training_of(steps, method, real=methods.training_of):
-        return dataclasses.replace(real(steps, method), batch=8, capacity=200)
+        return dataclasses.replace(real(steps, method), batch=8, capacity=400)
 
     monkeypatch.setattr(methods, "training_of", training_of)
 
@@ -54,6 +60,51 @@ def test_a_policy_is_trained_kept_tried_and_evaluated_again(short, tmp_path, cap
     assert values["success_rate.held_still"] == 0
 
 
+@pytest.mark.parametrize(
+    ("training", "evaluation", "where"),
+    [
+        (TrainMaze, EvaluateMaze, "tried in the maze home"),
+        (TrainNavigation, EvaluateNavigation, "trained by bresa"),
+    ],
+)
+def test_a_reflex_is_trained_and_watches_in_evaluation(
+    short, training, evaluation, where, tmp_path, monkeypatch, capsys
+):
+    handed = []
+    watch_with = Reflex.watch_with
+    monkeypatch.setattr(
+        Reflex, "watch_with", lambda *given: handed.append(given) or watch_with(*given)
+    )
+    folder = train.run(
+        training(method="bresa", steps=24, environments=2, out=tmp_path / "trained", seed=3)
+    )
+    assert len(handed) >= 12 + 1  # every round of the training, and then to be tried
+    values = {figure.name: figure.value for figure in read_result(folder / RESULT).figures}
+    assert values["pretraining.steps"] == 24
+    policy, manifest = load_actor(folder / "policy.safetensors")
+    assert isinstance(policy, GuardedPolicy)
+    assert manifest["constants"]["method"] == "ReflexAgent"
+    handed.clear()
+    evaluate.run(evaluation(policy=folder, episodes=2, out=tmp_path / "evaluated"))
+    assert where in capsys.readouterr().out
+    for _, guard, threshold in handed:
+        assert threshold == policy.threshold
+        np.testing.assert_array_equal(
+            guard.critic.network.weights[0], policy.guard.critic.network.weights[0]
+        )
+    assert handed  # by whom the policy was tried, not by who held still beside it
+    assert len(handed) == 1 + (evaluation is EvaluateMaze)  # which shows an episode besides
+
+
+def test_decisions_hold_for_as_long_as_is_asked():
+    method = {"options": {"method": "bresa", "mazes": ["home"]}}
+    for period, every in ((None, 100), (0.05, 50), (0.2, 200)):
+        asked = EvaluateMaze(policy=Path("x"), decision_period=period)
+        assert asked.make(1, method, None).lockstep.every == every
+    with pytest.raises(PalpateError, match="--decision-period is from"):
+        EvaluateMaze(policy=Path("x"), decision_period=0.0)
+
+
 def test_a_policy_of_another_task_is_refused(short, tmp_path):
     folder = train.run(
         TrainMaze(method="no-recovery", steps=12, environments=2, out=tmp_path / "trained")
@@ -75,11 +126,11 @@ def test_every_method_is_made_of_the_same_agent():
     assert agents["k300"].stiffness == 300
     assert agents["srl-vic"].stiffness is None
     with pytest.raises(PalpateError, match="unknown method 'sac'; there are: srl-vic, "):
-        methods.method_named("sac")
+        methods.MAZE.method("sac")
 
 
 def test_scripted_collisions_keep_their_direction_for_a_while():
-    script, random = methods.ScriptedCollisions(), np.random.default_rng(0)
+    script, random = methods.ScriptedCollisions(4), np.random.default_rng(0)
     seen, fresh = np.zeros((3, 9)), np.ones(3, bool)
     actions = np.stack([script(seen, fresh & (step == 0), random) for step in range(60)])
     assert np.abs(actions).max() <= 1

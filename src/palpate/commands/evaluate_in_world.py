@@ -1,5 +1,6 @@
 """`palpate evaluate` of what learnt in a world: episodes of the policy, and of doing nothing."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,9 @@ def evaluate_in_world(options: EvaluateInWorld) -> Path:
             rows: dict[str, list[Figure]] = {}
             for name, act in who.items():
                 suffix = "" if name == "policy" else f".{name.replace(' ', '_')}"
-                found = played(
-                    lambda count: options.make(count, manifest), act, options.episodes, options.seed
-                )
+                watching = policy if name == "policy" else None
+                make = functools.partial(options.make, manifest=manifest, policy=watching)
+                found = played(make, act, options.episodes, options.seed)
                 rows[name] = options.figures(found, suffix)
             options.show(run, policy, manifest)
             about = options.about(manifest)

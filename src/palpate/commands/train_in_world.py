@@ -1,6 +1,7 @@
 """`palpate train` of what learns in a world, by trial and error."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ def train_in_world(options: TrainInWorld) -> Path:
     with folders.begin(options, words, {}, folders.POLICY, **decided) as run:
         if not run.finished:
             policy, figures = trained_in_world(options, run)
-            tried = played(options.make, at_its_best(policy), options.tried, options.seed + 1)
+            make = functools.partial(options.make, policy=policy)
+            tried = played(make, at_its_best(policy), options.tried, options.seed + 1)
             figures += options.figures(tried, ".tried")
             options.show(run, policy)
             settings: dict[str, Any] = {folders.SUMMARY: [f"{line}." for line in lines_of(figures)]}
@@ -66,7 +68,7 @@ def trained_in_world(options: TrainInWorld, run: Run) -> tuple[ActorPolicy, list
             0.0 if offline is None else float(np.sum(np.asarray(offline.cost) > 0)),
             "",
         ),
-        Figure("pretraining.steps", 0 if offline is None else len(offline.cost), ""),
+        Figure("pretraining.steps", 0 if offline is None else offline.decisions, ""),
     ]
     policy = options.policy(state)
     save_controller(

@@ -46,8 +46,8 @@ class TrainInWorld(Options, ABC):
                 raise PalpateError(f"--{name} is 1 or greater, not {getattr(self, name)}")
 
     @abstractmethod
-    def make(self, count: int) -> VectorEnv:
-        """So many environments side by side."""
+    def make(self, count: int, policy: ActorPolicy | None = None) -> VectorEnv:
+        """So many environments side by side, to be trained in or, of a policy, to try it in."""
 
     def make_for_training(self) -> VectorEnv:
         """Those that it is trained in, which may begin where a task does not."""
@@ -98,8 +98,13 @@ class EvaluateInWorld(Options, ABC):
             raise PalpateError(f"--episodes is 1 or greater, not {self.episodes}")
 
     @abstractmethod
-    def make(self, count: int, manifest: Mapping[str, Any]) -> VectorEnv:
-        """So many environments side by side, controlled as the policy of the manifest was."""
+    def make(
+        self, count: int, manifest: Mapping[str, Any], policy: ActorPolicy | None
+    ) -> VectorEnv:
+        """So many environments side by side, controlled as the policy of the manifest was.
+
+        Without the policy itself nobody interrupts what is decided.
+        """
 
     @abstractmethod
     def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:

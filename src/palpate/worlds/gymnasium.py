@@ -13,9 +13,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from palpate.errors import PalpateError
+from palpate.worlds.motions import Motions
 from palpate.worlds.world import (
     ControlLaw,
     DivergedError,
+    InterruptingLaw,
     World,
     side_by_side,
     whole_periods,
@@ -64,8 +66,17 @@ class WorldTask(Protocol):
         ...
 
 
+def features_of(task: WorldTask, observation: Any) -> np.ndarray:
+    """What the task sees of observations side by side, (worlds, features) float32."""
+    seen = task.observe(observation)
+    return np.clip(seen, -FEATURE_LIMIT, FEATURE_LIMIT).astype(np.float32)
+
+
 class Lockstep:
-    """Worlds side by side at the control rate, whose decisions are taken together."""
+    """Worlds side by side at the control rate, whose decisions are taken together.
+
+    Where the law can interrupt, `motions` are the pieces of the last decision of all.
+    """
 
     def __init__(
         self, worlds: Sequence[World], task: WorldTask, law: ControlLaw | None, every: int
@@ -80,6 +91,9 @@ class Lockstep:
         self._first: list[Any] = [None] * count  # of the episodes under way
         self.fresh = np.ones(count, bool)
         self.decisions = np.zeros(count, int)
+        self.motions: Motions | None = None
+        if isinstance(law, InterruptingLaw):
+            self.motions = Motions(law, self.features, self.every)
         one = np.ones(task.features, np.float32) * FEATURE_LIMIT
         self.observation_space = Box(-one, one)
         self.action_space = Box(-1.0, 1.0, (task.actions,), np.float32)
@@ -93,8 +107,7 @@ class Lockstep:
 
     def features(self) -> np.ndarray:
         """What the task sees of all worlds, (worlds, features) float32."""
-        seen = self.task.observe(side_by_side(self.observations))
-        return np.clip(seen, -FEATURE_LIMIT, FEATURE_LIMIT).astype(np.float32)
+        return features_of(self.task, side_by_side(self.observations))
 
     def decide(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
         """Rewards, who terminated, who was cut off, and what else is told, each (worlds,).
@@ -102,6 +115,7 @@ class Lockstep:
         A world whose episode ends within the decision stands still until the others are done.
         """
         worlds, task, law, observations = self.worlds, self.task, self.law, self.observations
+        motions = self.motions
         if observations[0] is None:
             raise PalpateError("an environment takes a step after reset(), not before")
         before, truths = list(self._truths), self._truths
@@ -109,8 +123,10 @@ class Lockstep:
         force, running = [0.0] * len(worlds), list(range(len(worlds)))
         if law is not None:
             law.begin(side_by_side(observations), actions, self.fresh.copy())
-        for _ in range(self.every):
+        for period in range(self.every):
             commands = actions if law is None else law.command(side_by_side(observations))
+            if motions is not None:
+                motions.follow(period, end == "")
             for number in tuple(running):
                 world = worlds[number]
                 try:
@@ -134,6 +150,8 @@ class Lockstep:
                 HORIZON if self.decisions[number] >= task.horizon else ""
             )
         cut = (end == HORIZON) | (end == DIVERGED)
+        if motions is not None:
+            motions.finish(end == VIOLATION, (end != "") & ~cut, end != DIVERGED)
         told = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
         told["force"] = np.array(force)
         told["progress"] = np.array([*map(task.progress, self._first, truths)])
@@ -150,9 +168,9 @@ class GymnasiumWorlds(VectorEnv):
     The infos of a step hold, for all worlds: "cost" (0 or 1: a violation, which ends the episode at
     once, within the decision), "end" (str: "" while it goes on, else what the task says,
     "violation", "horizon" or "diverged"), "force" (N, the greatest in this decision) and "progress"
-    (the share of the way that is behind it); and
-    "final_obs" where an episode ended. An episode that is cut off at the horizon, or whose
-    simulation diverged, is truncated.
+    (the share of the way that is behind it); "final_obs" where an episode ended; and where the law
+    can interrupt (`InterruptingLaw`) "motions", the pieces of this decision (`Motions.pieces`). An
+    episode that is cut off at the horizon, or whose simulation diverged, is truncated.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
@@ -174,6 +192,11 @@ class GymnasiumWorlds(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._randoms = [np_random(None)[0] for _ in range(self.num_envs)]
+
+    @property
+    def law(self) -> ControlLaw | None:
+        """What stands between decisions and worlds."""
+        return self.lockstep.law
 
     def reset(
         self,
@@ -205,6 +228,8 @@ class GymnasiumWorlds(VectorEnv):
         actions = _checked(actions, (self.num_envs, *(self.single_action_space.shape or ())))
         reward, terminated, truncated, infos = lockstep.decide(actions)
         features, ended = lockstep.features(), terminated | truncated
+        if lockstep.motions is not None:
+            infos["motions"] = lockstep.motions.pieces
         if ended.any():
             final = np.full(self.num_envs, None, object)
             for number in np.flatnonzero(ended).tolist():

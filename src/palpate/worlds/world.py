@@ -77,6 +77,20 @@ class ControlLaw(Protocol):
         ...
 
 
+@runtime_checkable
+class InterruptingLaw(ControlLaw, Protocol):
+    """A control law that may put another action in the place of the one under way.
+
+    After each `command`, `executed` (worlds, ...) is what is under way and `interrupted` (worlds,)
+    bool whether it was replaced in this very period: again only after `pace` control periods, or
+    once in a decision where a sensor failed.
+    """
+
+    pace: int
+    executed: np.ndarray
+    interrupted: np.ndarray
+
+
 def side_by_side(observations: Sequence[Any]) -> Any:
     """Observations of several worlds as one of their kind, whose fields lead with the worlds.
 

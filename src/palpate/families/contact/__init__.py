@@ -3,6 +3,7 @@
 from palpate.family import Family
 
 _MAZE = "palpate.families.contact.maze_options"
+_NAVIGATION = "palpate.families.contact.navigation_options"
 _TOUCH = "palpate.families.contact.touch_options"
 
 FAMILY = Family(
@@ -12,8 +13,11 @@ FAMILY = Family(
     options={
         "record": {"contact": f"{_TOUCH}:RecordContact"},
         "identify": {"contact": f"{_TOUCH}:IdentifyContact"},
-        "train": {"maze": f"{_MAZE}:TrainMaze"},
-        "evaluate": {"maze": f"{_MAZE}:EvaluateMaze"},
+        "train": {"maze": f"{_MAZE}:TrainMaze", "navigation": f"{_NAVIGATION}:TrainNavigation"},
+        "evaluate": {
+            "maze": f"{_MAZE}:EvaluateMaze",
+            "navigation": f"{_NAVIGATION}:EvaluateNavigation",
+        },
     },
     experiments={
         "contact-model": "palpate.experiments.contact.contact_model:reproduce",

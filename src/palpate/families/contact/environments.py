@@ -10,22 +10,27 @@ Gymnasium 1 imports a module that is named before the identifier, too:
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 
+from palpate.networks.guarded import ActorPolicy, GuardedPolicy
 from palpate.safety.impedance import ImpedanceLaw
+from palpate.safety.reflex import Reflex
 from palpate.tasks.maze.maze import MazeTask
 from palpate.tasks.maze.navigation import NavigationTask
 from palpate.worlds.arm.maze import ArmMaze
-from palpate.worlds.gymnasium import GymnasiumWorld, GymnasiumWorlds
+from palpate.worlds.gymnasium import GymnasiumWorld, GymnasiumWorlds, WorldTask, features_of
 from palpate.worlds.maze.layout import Layout
 from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE, BlindMaze
 from palpate.worlds.maze.navigation import PERIODS, Navigation
 from palpate.worlds.maze.scene import TIP_MASS
+from palpate.worlds.world import ControlLaw
 
 DECISION_PERIOD = 0.1  # s, in the maze
+REFLEX_PACE = 10, 1  # control periods in the maze and between obstacles: tenths of a decision
 
 
 def maze_law(constant_stiffness: float | None = None) -> ImpedanceLaw:
@@ -35,26 +40,41 @@ def maze_law(constant_stiffness: float | None = None) -> ImpedanceLaw:
     )
 
 
+def _with_reflex(
+    law: ControlLaw | None, task: WorldTask, pace: int, reflex: bool | ActorPolicy
+) -> ControlLaw | None:
+    """The law, under a reflex if there is to be one: that of the policy, or one to be taught."""
+    if reflex is False:
+        return law
+    wrapped = Reflex(law, functools.partial(features_of, task), pace)
+    if isinstance(reflex, GuardedPolicy):
+        wrapped.watch_with(reflex.guard, reflex.threshold)
+    return wrapped
+
+
 def _maze_parts(
     layouts: Sequence[str | Layout] = ("home",),
     noise: float = 1.0,
     scattered: float = 0.0,
     constant_stiffness: float | None = None,
     decision_period: float = DECISION_PERIOD,
+    reflex: bool | ActorPolicy = False,
     count: int = 1,
     world: type[BlindMaze] = BlindMaze,
-) -> tuple[list[BlindMaze], MazeTask, ImpedanceLaw, int]:
+) -> tuple[list[BlindMaze], MazeTask, ControlLaw | None, int]:
     worlds = [
         world(layouts, noise=noise, scattered=number < scattered * count) for number in range(count)
     ]
     every = max(1, round(decision_period / worlds[0].control_period))
-    return worlds, MazeTask(), maze_law(constant_stiffness), every
+    task, law = MazeTask(), maze_law(constant_stiffness)
+    return worlds, task, _with_reflex(law, task, REFLEX_PACE[0], reflex), every
 
 
 def blind_maze(render_mode: str | None = None, **options: Any) -> GymnasiumWorld:
     """One blind maze. `options`: `layouts` and `noise` as `BlindMaze` has them, `scattered`, the
     share of the worlds side by side that begin anywhere, `constant_stiffness` as `ImpedanceLaw`,
-    `decision_period` in s."""
+    `decision_period` in s, and `reflex`: a policy whose guard is to interrupt motions (`Reflex`),
+    or whether something is to learn that."""
     worlds, task, law, every = _maze_parts(**options)
     return GymnasiumWorld(worlds[0], task, law, every, render_mode)
 
@@ -78,17 +98,27 @@ def arm_mazes(num_envs: int = 1, render_mode: str | None = None, **options: Any)
     return GymnasiumWorlds(*parts, render_mode=render_mode)
 
 
-def navigation(render_mode: str | None = None, scattered: bool = False) -> GymnasiumWorld:
-    """One point between obstacles; `scattered` as `Navigation` has it."""
-    return GymnasiumWorld(Navigation(scattered), NavigationTask(), None, PERIODS, render_mode)
+def _navigation_parts(
+    scattered: bool = False,
+    reflex: bool | ActorPolicy = False,
+    count: int = 1,
+) -> tuple[list[Navigation], NavigationTask, ControlLaw | None, int]:
+    worlds, task = [Navigation(scattered) for _ in range(count)], NavigationTask()
+    return worlds, task, _with_reflex(None, task, REFLEX_PACE[1], reflex), PERIODS
+
+
+def navigation(render_mode: str | None = None, **options: Any) -> GymnasiumWorld:
+    """One point between obstacles. `options`: `scattered` as `Navigation` has it, and
+    `reflex` as `blind_maze`."""
+    worlds, task, law, every = _navigation_parts(**options)
+    return GymnasiumWorld(worlds[0], task, law, every, render_mode)
 
 
 def navigations(
-    num_envs: int = 1, render_mode: str | None = None, scattered: bool = False
+    num_envs: int = 1, render_mode: str | None = None, **options: Any
 ) -> GymnasiumWorlds:
-    """Points between obstacles, side by side; `scattered` as `Navigation` has it."""
-    worlds = [Navigation(scattered) for _ in range(num_envs)]
-    return GymnasiumWorlds(worlds, NavigationTask(), None, PERIODS, render_mode)
+    """Points between obstacles, side by side; options as `navigation`."""
+    return GymnasiumWorlds(*_navigation_parts(**options, count=num_envs), render_mode=render_mode)
 
 
 ENVIRONMENTS = {

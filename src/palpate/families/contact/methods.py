@@ -5,6 +5,7 @@ of scattered starts were chosen on trainings of the seeds 0, 900 and 901, the ot
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,30 +19,26 @@ from palpate.learning.off_policy import (
     OffPolicyTraining,
     Penalty,
     RecoveryAgent,
+    ReflexAgent,
     SafetyCritic,
     SoftActorCritic,
 )
 from palpate.learning.off_policy.agent import Agent
 from palpate.networks import Channel
 from palpate.networks.guarded import ActorPolicy, GuardedPolicy
-from palpate.tasks.maze import maze as task
-from palpate.worlds.maze import maze as world
+from palpate.tasks.maze import maze, navigation
+from palpate.worlds.maze import maze as maze_world
+from palpate.worlds.maze import navigation as navigation_world
 from palpate.worlds.maze import scene
 
 WRENCH = (0, 1, 2, 3, 4, 5)  # of the features: SRL-VIC's critic and recovery see no position
 DISCOUNT, TARGET_ENTROPY = 0.98, -1.0  # of the task's agent
 RISK_DISCOUNT, RISK_THRESHOLD = 0.8, 0.2
+NAVIGATION_THRESHOLD = 0.3  # as Recovery RL's, which has this discount there too
 VIOLATION_PRICE = 50.0  # of the penalty, in rewards: more than the whole way to the goal is worth
 COST_LIMIT = 0.02  # Lagrangian: violations an episode
 PRETRAINING_STEPS, PRETRAINING_UPDATES = 20_000, 5_000
-SCATTERED = 0.5  # share of the episodes of a training that begin anywhere on the way to the goal
 HELD = (3, 15)  # decisions for which a scripted collision keeps its direction
-
-OBSERVATIONS = (  # each as a share of what `palpate.tasks.maze.maze` divides it by
-    Channel("wrench", (6,)),
-    Channel("position", (3,)),
-)
-ACTIONS = (Channel("displacement", (2,)), Channel("stiffness", (2,)))
 
 
 @dataclass(frozen=True)
@@ -56,17 +53,27 @@ class Method:
         """Whether it has a safety critic, which learns ahead from scripted collisions."""
         return isinstance(self.agent, RecoveryAgent)
 
+    @property
+    def interrupts(self) -> bool:
+        """Whether its guard is a reflex, which interrupts motions."""
+        return isinstance(self.agent, ReflexAgent)
+
 
 def _agent() -> SoftActorCritic:
     return SoftActorCritic(discount=DISCOUNT, target_entropy=TARGET_ENTROPY)
 
 
-def _guarded(seen: tuple[int, ...] | None = WRENCH) -> RecoveryAgent:
-    return RecoveryAgent(_agent(), SafetyCritic(discount=RISK_DISCOUNT, seen=seen), RISK_THRESHOLD)
+def _guarded(
+    seen: tuple[int, ...] | None = WRENCH,
+    kind: type[RecoveryAgent] = RecoveryAgent,
+    threshold: float = RISK_THRESHOLD,
+) -> RecoveryAgent:
+    return kind(_agent(), SafetyCritic(discount=RISK_DISCOUNT, seen=seen), threshold)
 
 
 METHODS: dict[str, Callable[[], Method]] = {
     "srl-vic": lambda: Method(_guarded()),
+    "bresa": lambda: Method(_guarded(kind=ReflexAgent)),
     "position-critic": lambda: Method(_guarded(seen=None)),
     "no-recovery": lambda: Method(_agent()),
     "k300": lambda: Method(_guarded(), 300.0),
@@ -78,6 +85,76 @@ METHODS: dict[str, Callable[[], Method]] = {
     ),
     "penalty": lambda: Method(Penalty(_agent(), VIOLATION_PRICE)),
 }
+
+
+_beside = functools.partial(_guarded, seen=None, threshold=NAVIGATION_THRESHOLD)
+NAVIGATION_METHODS: dict[str, Callable[[], Method]] = {
+    "srl-vic": lambda: Method(_beside()),
+    "bresa": lambda: Method(_beside(kind=ReflexAgent)),
+    "no-recovery": lambda: Method(_agent()),
+}
+
+
+@dataclass(frozen=True)
+class Skill:
+    """What is to be learnt: what a policy sees and does, by which methods, and in which worlds.
+
+    `period` is that of a decision, s; `modules` hold the constants of task and world by the word
+    that they are told under.
+    """
+
+    observations: tuple[Channel, ...]
+    actions: tuple[Channel, ...]
+    period: float
+    methods: dict[str, Callable[[], Method]]
+    modules: tuple[tuple[str, Any], ...]
+
+    def method(self, name: str) -> Method:
+        """The method of that name; raises `PalpateError` that lists all."""
+        return self.methods[check_name("method", name, self.methods)]()
+
+    def policy(self, agent: Agent, state: Any) -> ActorPolicy:
+        """The controller of an agent's state: its actor, under the guard where it has one."""
+        declared: dict[str, Any] = {
+            "observations": self.observations,
+            "actions": self.actions,
+            "period": self.period,
+        }
+        if isinstance(agent, RecoveryAgent):
+            task, safety = state.task, state.safety
+            return GuardedPolicy(
+                actor=task.actor, guard=safety.guard, threshold=agent.threshold, **declared
+            )
+        alone = state.agent if isinstance(agent, Lagrangian) else state
+        return ActorPolicy(actor=alone.actor, **declared)
+
+    def constants(self, method: Method) -> dict[str, Any]:
+        """Those of method, task and world: what decides a training beside its options."""
+        numbers = {
+            f"{name}.{constant.lower()}": value
+            for name, module in self.modules
+            for constant, value in vars(module).items()
+            if constant.isupper() and isinstance(value, int | float | tuple)
+        }
+        agent = dataclasses.asdict(method.agent)  # type: ignore[call-overload]
+        return {"method": type(method.agent).__name__, "agent": agent, **numbers}
+
+
+MAZE = Skill(
+    # Each a share of what `palpate.tasks.maze.maze` divides it by.
+    (Channel("wrench", (6,)), Channel("position", (3,))),
+    (Channel("displacement", (2,)), Channel("stiffness", (2,))),
+    DECISION_PERIOD,
+    METHODS,
+    (("task", maze), ("world", maze_world), ("world", scene)),
+)
+NAVIGATION = Skill(
+    (Channel("position", (2,)),),
+    (Channel("motion", (2,)),),
+    1.0,
+    NAVIGATION_METHODS,
+    (("task", navigation), ("world", navigation_world)),
+)
 
 
 def training_of(steps: int, method: Method) -> OffPolicyTraining:
@@ -92,57 +169,25 @@ class ScriptedCollisions:
     """Pushes in random directions, of any length and stiffness, each held for a while.
 
     A `palpate.learning.off_policy.rollouts.Script`: from observations (worlds, features) and
-    whether each episode has just begun, actions (worlds, 4) in [-1, 1]. What a critic of risks
+    whether each episode has just begun, `actions` numbers for each in [-1, 1], of which the first
+    two are a displacement. What a critic of risks
     learns from before a training, as SRL-VIC's (arXiv 2406.13744).
     """
 
-    def __init__(self) -> None:
-        self._action, self._left = np.zeros((0, 4)), np.zeros(0, int)
+    def __init__(self, actions: int) -> None:
+        self._action, self._left = np.zeros((0, actions)), np.zeros(0, int)
 
     def __call__(
         self, observation: np.ndarray, fresh: np.ndarray, random: np.random.Generator
     ) -> np.ndarray:
-        count = len(observation)
+        count, others = len(observation), self._action.shape[1] - 2
         if len(self._left) != count:
-            self._action, self._left = np.zeros((count, 4)), np.zeros(count, int)
+            self._action, self._left = np.zeros((count, 2 + others)), np.zeros(count, int)
         angle, length = random.uniform(0, 2 * np.pi, count), random.uniform(0.3, 1.0, count)
-        stiffness = random.uniform(-1, 1, (count, 2))
+        stiffness = random.uniform(-1, 1, (count, others))
         drawn = np.column_stack([length * np.cos(angle), length * np.sin(angle), stiffness])
         held = random.integers(*HELD, count)
         new = fresh | (self._left == 0)
         self._action[new], self._left[new] = drawn[new], held[new]
         self._left -= 1
         return self._action.copy()
-
-
-def method_named(name: str) -> Method:
-    """The method of that name; raises `PalpateError` that lists all."""
-    return METHODS[check_name("method", name, METHODS)]()
-
-
-def policy_of(agent: Agent, state: Any) -> ActorPolicy:
-    """The controller of an agent's state: its actor, under the guard where it has one."""
-    declared: dict[str, Any] = {
-        "observations": OBSERVATIONS,
-        "actions": ACTIONS,
-        "period": DECISION_PERIOD,
-    }
-    if isinstance(agent, RecoveryAgent):
-        task, safety = state.task, state.safety
-        return GuardedPolicy(
-            actor=task.actor, guard=safety.guard, threshold=agent.threshold, **declared
-        )
-    alone = state.agent if isinstance(agent, Lagrangian) else state
-    return ActorPolicy(actor=alone.actor, **declared)
-
-
-def constants(method: Method) -> dict[str, Any]:
-    """Those of the method, the task and the world: what decides a training beside its options."""
-    numbers = {
-        f"{name}.{constant.lower()}": value
-        for name, module in (("task", task), ("world", world), ("world", scene))
-        for constant, value in vars(module).items()
-        if constant.isupper() and isinstance(value, int | float | tuple)
-    }
-    agent = dataclasses.asdict(method.agent)  # type: ignore[call-overload]
-    return {"method": type(method.agent).__name__, "agent": agent, **numbers}

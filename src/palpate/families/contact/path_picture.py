@@ -13,6 +13,7 @@ from matplotlib.transforms import Affine2D
 
 from palpate.networks.guarded import ActorPolicy, GuardedPolicy
 from palpate.report.picture import canvas_of, save_animation, save_picture
+from palpate.safety.reflex import Reflex
 from palpate.worlds.gymnasium import GymnasiumWorlds
 from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
 
@@ -47,6 +48,7 @@ def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Epi
     observation, _ = environment.reset(seed=seed)
     inside: Any = environment.lockstep
     (world,), task, law = inside.worlds, inside.task, inside.law
+    impedance: Any = law.law if isinstance(law, Reflex) else law
     layout, end, rows = world.truth().layout, "", []
 
     @jax.jit
@@ -63,7 +65,7 @@ def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Epi
         end = infos["end"][0]
         felt = infos["force"][0]
         before = truth.position[:2], truth.obstacle, truth.force[:2]
-        rows.append((*before, law.stiffness[0].copy(), felt, float(risk[0])))
+        rows.append((*before, impedance.stiffness[0].copy(), felt, float(risk[0])))
     position, block, force, stiffness, greatest, risk = map(np.array, zip(*rows, strict=True))
     period = inside.every * world.control_period
     risk = None if np.isnan(risk).all() else risk

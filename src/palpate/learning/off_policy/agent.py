@@ -51,7 +51,8 @@ class Agent(Protocol):
         """The state after one update, and figures to log.
 
         An agent that learns ahead of its training has a `pretrain` besides, which takes and gives
-        the same and for which `batch.risk` alone counts.
+        the same and for which `batch.risk` alone counts. One that interrupts what is under way has
+        a `reflex`, which gives the guard of a state and its threshold; `batch.risk` are `Motion`s.
         """
         ...
 

@@ -3,6 +3,7 @@
 It is written and drawn from inside compiled calls, and saved with a run like any other state.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -28,6 +29,27 @@ class Transition(eqx.Module):
     next_observation: Float[Any, "*batch features"]
     terminated: Float[Any, "*batch"]
 
+    @property
+    def decisions(self) -> int:
+        """How many they are."""
+        return len(self.reward)
+
+
+class Motion(Transition):
+    """Pieces of decisions that could be interrupted, at the rate of the reflex that does it.
+
+    `action` is `executed`, and the reward is not known. `duration` is a share of a whole decision;
+    `holds` is 1 where the decision goes on after the piece.
+    """
+
+    duration: Float[Any, "*batch"]
+    holds: Float[Any, "*batch"]
+
+    @property
+    def decisions(self) -> int:
+        """How many decisions these are the pieces of."""
+        return int((self.holds == 0).sum())
+
 
 class ReplayBuffer(eqx.Module):
     """The last transitions, and apart from them the last ones that violated a constraint.
@@ -44,15 +66,26 @@ class ReplayBuffer(eqx.Module):
 
     @classmethod
     def create(
-        cls, observation: int, action: int, capacity: int, violating: int = 20_000
+        cls,
+        observation: int,
+        action: int,
+        capacity: int,
+        violating: int = 20_000,
+        kind: type[Transition] = Transition,
     ) -> "ReplayBuffer":
-        """An empty one for so many numbers seen and done, so many transitions and violations."""
+        """An empty one for so many numbers seen and done, so many transitions and violations.
+
+        Of a `kind` of transition that may have more fields, of a number each.
+        """
+        more = len(dataclasses.fields(kind)) - len(dataclasses.fields(Transition))
 
         def empty(count: int) -> Transition:
             seen, done = jnp.zeros((count, observation)), jnp.zeros((count, action))
             one = jnp.zeros(count)
             # Buffers are donated to compiled calls: no array may stand in two places.
-            return jax.tree.map(jnp.array, Transition(seen, done, done, one, one, seen, one))
+            return jax.tree.map(
+                jnp.array, kind(seen, done, done, one, one, seen, one, *more * [one])
+            )
 
         zero = jnp.zeros((), jnp.int32)
         counts = (jnp.array(zero), jnp.array(zero), jnp.array(zero))
@@ -63,19 +96,24 @@ class ReplayBuffer(eqx.Module):
         """How many transitions there are to draw from."""
         return jnp.minimum(self.added, len(self.transitions.reward))
 
-    def add(self, batch: Transition) -> "ReplayBuffer":
-        """With a batch (n, ...) more, in place of the oldest where there is no room."""
+    def add(self, batch: Transition, count: Any = None) -> "ReplayBuffer":
+        """With a batch (n, ...) more, in place of the oldest where there is no room.
+
+        Only the first `count` of the batch, if it is given: a number that may be traced.
+        """
+        count, nth = len(batch.reward) if count is None else count, jnp.arange(len(batch.reward))
         ring = len(self.transitions.reward) - self.kept
-        places = self.added - self.kept + jnp.arange(len(batch.reward))
+        places = self.added - self.kept + nth
         places = self.kept + places % jnp.maximum(ring, 1)
-        violates = batch.cost > 0
+        violates = (batch.cost > 0) & (nth < count)
+        fits = places < len(self.transitions.reward)
         room = len(self.violating.reward)
-        nth = self.violated + jnp.cumsum(violates) - 1
+        rare = self.violated + jnp.cumsum(violates) - 1
         return ReplayBuffer(
-            _written(self.transitions, batch, places, places < len(self.transitions.reward)),
-            _written(self.violating, batch, nth % room, violates),
+            _written(self.transitions, batch, places, fits & (nth < count)),
+            _written(self.violating, batch, rare % room, violates),
             self.kept,
-            self.added + len(batch.reward),
+            self.added + count,
             self.violated + jnp.sum(violates),
         )
 

@@ -7,7 +7,8 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from palpate.errors import PalpateError
-from palpate.learning.off_policy.buffer import Transition
+from palpate.learning.off_policy.buffer import Motion, Transition
+from palpate.safety.reflex import Reflex
 
 
 def check(environments: VectorEnv) -> tuple[int, int]:
@@ -35,6 +36,22 @@ def check(environments: VectorEnv) -> tuple[int, int]:
     return seen.shape[0], done.shape[0]
 
 
+def reflex_of(environments: VectorEnv, agent: Any) -> Reflex | None:
+    """What interrupts motions in the environments, for an agent that has a reflex; else None.
+
+    Raises `PalpateError` for such an agent in environments that cannot interrupt.
+    """
+    if not hasattr(agent, "reflex"):
+        return None
+    law = getattr(environments, "law", None)
+    if not isinstance(law, Reflex):
+        raise PalpateError(
+            f"{type(agent).__name__} interrupts motions, and {type(environments).__name__} does "
+            "not let it: expected worlds side by side (GymnasiumWorlds) whose law is a Reflex"
+        )
+    return law
+
+
 def begun(environments: VectorEnv, seed: int, step: int) -> np.ndarray:
     """The first observations (environments, features) of episodes that follow from seed and step.
 
@@ -47,13 +64,13 @@ def begun(environments: VectorEnv, seed: int, step: int) -> np.ndarray:
 
 def advance(
     environments: VectorEnv, observation: np.ndarray, action: np.ndarray, executed: np.ndarray
-) -> tuple[Transition, np.ndarray, dict[str, np.ndarray]]:
+) -> tuple[Transition, np.ndarray, dict[str, Any]]:
     """One step of all: the transitions, what is seen then, and what else was told of each.
 
     Actions lie in [-1, 1], which is stretched onto the environments' bounds. Told are "ended"
     (bool), "end" (how, "" where it goes on or nothing says so), "force" (N, the greatest in the
     step) and "progress" (share of the way behind it; both NaN where nothing says so), each
-    (environments,).
+    (environments,); and where a decision can be interrupted "motions", as `Motions.pieces`.
 
     Raises `PalpateError` for observations, rewards and costs that are not finite.
     """
@@ -81,7 +98,18 @@ def advance(
         name: _told(infos, name, ended, np.full(len(ended), np.nan))
         for name in ("force", "progress")
     }
+    told |= {name: infos[name] for name in ("motions",) if name in infos}
     return lived, _finite("observation", after), {"ended": ended, "end": end, **told}
+
+
+def motions_of(told: dict[str, Any]) -> tuple[Motion, int]:
+    """The pieces of a step's decisions, and how many of the rows are pieces.
+
+    Raises `PalpateError` for numbers that are not finite.
+    """
+    found = {name: _finite(name, one) for name, one in told["motions"].items()}
+    count, done = int(found.pop("there").sum()), found["executed"]
+    return Motion(action=done, reward=np.zeros_like(found["cost"]), **found), count
 
 
 def _told(infos: dict[str, Any], name: str, ended: np.ndarray, default: np.ndarray) -> np.ndarray:

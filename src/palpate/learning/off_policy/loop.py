@@ -2,7 +2,8 @@
 
 Each round all environments take a step, and the agent is updated from what is remembered. Actions
 of a round are those of the agent before the updates of the round before it: so the updates run on
-the device while the environments step on the host.
+the device while the environments step on the host. So is the reflex of an agent that has one; what
+it interrupts is remembered in pieces, from which critics of risks learn instead.
 """
 
 import functools
@@ -19,14 +20,16 @@ from jaxtyping import Array, PRNGKeyArray
 
 from palpate.errors import PalpateError
 from palpate.learning.off_policy.agent import Agent, Batch, copied
-from palpate.learning.off_policy.buffer import ReplayBuffer, Transition
-from palpate.learning.off_policy.environments import advance, begun, check
+from palpate.learning.off_policy.buffer import Motion, ReplayBuffer, Transition
+from palpate.learning.off_policy.environments import advance, begun, check, motions_of, reflex_of
 from palpate.learning.off_policy.episodes import REMEMBERED, Episodes
 from palpate.runs import Run
 from palpate.runs.progress import interruptible, progress
 
 # After so many steps and with this state: figures to log beside the others.
 Evaluation = Callable[[int, Any], Mapping[str, float]]
+# Transitions of the task; where motions can be interrupted, their pieces besides.
+Memory = tuple[ReplayBuffer, ReplayBuffer | None]
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ class TrainingState(eqx.Module):
     buffer: ReplayBuffer
     totals: np.ndarray  # episodes that ended, costs
     episode_costs: np.ndarray  # of the last episodes, NaN before there were so many
+    motions: ReplayBuffer | None = None  # of an agent with a reflex
 
 
 def train_off_policy(
@@ -87,8 +91,12 @@ def train_off_policy(
     stretched. A "cost" in what they tell besides is remembered (none: 0), and how an episode ended
     ("end") is counted.
 
-    `offline` transitions are never forgotten; a critic of risks draws from them, a task's policy
-    does not. With `settings.pretraining` the agent's `pretrain` sees them first.
+    An agent with a `reflex` learns in `GymnasiumWorlds` whose law is a `Reflex`, to which its
+    guard's weights are handed every round; its critic learns from the pieces of its decisions.
+
+    `offline` transitions (of such an agent: pieces) are never forgotten; a critic of risks draws
+    from them, a task's policy does not. With `settings.pretraining` the agent's `pretrain` sees
+    them first.
 
     With a `run`, every `log_every` steps a line says what the episodes that ended since gave
     ("episodes", "return", "length", "cost", "ends"), how much cost there was in all ("violations")
@@ -101,11 +109,16 @@ def train_off_policy(
     and losses that are not finite.
     """
     sizes = check(environments)
-    count = environments.num_envs
+    count, reflex = environments.num_envs, reflex_of(environments, agent)
     if offline is not None and len(offline.reward) >= settings.capacity:
         raise PalpateError(
             f"the capacity is {settings.capacity} and {len(offline.reward)} transitions were "
             "collected before: expected more room than they take"
+        )
+    if offline is not None and isinstance(offline, Motion) != (reflex is not None):
+        raise PalpateError(
+            f"what was collected before are {type(offline).__name__}s: expected pieces of "
+            "decisions (Motion) for an agent with a reflex, and for no other"
         )
     if settings.pretraining and (offline is None or not hasattr(agent, "pretrain")):
         raise PalpateError(
@@ -114,21 +127,24 @@ def train_off_policy(
         )
     compiled = compiled_for(agent, settings)
     key = jax.random.key(seed)
+    pieces = reflex and ReplayBuffer.create(*sizes, settings.capacity, kind=Motion)
     start = TrainingState(
         compiled.init(jax.random.fold_in(key, 0), *sizes),
         ReplayBuffer.create(*sizes, settings.capacity),
         np.zeros(2),
         np.full(REMEMBERED, np.nan),
+        pieces,
     )
     restored = None if run is None else run.restore(start)
     done, state = restored or (0, start)
-    learnt, buffer = copied((state.agent, state.buffer))
+    learnt, memory = copied((state.agent, (state.buffer, state.motions)))
     if restored is None and offline is not None:
-        buffer = compiled.keep(buffer, offline)
+        memory = compiled.keep(memory, offline)
         if settings.pretraining:
-            learnt = compiled.pretrain(learnt, buffer, jax.random.fold_in(key, 1))
+            learnt = compiled.pretrain(learnt, memory, jax.random.fold_in(key, 1))
         if settings.pretraining and run is not None:
-            run.save(0, TrainingState(learnt, buffer, state.totals, state.episode_costs))
+            told = state.totals, state.episode_costs
+            run.save(0, TrainingState(learnt, memory[0], *told, memory[1]))
     episodes = Episodes(count, state.totals, state.episode_costs)
     observation, pending = None, None
     rounds = range(done + count, settings.steps + count, count)
@@ -142,17 +158,20 @@ def train_off_policy(
             at_random = step <= settings.warm_up
             acting = compiled.act(learnt, observation, for_action, at_random)
             action, executed = (np.asarray(one) for one in acting)
+            if reflex is not None:
+                reflex.watch_with(*compiled.reflex(learnt))
             if pending is not None:
-                learnt, buffer, figures = compiled.learn(learnt, buffer, *pending)
+                learnt, memory, figures = compiled.learn(learnt, memory, *pending)
             lived, observation, told = advance(environments, observation, action, executed)
             episodes.add(lived, told)
+            motions = None if reflex is None else motions_of(told)
             updates = settings.updates(step) - settings.updates(step - count)
-            pending = lived, for_updates, updates, np.float32(episodes.mean_cost)
+            pending = lived, motions, for_updates, updates, np.float32(episodes.mean_cost)
 
             save = step >= settings.steps or _passes(step, count, settings.checkpoint_every)
             evaluate = evaluation is not None and _passes(step, count, settings.evaluate_every)
             if save or evaluate or _passes(step, count, settings.log_every):
-                learnt, buffer, figures = compiled.learn(learnt, buffer, *pending)
+                learnt, memory, figures = compiled.learn(learnt, memory, *pending)
                 pending = None
                 line = episodes.line() | _finite(figures if updates else {}, step)
                 bar.show(**{name: line[name] for name in ("return", "violations")})
@@ -164,7 +183,7 @@ def train_off_policy(
                 observation = None
                 if run is not None:
                     told = episodes.totals, episodes.costs
-                    run.save(step, TrainingState(learnt, buffer, *told))
+                    run.save(step, TrainingState(learnt, memory[0], *told, memory[1]))
             if stop:
                 break
     return learnt
@@ -178,7 +197,8 @@ class Compiled:
         self.act = jax.jit(self._act)
         self.learn = jax.jit(self._learn, donate_argnums=(0, 1))
         self.pretrain = jax.jit(self._pretrain, donate_argnums=0)
-        self.keep = jax.jit(lambda buffer, new: buffer.add(new).keep(), donate_argnums=0)
+        self.keep = jax.jit(self._keep, donate_argnums=0)
+        self.reflex: Callable[[Any], Any] = getattr(agent, "reflex", lambda state: None)
         self._agent: Any = agent
         self._settings = settings
 
@@ -191,32 +211,43 @@ class Compiled:
         proposed = jnp.where(at_random, uniform, proposed)
         return proposed, self._agent.guard(state, observation, proposed)
 
+    def _keep(self, memory: Memory, new: Transition) -> Memory:
+        """With transitions, or pieces of them, that are kept for ever."""
+        transitions, motions = memory
+        if motions is None:
+            return transitions.add(new).keep(), None
+        return transitions, motions.add(new).keep()
+
     def _learn(
         self,
         state: Any,
-        buffer: ReplayBuffer,
+        memory: Memory,
         lived: Transition,
+        motions: tuple[Motion, Array] | None,
         key: PRNGKeyArray,
         updates: Array,
         episode_cost: Array,
-    ) -> tuple[Any, ReplayBuffer, dict[str, Array]]:
+    ) -> tuple[Any, Memory, dict[str, Array]]:
         """So many updates after `lived` is remembered; and what the last of them found."""
-        buffer = buffer.add(lived)
+        pieces = memory[1]
+        if pieces is not None and motions is not None:
+            pieces = pieces.add(*motions)
+        memory = memory[0].add(lived), pieces
 
         def update(number: Array, before: tuple[Any, dict[str, Array]]) -> Any:
-            return self._update(self._agent.update, before[0], buffer, key, number, episode_cost)
+            return self._update(self._agent.update, before[0], memory, key, number, episode_cost)
 
         of_state = lambda state: update(jnp.zeros((), int), (state, {}))[1]  # noqa: E731
         figures = jax.tree.map(
             lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(of_state, state)
         )
         state, figures = jax.lax.fori_loop(0, updates, update, (state, figures))
-        return state, buffer, figures
+        return state, memory, figures
 
-    def _pretrain(self, state: Any, buffer: ReplayBuffer, key: PRNGKeyArray) -> Any:
+    def _pretrain(self, state: Any, memory: Memory, key: PRNGKeyArray) -> Any:
         def update(number: Array, state: Any) -> Any:
             cost = jnp.full((), jnp.nan)
-            return self._update(self._agent.pretrain, state, buffer, key, number, cost)[0]
+            return self._update(self._agent.pretrain, state, memory, key, number, cost)[0]
 
         return jax.lax.fori_loop(0, self._settings.pretraining, update, state)
 
@@ -224,15 +255,18 @@ class Compiled:
         self,
         update: Callable[[Any, Batch, PRNGKeyArray], Any],
         state: Any,
-        buffer: ReplayBuffer,
+        memory: Memory,
         key: PRNGKeyArray,
         number: Array,
         episode_cost: Array,
     ) -> Any:
         keys = jax.random.split(jax.random.fold_in(key, number), 3)
         size, share = self._settings.batch, self._settings.violating_share
-        risk = buffer.sample_violating(keys[1], size, share)
-        return update(state, Batch(buffer.sample(keys[0], size), risk, episode_cost), keys[2])
+        transitions, motions = memory
+        task = transitions.sample(keys[0], size)
+        source = transitions if motions is None else motions
+        risk = source.sample_violating(keys[1], size, share)
+        return update(state, Batch(task, risk, episode_cost), keys[2])
 
 
 @functools.lru_cache(maxsize=8)

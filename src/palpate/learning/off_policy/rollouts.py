@@ -9,8 +9,8 @@ from gymnasium.vector import VectorEnv
 
 from palpate.errors import PalpateError
 from palpate.learning.off_policy.agent import Agent
-from palpate.learning.off_policy.buffer import Transition
-from palpate.learning.off_policy.environments import advance, begun, check
+from palpate.learning.off_policy.buffer import Motion, Transition
+from palpate.learning.off_policy.environments import advance, begun, check, motions_of
 from palpate.runs.progress import Watch, unwatched
 
 # From observations (environments, features), whether each has just begun, and a generator:
@@ -28,7 +28,9 @@ def collect(
     """The transitions (steps, ...) of a scripted policy, to learn from before a training.
 
     They stand in the order of time, those of all environments beside each other. What is proposed
-    is what is executed. Raises `PalpateError` as `train_off_policy`, and for fewer than one step.
+    is what is executed. Where decisions can be interrupted, their pieces are given (`Motion`) in
+    place of the steps, more of them. Raises `PalpateError` as `train_off_policy`, and for fewer
+    than one step.
     """
     check(environments)
     if steps < 1:
@@ -40,8 +42,12 @@ def collect(
         action = np.asarray(script(observation, fresh, random), np.float32)
         lived, observation, told = advance(environments, observation, action, action)
         fresh = told["ended"]
+        if "motions" in told:
+            motions, pieces = motions_of(told)
+            lived = jax.tree.map(lambda leaf, pieces=pieces: leaf[:pieces], motions)
         seen.append(lived)
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:steps], *seen)
+    most = None if isinstance(seen[0], Motion) else steps
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:most], *seen)
 
 
 def at_its_best(agent: Agent) -> Callable[[Any, np.ndarray], jax.Array]:

@@ -31,9 +31,10 @@ class SafetyCriticState(eqx.Module):
 class SafetyCritic:
     """Learns the discounted probability of a violation, twice, and the actor that makes it least.
 
-        y = c + (1 - c) (1 - terminated) discount max_i Q_target_i(s', a')
+        y = c + (1 - c) (1 - terminated) discount^duration max_i Q_target_i(s', a')
 
-    with c whether the decision violated a constraint: nothing counts beyond a violation. a' is
+    with c whether the decision violated a constraint: nothing counts beyond a violation. The
+    discount is that of a whole decision, of which a transition may be a share, its duration. a' is
     what the policy acting would do at s'. The critics' outputs are squashed into [0, 1] and follow
     y by least squares; the greater of the two is the risk. Critic and recovery see the numbers
     `seen` of an observation (None: all).
@@ -64,18 +65,23 @@ class SafetyCritic:
         return SafetyCriticState(guard, copied(guard.critic), *moments)
 
     def update(
-        self, state: SafetyCriticState, lived: Transition, following: Float[Array, "n actions"]
+        self,
+        state: SafetyCriticState,
+        lived: Transition,
+        following: Float[Array, "n actions"],
+        duration: float | Float[Array, " n"] = 1.0,
     ) -> tuple[SafetyCriticState, dict[str, Array]]:
         """After one update from transitions (n, ...), and figures to log.
 
-        `following` is what the acting policy would do at their next observations.
+        `following` is what the acting policy would do at their next observations; `duration` is in
+        decisions.
         """
         guard, optimiser = state.guard, adam(self.learning_rate)
         seen, after = guard.part(lived.observation), guard.part(lived.next_observation)
         later = jnp.max(jax.nn.sigmoid(state.target(after, following)), axis=0)
         violated = (lived.cost > 0).astype(later.dtype)
         goes_on = (1.0 - violated) * (1.0 - lived.terminated)
-        wanted = violated + self.discount * goes_on * later
+        wanted = violated + self.discount**duration * goes_on * later
 
         def critic_loss(critic: Critic) -> Array:
             error = jax.nn.sigmoid(critic(seen, lived.executed)) - wanted

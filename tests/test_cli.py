@@ -258,8 +258,17 @@ def test_words_that_do_not_fit(refused, words, sentence):
             "'gravity' cannot be fixed and identified at the same time",
         ),
         (
-            "identify rope mocap.npz --rate 100 --nodes 4",
-            "4 nodes do not fall on 5 markers; 5 nodes do",
+            "identify rope mocap.npz --rate 100 --nodes 6",
+            "6 nodes need at least as many markers, not 5",
+        ),
+        (
+            "identify rope mocap.npz --rate 100 --nodes 3",
+            "a rope has at least 4 nodes, not 3",
+        ),
+        (
+            "identify rope mocap.npz --rate 100 --nodes 4 --driven 0 1",
+            "--nodes spreads nodes between the ends, so only the ends can be driven: expected "
+            "--driven 0, -1 or both with it, got 0 1",
         ),
         (
             "identify rope mocap.npz --rate 100 --out rope.npz",

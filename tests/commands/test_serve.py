@@ -49,9 +49,7 @@ def test_sentences(refused, tmp_path, monkeypatch):
         "--rate-limit"
     )
     assert refused("--limit 0") == ("a limit of the gripper velocity is greater than 0, not 0.0")
-    assert refused("--rows markers=8") == (
-        "a policy for 6 nodes needs a multiple of 5 markers and one more, not 8"
-    )
+    assert refused("--rows markers=5") == "6 nodes need at least as many markers, not 5"
     assert "did you mean 'gripper velocity'" in refused("--limit gripper-velocity=1")
     assert refused("--rows 8") == "--rows 8 is not NAME=NUMBER"
     assert "--rows markers=8.5 is not NAME=NUMBER" in refused("--rows markers=8.5")

@@ -13,12 +13,14 @@ from deployed import rope_policy
 from palpate.errors import PalpateError
 from palpate.families.rope.control_options import EvaluateRopeStabilization, TrainRopeStabilization
 from palpate.families.rope.counterpart import (
+    SEEN_MARKERS,
     adapted,
     counterpart,
     described,
     rope_for,
     with_markers,
 )
+from palpate.families.rope.deployment import RopeDeployment
 from palpate.families.rope.options import ALONG, IdentifyRope
 from palpate.families.rope.recording import constants, record_rope
 from palpate.families.rope.robot import servoed
@@ -170,6 +172,27 @@ def test_any_markers_at_any_rate_are_tried_to_the_end(markers, rate):
     assert seen.markers.shape == (1, 6, markers, 3)
     apart = np.linalg.norm(np.diff(seen.markers[0], axis=1), axis=-1)
     assert apart.mean() == pytest.approx(base.length / (markers - 1), rel=0.05)
+
+
+def test_a_policy_of_few_nodes_sees_all_markers_that_were_recorded():
+    """In trials, and in the loop of `serve` as an exported file would be."""
+    policy, model = rope_policy(7, period=1 / 60), own_rope(nodes=7)
+    told = manifest(model, {"file": "own.npz", SEEN_MARKERS: 30})
+    base, _ = rope_for(policy, told)
+    assert base == with_markers(counterpart(model, 2e-3), 30)
+    assert rope_for(policy, told, own_rope(nodes=9))[0].markers == 30
+    deployment = RopeDeployment(policy, told, {})
+    assert deployment.sensors[1].shape == (30, 3)
+    assert deployment.segment_lengths() == pytest.approx(np.full(29, 0.73 / 29))
+    trials = [StabilizationTrial(base, "straight", 0)]
+    seen = run_trials(trials, LearnedController(policy, RopeStabilization()), 5, drawn=[0])
+    assert not seen.failures
+    decision, check = deployment.decision(), deployment.check()
+    for markers in seen.markers[0]:
+        values = {"gripper": markers[0], "markers": markers}
+        assert not check.problem(values)
+        decision.see(values)
+    assert np.isfinite(decision.decide(np.zeros(3, np.float32))).all()
 
 
 def test_a_training_tries_its_policy_in_the_same_rope(tmp_path, monkeypatch):

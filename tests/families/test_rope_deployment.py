@@ -6,6 +6,7 @@ import pytest
 from deployed import PERIOD, impedance_policy, manifest, rope_policy
 from palpate.deployment.deployment import deployment_of
 from palpate.errors import PalpateError
+from palpate.families.rope.counterpart import SEEN_MARKERS
 from palpate.families.rope.deployment import RopeDecision
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope.learned import LearnedController
@@ -14,9 +15,9 @@ from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import SMALL
 
 
-@pytest.mark.parametrize("nodes", [6, 11])
+@pytest.mark.parametrize("nodes", [6, 8, 11])
 def test_a_rope_world_gets_the_commands_of_the_trials(nodes):
-    """The same features as `LearnedController`: thinning, encoder, velocities, closed loop."""
+    """The same features as `LearnedController`: nodes, encoder, velocities, closed loop."""
     policy = rope_policy(nodes)
     world = RopeWorld(RopeConfiguration(**SMALL))
     theirs = LearnedController(policy, RopeStabilization())
@@ -34,18 +35,24 @@ def test_a_rope_world_gets_the_commands_of_the_trials(nodes):
     assert np.linalg.norm(command) > 0.1
 
 
-def test_markers_that_no_nodes_fall_on_are_refused():
-    policy = rope_policy()
-    with pytest.raises(PalpateError) as refused:
-        RopeDecision(policy, markers=8)
-    assert str(refused.value) == (
-        "a policy for 6 nodes needs a multiple of 5 markers and one more, not 8"
-    )
+def test_fewer_markers_than_nodes_are_refused():
+    with pytest.raises(PalpateError, match="6 nodes need at least as many markers, not 5"):
+        RopeDecision(rope_policy(), markers=5)
 
 
 def test_segments_are_those_of_the_model_shared_out_among_markers():
     deployment = deployment_of(rope_policy(), manifest(), {"markers": 11})
     np.testing.assert_allclose(deployment.segment_lengths(), np.full(10, 0.05))
+    uneven = {"name": "rest_length", "value": [0.1, 0.3]}
+    deployment = deployment_of(rope_policy(), {**manifest(), "model": [uneven]}, {"markers": 6})
+    np.testing.assert_allclose(deployment.segment_lengths(), [0.04, 0.04, 0.08, 0.12, 0.12])
+
+
+def test_states_have_the_markers_that_were_recorded():
+    recorded = {**manifest(), "recordings": {SEEN_MARKERS: 8}}
+    assert deployment_of(rope_policy(), manifest()).markers == 6
+    assert deployment_of(rope_policy(), recorded).markers == 8
+    assert deployment_of(rope_policy(), recorded, {"markers": 11}).markers == 11
     silent = deployment_of(rope_policy(), {**manifest(), "model": []})
     with pytest.raises(PalpateError, match="does not say how long its rope's segments are"):
         silent.check()

@@ -32,7 +32,6 @@ from palpate.identification.posterior.predictive import check_seen
 from palpate.models.files import load_model, save_model
 from palpate.models.model import Model
 from palpate.parameters import parameters_of, value_of, with_values
-from palpate.recordings.noise import measurement_noise
 from palpate.report import write_evidence
 from palpate.runs import Run
 from palpate.runs.result import read_result
@@ -172,7 +171,6 @@ def _write_fit(
     doubts = _doubts(options, data, report.scored.within(TRUSTED))
     summary = fit.summary_of_fit(report, figures, parameters, doubts)
     settings = report.settings() | {folders.DOUBTS: doubts, folders.SUMMARY: summary}
-    noise = measurement_noise(data.fitted_aligned.observation)
     save_model(
         run.path / folders.MODEL,
         report.delivered,
@@ -180,7 +178,7 @@ def _write_fit(
             folders.DOUBTS: doubts,
             "recordings": dict(data.fitted.provenance),
             "observed": settings["predicted"],
-            **({} if noise is None else {"observation_noise": noise}),
+            **({} if data.noise is None else {"observation_noise": data.noise}),
             "figures": {figure.name: figure.value for figure in figures},
             "parameters": [
                 {key: row[key] for key in ("name", "lower", "upper", "verdict")}

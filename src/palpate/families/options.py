@@ -230,6 +230,13 @@ class Identify(Options, ABC):
         """
         return []
 
+    def reduced(self, *aligned: Aligned) -> tuple[Aligned, ...]:
+        """What a model is fitted to and scored on, of recordings, the one to be fitted first.
+
+        After `problems`, which are seen in all that was recorded. Here all of it.
+        """
+        return aligned
+
     def misfit(self, aligned: Aligned, error: float) -> str:
         """The same of a fit that misses the scored recordings by `error`; "" where it may.
 

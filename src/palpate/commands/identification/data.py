@@ -9,6 +9,7 @@ from palpate.errors import PalpateError
 from palpate.families.options import Identify
 from palpate.recordings import Aligned, Recording, join
 from palpate.recordings.files import read_recording
+from palpate.recordings.noise import measurement_noise
 
 SHORTEST = 0.5  # s of recordings that a posterior needs, in all
 
@@ -24,6 +25,7 @@ class Data:
     unit: str
     observed: tuple[str, ...]
     problems: tuple[str, ...]  # of the recording that is fitted, in sentences
+    noise: float | None  # of what was recorded, a standard deviation in the unit
 
     @property
     def shown(self) -> list[Recording]:
@@ -58,8 +60,10 @@ def read(options: Identify) -> Data:
         validation = _prepared(validation, options, "validation, ")
         scored = validation.align(period, observed, action)
     problems = tuple(options.problems(aligned))
+    noise = measurement_noise(aligned.observation)
+    aligned, scored = options.reduced(aligned, scored)
     unit = _unit(fitted, observed)
-    return Data(fitted, validation, aligned, scored, unit, observed, problems)
+    return Data(fitted, validation, aligned, scored, unit, observed, problems, noise)
 
 
 def _unit(recording: Recording, observed: tuple[str, ...]) -> str:

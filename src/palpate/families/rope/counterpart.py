@@ -14,7 +14,7 @@ the same of what makes a hanging rope swing, summed along its length L:
                  because how a hanging rope swings says next to nothing about it
     bodies       40, or down to 20 where a stiff rope of more would need shorter time steps
     gravity      the model's, as its length and its gravity say together how fast it swings
-    markers      where the nodes are
+    markers      where the nodes are; others evenly between those, as `at_nodes` has it
 
 Continuum limits of both chains are those of Bergou et al. 2008 (Discrete Elastic Rods, ACM Trans.
 Graph. 27:63), whose bending energy is EI kappa^2 h / 2 for each joint. A grip that holds the first
@@ -37,6 +37,7 @@ from palpate.trials.controller import SAME_PERIOD
 from palpate.worlds.rope.configuration import RopeConfiguration, in_step
 
 SOURCE = "MuJoCo rope"  # in the provenance of what palpate recorded itself
+SEEN_MARKERS = "seen_markers"  # in the provenance of what was identified: how many a rope had
 TWIST = 0.7  # GJ / EI
 BODIES = (40, 30, 20)
 
@@ -120,6 +121,11 @@ def recorded_world(recordings: Mapping[str, Any]) -> RopeConfiguration | None:
         return None
 
 
+def recorded_markers(manifest: Mapping[str, Any]) -> int | None:
+    """How many markers the recordings of a policy's model have; None where its file is silent."""
+    return manifest.get("recordings", {}).get(SEEN_MARKERS)
+
+
 def trained_on(policy: CommandPolicy, manifest: Mapping[str, Any]) -> Rope | None:
     """The model that a policy's file says it was trained on; None where it does not."""
     rows = {row["name"]: row["value"] for row in manifest.get("model", ()) if "value" in row}
@@ -136,16 +142,20 @@ def rope_for(
     """The rope to try a policy in, and whose it is, in words.
 
     That of the `model` where one is named. Else the rope that palpate simulated for the policy's
-    recordings; or, for recordings of anything else, that of the model it was trained on. A file
-    that does not say what was recorded, as those that ship, is tried in the default rope, unless
-    its rate or its nodes do not fit that.
+    recordings; or, for recordings of anything else, that of the model it was trained on. Those of
+    models have as many markers as were recorded. A file that does not say what was recorded, as
+    those that ship, is tried in the default rope, unless its rate or its nodes do not fit that.
 
     Raises as `counterpart`.
     """
     usual = RopeConfiguration.observation_noise
     noise = manifest.get("training", {}).get("observation_noise", usual)
+
+    def seen(rope: RopeConfiguration) -> RopeConfiguration:
+        return with_markers(rope, recorded_markers(manifest) or rope.markers)
+
     if model is not None:
-        return counterpart(model, noise), "that of the model"
+        return seen(counterpart(model, noise)), "that of the model"
     recordings = manifest.get("recordings")
     if recordings is None:
         default = RopeConfiguration()
@@ -158,7 +168,7 @@ def rope_for(
     own = trained_on(policy, manifest)
     if own is None:
         return RopeConfiguration(), "the one that `palpate record rope` has by default"
-    return counterpart(own, noise), "that of the model it was trained on"
+    return seen(counterpart(own, noise)), "that of the model it was trained on"
 
 
 def adapted(base: RopeConfiguration, constants: Mapping[str, float]) -> RopeConfiguration:

@@ -12,9 +12,10 @@ from palpate.deployment.deployment import Deployment
 from palpate.deployment.plausibility import Values
 from palpate.errors import PalpateError
 from palpate.families.rope.chain_check import ChainCheck
-from palpate.families.rope.counterpart import rope_for, with_markers
+from palpate.families.rope.counterpart import recorded_markers, rope_for, with_markers
 from palpate.family import check_name
 from palpate.networks import Channel, CommandPolicy
+from palpate.perception.rope.nodes import at_nodes
 from palpate.perception.velocity import VelocityEstimator
 from palpate.runs import Figure
 from palpate.trials.rope.stabilization import settling_time
@@ -25,8 +26,8 @@ Network = Callable[[np.ndarray, np.ndarray], np.ndarray]  # features and command
 class RopeDecision:
     """A rope's policy, fed as in training: node positions relative to the gripper and velocities.
 
-    The nodes are the markers, or every second of them, and so on; at the gripper its encoder is
-    believed, not its marker. Velocities are `VelocityEstimator`'s, of the last frames.
+    The nodes lie among the markers as `at_nodes` says; at the gripper its encoder is believed, not
+    its marker. Velocities are `VelocityEstimator`'s, of the last frames.
 
     Args:
         policy: trained for `palpate.tasks.RopeStabilization`.
@@ -34,18 +35,12 @@ class RopeDecision:
         network: decides in the policy's stead, as `NetworkDecision` does.
 
     Raises:
-        PalpateError: the policy observes something else, or its nodes do not fall on so many
-            markers.
+        PalpateError: the policy observes something else, or more nodes than there are markers.
     """
 
     def __init__(self, policy: CommandPolicy, markers: int, network: Network | None = None):
         nodes = nodes_of(policy)
-        self._every, rest = divmod(markers - 1, nodes - 1)
-        if rest or not self._every:
-            raise PalpateError(
-                f"a policy for {nodes} nodes needs a multiple of {nodes - 1} markers and one more, "
-                f"not {markers}"
-            )
+        at_nodes(np.zeros((markers, 3)), nodes)  # which says now if there are too few
         self._network = network or NetworkDecision(policy)
         self._weights = np.asarray(VelocityEstimator(policy.period).weights, np.float32)
         self._window = np.zeros((len(self._weights), nodes, 3), np.float32)
@@ -60,7 +55,7 @@ class RopeDecision:
         """See `palpate.deployment.supervisor.Decision.see`."""
         window = self._window
         window[:-1] = window[1:]
-        window[-1] = values["markers"][:: self._every]
+        window[-1] = at_nodes(values["markers"], len(window[-1]))
         window[-1, 0] = values["gripper"]
         if not self._started:
             window[:-1] = window[-1]
@@ -79,10 +74,11 @@ class RopeDeployment(Deployment):
     """See `Deployment`: the sensors are the gripper's encoder and the markers, gripper to tip."""
 
     def set_rows(self, rows: Mapping[str, int]) -> None:
-        """As many markers as the policy has nodes, unless `rows` says how many there are."""
+        """As many markers as were recorded, else as nodes; or as many as `rows` says."""
         for name in rows:
             check_name("sensor channel with open rows", name, ["markers"])
-        self.markers = rows.get("markers", nodes_of(self.policy))
+        usual = recorded_markers(self.manifest) or nodes_of(self.policy)
+        self.markers = rows.get("markers", usual)
         self.sensors = (Channel("gripper", (3,), "m"), Channel("markers", (self.markers, 3), "m"))
 
     def decision(self) -> RopeDecision:
@@ -102,9 +98,9 @@ class RopeDeployment(Deployment):
                 "the policy does not say how long its rope's segments are: expected one that "
                 "`palpate train rope-stabilization` wrote"
             )
-        own = np.asarray(lengths[0], float)
-        every = (self.markers - 1) // len(own)
-        return np.repeat(own / every, every)
+        along = np.append(0.0, np.cumsum(np.asarray(lengths[0], float)))
+        places = np.linspace(0, len(along) - 1, self.markers)
+        return np.diff(np.interp(places, np.arange(len(along)), along))
 
     def simulated_robot(self, endpoint: str, seconds: float, seed: int) -> list[str]:
         """See `Deployment.simulated_robot`: `palpate.families.rope.robot`, with the policy's rope.

@@ -131,9 +131,10 @@ class IdentifyRope(Identify, Reading):
     mass: Number = None
     """Of the whole rope, kg; unknown, a node has 4 g, and only what is found per mass counts."""
     nodes: Annotated[
-        int | None, arg(metavar="N", help_behavior_hint="(default: one for each marker)")
+        int | None, arg(metavar="N", help_behavior_hint="(default: one for each marker, or fewer)")
     ] = None
-    """Of the model: at every marker, at every second one, and so on."""
+    """Of the model, spread evenly over the markers; fewer where markers are so close together that
+    its time steps could not integrate the bending damping of a rope."""
     substeps: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: of about 1 ms)")
     ] = None
@@ -146,16 +147,24 @@ class IdentifyRope(Identify, Reading):
         if self.uniform:
             object.__setattr__(self, "shared", tuple(dict.fromkeys((*self.shared, *ALONG))))
 
+    def check(self) -> None:
+        """See `Identify.check`."""
+        if self.nodes is not None and self.nodes < 4:
+            raise PalpateError(f"a rope has at least 4 nodes, not {self.nodes}")
+
     def reading(self) -> dict[str, Any]:
         topics = self.topics or ()
         return {**super().reading(), "unit": self.unit, "up": self.up, "topics": topics}
 
     def prepare(self, recording: Recording) -> Recording:
-        """Keep the markers that are nodes, and make those that are gripped a driven channel."""
+        """Say how many markers there are, and make those that are gripped a driven channel."""
+        from palpate.families.rope.counterpart import SEEN_MARKERS
         from palpate.families.rope.recording import GRIPPER
         from palpate.recordings.markers import with_driven
 
-        recording = self._thinned(recording)
+        count = recording.trials[0][self.observation].values.shape[1]
+        provenance = {**recording.provenance, SEEN_MARKERS: count}
+        recording = dataclasses.replace(recording, provenance=provenance)
         if self.driven or GRIPPER not in recording.trials[0].channels:
             return with_driven(recording, self.driven or (0,), self.observation, GRIP)
         return recording
@@ -185,6 +194,33 @@ class IdentifyRope(Identify, Reading):
 
         return problems(aligned, self._driven(aligned), self.mass)
 
+    def reduced(self, *aligned: Aligned) -> tuple[Aligned, ...]:
+        """See `Identify.reduced`: the nodes of the model."""
+        from palpate.families.rope.recording import enough_nodes
+        from palpate.perception.rope.nodes import at_nodes
+
+        fitted, nodes = aligned[0], self.nodes
+        markers = fitted.observation.shape[2]
+        inside = set(self._driven(fitted)) - {0, markers - 1}
+        if nodes is None and not inside:
+            nodes = enough_nodes(fitted, self.substeps)
+            if nodes < markers:
+                print(
+                    f"note: the model has {nodes} nodes between the ends of {markers} markers: "
+                    "closer ones could not be integrated with as much bend damping as ropes have"
+                )
+        if nodes is None or nodes == markers:
+            return aligned
+        if inside:
+            raise PalpateError(
+                "--nodes spreads nodes between the ends, so only the ends can be driven: expected "
+                f"--driven 0, -1 or both with it, got {' '.join(map(str, self.driven))}"
+            )
+        return tuple(
+            dataclasses.replace(one, observation=at_nodes(one.observation, nodes))
+            for one in aligned
+        )
+
     def misfit(self, aligned: Aligned, error: float) -> str:
         from palpate.families.rope.recording_check import misfit
 
@@ -209,27 +245,3 @@ class IdentifyRope(Identify, Reading):
         from palpate.recordings.recording import resolve_indices
 
         return resolve_indices(self.driven or (0,), aligned.observation.shape[2], "marker")
-
-    def _thinned(self, recording: Recording) -> Recording:
-        if self.nodes is None:
-            return recording
-        if not set(self.driven) <= {0, -1}:
-            raise PalpateError(
-                f"--nodes keeps every so many markers, so only the ends can be driven: expected "
-                f"--driven 0, -1 or both with it, got {' '.join(map(str, self.driven))}"
-            )
-        count = recording.trials[0][self.observation].values.shape[1]
-        every, rest = divmod(count - 1, max(self.nodes - 1, 1))
-        if rest or not every:
-            fitting = [n + 1 for n in range(3, count) if (count - 1) % n == 0]
-            raise PalpateError(
-                f"{self.nodes} nodes do not fall on {count} markers; "
-                f"{', '.join(map(str, fitting)) or 'no number of'} nodes do"
-            )
-        trials = []
-        for trial in recording.trials:
-            markers = trial[self.observation]
-            kept = dataclasses.replace(markers, values=markers.values[:, ::every], notes=())
-            channels = {**trial.channels, self.observation: kept}
-            trials.append(dataclasses.replace(trial, channels=channels))
-        return dataclasses.replace(recording, trials=tuple(trials))

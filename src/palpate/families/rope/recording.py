@@ -1,13 +1,16 @@
 """Recordings of MuJoCo ropes, and the rope model that an identification starts from."""
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.models.rope import Rope
+from palpate.models.rope.stability import LIMIT
 from palpate.parameters import declare
+from palpate.perception.rope.nodes import at_nodes
 from palpate.recordings import Aligned, Channel, Driven, Recording, Role, Trial
 from palpate.worlds.excitation import excitation, record
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
@@ -15,6 +18,8 @@ from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 MARKERS, GRIPPER, COMMAND = "markers", "gripper", "command"
 NODE_MASS = 4e-3  # kg, where nothing was weighed: the motion tells stiffness per mass and no more
 TIME_STEP = 1e-3  # s, about, of the model's integration
+BEND_DAMPING = 6e-4  # m^4/s, over the rope's density, that a model should be able to integrate
+FEWEST_NODES = 4
 STRETCHED, UNEVEN = 0.15, 0.03  # of a length: by which equal segments differ along a line, off it
 
 
@@ -53,6 +58,31 @@ def constants(configuration: RopeConfiguration) -> dict[str, str | float | int]:
     }
 
 
+def enough_nodes(aligned: Aligned, substeps: int | None = None) -> int:
+    """How many nodes a model of this rope should have: as many as markers, or fewer.
+
+    With `substeps` in a period, or the usual number. The most bend damping c (N m^2 s) that steps
+    of h s can integrate on segments of l m is, for a rope of r kg/m without anything else, given by
+    32 h c / (r l^4) = `LIMIT`: see `palpate.models.rope.stability`. Nodes are no closer than where
+    c / r is `BEND_DAMPING`. A fit of closer ones makes up for damping that they cannot have by too
+    much stiffness, and one of nodes far apart for their coarse chain.
+    """
+    nodes = markers = aligned.observation.shape[2]
+    time_step = aligned.period / (substeps or usual_substeps(aligned))
+    closest = (32 * time_step * BEND_DAMPING / LIMIT) ** 0.25
+    for _ in range(2):  # once more, as noise lengthens a rope of close markers
+        distance = np.linalg.norm(np.diff(at_nodes(aligned.observation, nodes), axis=2), axis=-1)
+        seen = np.isfinite(distance)
+        mean = np.sum(distance, (0, 1), where=seen) / np.maximum(seen.sum((0, 1)), 1)
+        nodes = min(markers, max(FEWEST_NODES, 1 + math.floor(mean.sum() / closest)))
+    return nodes
+
+
+def usual_substeps(aligned: Aligned) -> int:
+    """Of a period, so that a time step lasts about `TIME_STEP`."""
+    return max(1, round(aligned.period / TIME_STEP))
+
+
 def starting_rope(
     aligned: Aligned,
     driven: Sequence[int] = (0,),
@@ -68,8 +98,10 @@ def starting_rope(
     `PalpateError` for too few markers, or neighbouring ones that coincide.
     """
     nodes = aligned.observation.shape[2]
-    if nodes < 4:
-        raise PalpateError(f"a rope needs at least 4 markers, the recording has {nodes}")
+    if nodes < FEWEST_NODES:
+        raise PalpateError(
+            f"a rope needs at least {FEWEST_NODES} markers and nodes, and here are {nodes}"
+        )
     distance = np.linalg.norm(np.diff(aligned.observation, axis=2), axis=-1)
     rest_length = np.nanmean(distance, axis=(0, 1))
     if not np.all(rest_length > 0):
@@ -89,7 +121,7 @@ def starting_rope(
         driven=tuple(driven),
         drive="position",
         control_period=aligned.period,
-        substeps=max(1, round(aligned.period / TIME_STEP)),
+        substeps=usual_substeps(aligned),
     )
     if rope.held_at_both_ends:
         # Two grips show how a rope is bent at rest and how its mass is spread.

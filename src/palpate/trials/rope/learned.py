@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.errors import PalpateError
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
 from palpate.perception.rope.marker_observer import MarkerObserver
+from palpate.perception.rope.nodes import at_nodes
 from palpate.perception.velocity import VelocityEstimator
 from palpate.tasks.rope import RopeStabilization
 from palpate.tasks.rope.stabilization import HangingRopeTask
@@ -20,8 +20,8 @@ from palpate.worlds.rope.rope import RopeObservation
 class RopeObserver:
     """Markers as a camera sees them to states of a model with that many segments.
 
-    The nodes are the markers, or every second of them, and so on. Where the gripper is, its encoder
-    says better than its marker. What is carried is a window of positions (frames, worlds, nodes, 3)
+    The nodes lie among the markers as `at_nodes` says. Where the gripper is, its encoder says
+    better than its marker. What is carried is a window of positions (frames, worlds, nodes, 3)
     in m, from which velocities are estimated.
     """
 
@@ -43,15 +43,8 @@ class RopeObserver:
         return window, RopeState(jnp.asarray(positions), jnp.tensordot(weights, window, axes=1))
 
     def positions(self, observation: RopeObservation) -> np.ndarray:
-        """Of the nodes, (worlds, nodes, 3) in m; `PalpateError` if they fall on no markers."""
-        markers = observation.markers.shape[1]
-        every, rest = divmod(markers - 1, self._segments)
-        if rest:
-            raise PalpateError(
-                f"a controller for {self._segments + 1} nodes needs a multiple of "
-                f"{self._segments} markers and one more, not {markers}"
-            )
-        positions = observation.markers[:, ::every].astype(np.float32)
+        """Of the nodes, (worlds, nodes, 3) in m; raises as `at_nodes`."""
+        positions = at_nodes(observation.markers, self._segments + 1).astype(np.float32)
         positions[:, 0] = observation.gripper_position
         return positions
 

@@ -67,7 +67,7 @@ def test_risk_is_that_of_going_on_until_the_decision_ends():
     def pieces(action, cost, terminated) -> Motion:
         done = action * ones[:, None]
         return Motion(places[here], done, done, nothing, cost, places[there], terminated,
-                      0.5 * ones, holds)  # fmt: skip
+                      0.5 * ones, holds, ones - holds)  # fmt: skip
 
     lived = jax.tree.map(
         lambda *parts: jnp.concatenate(parts), pieces(1.0, over, over), pieces(-1.0, nothing, ones)
@@ -81,7 +81,7 @@ def test_risk_is_that_of_going_on_until_the_decision_ends():
 
     state = jax.jit(lambda state: jax.lax.fori_loop(0, 2000, update, state))(state)
     risk = state.safety.guard.risk(lived.observation, lived.executed)
-    going_on = [0.0, 0.0, DISCOUNT, DISCOUNT**0.5, 1.0]  # half a decision each
+    going_on = [0.0, 0.0, DISCOUNT**1.5, DISCOUNT, DISCOUNT**0.5]  # half a decision each
     np.testing.assert_allclose(risk[:LENGTH], going_on, atol=0.04)
     np.testing.assert_allclose(risk[LENGTH:], 0.0, atol=0.04)
     assert (state.safety.guard.recover(lived.observation)[2:] < 0.0).all()
@@ -116,14 +116,16 @@ def test_a_killed_training_resumes_to_the_same_bits_pieces_and_all(tmp_path: Pat
     )
     state, arrays, lines, offline = trained(tmp_path / "whole")
     assert made[0].learn._cache_size() == 1
-    # Those of before are pieces, and every violation is in one of them alone.
+    # Those of before are pieces, of which the last of a decision count.
     assert isinstance(offline, Motion)
-    assert offline.duration.max() == pytest.approx(0.2)
-    assert len(offline.cost) > 4 * 40
+    assert len(offline.cost) > 4 * 40 == 4 * offline.whole.sum()
     assert arrays["motions.kept"] == len(offline.cost)
     assert arrays["buffer.kept"] == 0
     assert arrays["buffer.added"] == SHORT.steps
-    assert arrays["motions.violated"] - offline.cost.sum() == lines[-1]["violations"] > 0
+    lived = slice(len(offline.cost), arrays["motions.added"])
+    pieces = {n: arrays[f"motions.transitions.{n}"][lived] for n in ("cost", "last")}
+    assert (pieces["cost"] * pieces["last"]).sum() == lines[-1]["violations"] > 0
+    assert pieces["last"].sum() == SHORT.steps
     for step in (32, 64):
         with pytest.raises(RuntimeError, match="killed"):
             trained(tmp_path / "cut", killed_after=step)
@@ -145,13 +147,13 @@ def test_a_reflex_that_learns_keeps_a_training_from_the_edge(tmp_path: Path):
     with Folder.open(tmp_path, {}) as run:
         train_off_policy(watched(), agent, settings, 0, run, offline=offline)
         violations = run.metrics()[-1]["violations"]
-    assert np.sum(offline.cost) > 80  # of 1000 decisions
+    assert np.sum(offline.cost * offline.whole) > 80  # of 1000 decisions
     assert violations < 10
 
 
 def test_only_the_first_of_a_batch_are_added():
     zeros, ones = np.zeros((4, 1), np.float32), np.ones(4, np.float32)
-    batch = Motion(zeros, zeros, zeros, np.arange(4.0), ones, zeros, ones, ones, ones)
+    batch = Motion(zeros, zeros, zeros, np.arange(4.0), ones, zeros, ones, ones, ones, ones)
     buffer = ReplayBuffer.create(1, 1, 6, kind=Motion)
     for _ in range(3):
         buffer = buffer.add(batch, 3)

@@ -54,29 +54,42 @@ def test_a_decision_that_looks_safe_is_interrupted_before_the_edge():
     assert environments.step(FORWARDS)[4]["end"].tolist() == ["", ""]
 
 
-def test_pieces_tell_a_decision_apart():
-    pieces = runways(reflex(watchful()))
-    pieces.step(FORWARDS)
-    told = pieces.lockstep.motions.pieces  # type: ignore[union-attr]
+def rows(environments) -> dict[str, np.ndarray]:
+    told = environments.lockstep.motions.pieces
     there = told["there"] == 1
     assert len(there) == 2 * (2 * 5 + 3)  # constant, for what is compiled
     assert there[: there.sum()].all()
-    own = {name: values[there] for name, values in told.items()}
-    first = np.isin(own["next_observation"][:, 0], own["observation"][own["executed"][:, 0] < 0])
-    assert first.any()  # an interrupted piece leads to where the recovery begins
-    np.testing.assert_allclose(own["duration"].sum(), 2.0)
-    assert sorted(own["holds"])[:3] == [0, 0, 1]  # of each world one piece ends the decision
+    return {name: values[there] for name, values in told.items()}
+
+
+def test_pieces_lead_from_within_a_decision_to_where_its_action_ends():
+    environments = runways(reflex(watchful()))
+    environments.step(FORWARDS)
+    own = rows(environments)
     moved = own["next_observation"] - own["observation"]
     np.testing.assert_allclose(moved, own["executed"] * own["duration"][:, None], atol=1e-6)
     assert own["cost"].sum() == own["terminated"].sum() == 0
+    assert own["last"].sum() == 2  # two decisions
+    undisturbed = own["observation"][:, 0] < -0.05
+    np.testing.assert_allclose(own["duration"][undisturbed], [1, 0.8, 0.6, 0.4, 0.2], atol=1e-6)
+    assert own["last"][undisturbed].tolist() == [0, 0, 0, 0, 1]
+    back, broken = own["executed"][:, 0] < 0, own["holds"] == 1
+    assert not (back & broken).any()
+    (where,) = np.unique(own["next_observation"][broken])  # where it was interrupted
+    assert where == own["observation"][back].max() >= 0.4
+    np.testing.assert_allclose(own["duration"][broken], where - own["observation"][broken, 0])
+    assert (own["duration"][broken | back] < 1 - 0.4 + 1e-6).all()
 
-    over = runways(reflex(None))
-    over.step(FORWARDS)
-    told = over.lockstep.motions.pieces  # type: ignore[union-attr]
-    assert told["cost"].sum() == told["terminated"].sum() == 1
-    ended = np.flatnonzero(told["cost"])[0]
-    assert told["next_observation"][ended, 0] > EDGE
-    np.testing.assert_allclose(told["duration"].sum(), 1.8)  # the ninth period's start is beyond
+
+def test_pieces_tell_of_a_violation_from_wherever_they_began():
+    environments = runways(reflex(None))
+    environments.step(FORWARDS)
+    own = rows(environments)
+    violated = own["cost"] == 1
+    np.testing.assert_array_equal(violated, own["terminated"] == 1)
+    assert (own["next_observation"][violated, 0] > EDGE).all()
+    np.testing.assert_allclose(own["duration"][violated], [0.8, 0.6, 0.4, 0.2], atol=1e-6)
+    assert (own["last"] * own["cost"]).sum() == 1
 
 
 class Felt(NamedTuple):

@@ -65,10 +65,10 @@ def trained_in_world(options: TrainInWorld, run: Run) -> tuple[ActorPolicy, list
         Figure("training.episodes", sum(line["episodes"] for line in lines), ""),
         Figure(
             "pretraining.violations",
-            0.0 if offline is None else float(np.sum(np.asarray(offline.cost) > 0)),
+            0.0 if offline is None else float(np.sum((offline.cost > 0) & offline.whole)),
             "",
         ),
-        Figure("pretraining.steps", 0 if offline is None else offline.decisions, ""),
+        Figure("pretraining.steps", 0 if offline is None else int(np.sum(offline.whole)), ""),
     ]
     policy = options.policy(state)
     save_controller(

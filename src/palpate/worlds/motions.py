@@ -1,4 +1,4 @@
-"""What happened within a decision that could be interrupted, in pieces of one action each."""
+"""What came of decisions that could be interrupted, told from several moments within each."""
 
 from collections.abc import Callable
 
@@ -6,12 +6,15 @@ import numpy as np
 
 from palpate.worlds.world import InterruptingLaw
 
+_Start = tuple[int, np.ndarray, np.ndarray, np.ndarray]  # period, seen, executed, of which worlds
+
 
 class Motions:
-    """Cuts the decisions of worlds side by side into pieces in which the action is the same.
+    """The decisions of worlds side by side, in pieces that begin within them.
 
-    A piece ends after `law.pace` control periods, where the law interrupts, and with the decision
-    or the episode. One that ends by a diverged simulation is left out.
+    A piece begins with the decision, where the law interrupts, and every `law.pace` control periods
+    after either. It leads to where its action ends: to the next interruption, the decision's end
+    or that of the episode. What ends by a diverged simulation is left out.
     """
 
     def __init__(self, law: InterruptingLaw, features: Callable[[], np.ndarray], every: int):
@@ -27,18 +30,19 @@ class Motions:
         """
         law = self._law
         if period == 0:
-            count = len(law.executed)
-            self._seen, self._done = self._features(), law.executed.copy()
-            self._began, self._ran = np.zeros(count, int), np.zeros(count, int)
+            self._began, self._ran = np.zeros((2, len(running)), int)
+            self._starts: list[_Start] = []
             self._rows: list[dict[str, np.ndarray]] = []
+            due = np.ones(len(running), bool)
         else:
-            cut = running & (law.interrupted | (period - self._began >= law.pace))
-            self._ran[running] = period
-            if cut.any():
-                after, nothing = self._features(), np.zeros(len(cut))
-                self._cut(cut, after, nothing, nothing, holds=True)
-                self._seen[cut], self._done[cut] = after[cut], law.executed[cut]
-                self._began[cut] = period
+            due = running & (law.interrupted | (period - self._began >= law.pace))
+        self._ran[running] = period
+        if due.any():
+            seen, nothing = self._features(), np.zeros(len(due))
+            if period:
+                self._end(due & law.interrupted, seen, nothing, nothing, holds=True)
+            self._starts.append((period, seen, law.executed.copy(), due))
+            self._began[due] = period
         self._ran[running] = period + 1
 
     def finish(self, violated: np.ndarray, terminated: np.ndarray, known: np.ndarray) -> None:
@@ -46,20 +50,21 @@ class Motions:
 
         Then `pieces` are arrays of a constant length whose first rows, those where "there" is 1,
         hold "observation", "executed" and "next_observation" (n, ...), and (n,) "cost" (1: a
-        violation ended it), "terminated" (1: it was the episode's last), "duration" (as a share of
-        a whole decision) and "holds" (1: the decision goes on after it).
+        violation ended it), "terminated" (1: so did the episode), "duration" (as a share of a whole
+        decision), "holds" (1: it was interrupted, the decision goes on) and "last" (1: no piece of
+        its decision began later).
         """
-        self._cut(known, self._features(), violated, terminated, holds=False)
-        columns = {
-            name: np.concatenate([row[name] for row in self._rows]) for name in self._rows[0]
-        }
-        room = len(known) * self._most
+        self._end(known, self._features(), violated, terminated, holds=False)
+        rows, room = self._rows, len(known) * self._most
+        free = room - sum(len(row["there"]) for row in rows)
         self.pieces = {
-            name: np.concatenate([one, np.zeros((room - len(one), *one.shape[1:]), np.float32)])
-            for name, one in columns.items()
+            name: np.concatenate(
+                [*(row[name] for row in rows), np.zeros((free, *one.shape[1:]), np.float32)]
+            )
+            for name, one in rows[0].items()
         }
 
-    def _cut(
+    def _end(
         self,
         which: np.ndarray,
         after: np.ndarray,
@@ -67,15 +72,20 @@ class Motions:
         terminated: np.ndarray,
         holds: bool,
     ) -> None:
-        one = np.ones(np.sum(which), np.float32)
-        columns = {
-            "observation": self._seen[which],
-            "executed": self._done[which],
-            "next_observation": after[which],
-            "cost": cost[which],
-            "terminated": terminated[which],
-            "duration": (self._ran - self._began)[which] / self._every,
-            "holds": one * holds,
-            "there": one,
-        }
-        self._rows.append({name: np.array(x, np.float32) for name, x in columns.items()})
+        """The actions of these worlds end here: so do all pieces that began under them."""
+        for period, seen, executed, began in self._starts:
+            ended = which & began
+            one = np.ones(int(np.sum(ended)), np.float32)
+            columns = {
+                "observation": seen[ended],
+                "executed": executed[ended],
+                "next_observation": after[ended],
+                "cost": cost[ended],
+                "terminated": terminated[ended],
+                "duration": (self._ran[ended] - period) / self._every,
+                "holds": one * holds,
+                "last": (self._began[ended] == period) * (not holds),
+                "there": one,
+            }
+            self._rows.append({name: np.array(x, np.float32) for name, x in columns.items()})
+            began[which] = False

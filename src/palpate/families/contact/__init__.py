@@ -21,5 +21,6 @@ FAMILY = Family(
     },
     experiments={
         "contact-model": "palpate.experiments.contact.contact_model:reproduce",
+        "maze-reflex": "palpate.experiments.contact.maze_reflex:reproduce",
     },
 )

@@ -30,25 +30,27 @@ class Transition(eqx.Module):
     terminated: Float[Any, "*batch"]
 
     @property
-    def decisions(self) -> int:
-        """How many they are."""
-        return len(self.reward)
+    def whole(self) -> Any:
+        """(*batch,) bool: which of them are to be counted as a decision."""
+        return jnp.ones_like(self.cost, bool)
 
 
 class Motion(Transition):
-    """Pieces of decisions that could be interrupted, at the rate of the reflex that does it.
+    """What came of decisions that could be interrupted, told from several moments within each.
 
-    `action` is `executed`, and the reward is not known. `duration` is a share of a whole decision;
-    `holds` is 1 where the decision goes on after the piece.
+    Each leads to where its action ends; `action` is `executed`, and the reward is not known.
+    `duration` is a share of a whole decision; `holds` is 1 where the action was interrupted, `last`
+    where no piece of the decision began later. See `palpate.worlds.motions.Motions`.
     """
 
     duration: Float[Any, "*batch"]
     holds: Float[Any, "*batch"]
+    last: Float[Any, "*batch"]
 
     @property
-    def decisions(self) -> int:
-        """How many decisions these are the pieces of."""
-        return int((self.holds == 0).sum())
+    def whole(self) -> Any:
+        """See `Transition.whole`: of each decision the last piece."""
+        return self.last > 0
 
 
 class ReplayBuffer(eqx.Module):

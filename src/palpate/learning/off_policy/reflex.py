@@ -18,7 +18,8 @@ class ReflexAgent(RecoveryAgent):
 
     Its environments hold the guard (`palpate.safety.reflex.Reflex`), which looks in every control
     period, the first one of a decision included. The critic learns from `Motion`s: its risk is
-    that of going on with an action until the decision's end, and then as the task's agent would.
+    that of going on with an action until the decision's end, and then as the task's agent would;
+    a violation counts discount^(time until then), in decisions.
     """
 
     def guard(self, state: RecoveryState, observation: Array, proposed: Array) -> Array:

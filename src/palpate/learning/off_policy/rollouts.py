@@ -29,7 +29,7 @@ def collect(
 
     They stand in the order of time, those of all environments beside each other. What is proposed
     is what is executed. Where decisions can be interrupted, their pieces are given (`Motion`) in
-    place of the steps, more of them. Raises `PalpateError` as `train_off_policy`, and for fewer
+    place of the steps, and more of them. Raises `PalpateError` as `train_off_policy`, and for fewer
     than one step.
     """
     check(environments)

@@ -31,10 +31,9 @@ class SafetyCriticState(eqx.Module):
 class SafetyCritic:
     """Learns the discounted probability of a violation, twice, and the actor that makes it least.
 
-        y = c + (1 - c) (1 - terminated) discount^duration max_i Q_target_i(s', a')
+        y = c + (1 - c) (1 - terminated) discount max_i Q_target_i(s', a')
 
-    with c whether the decision violated a constraint: nothing counts beyond a violation. The
-    discount is that of a whole decision, of which a transition may be a share, its duration. a' is
+    with c whether the decision violated a constraint: nothing counts beyond a violation. a' is
     what the policy acting would do at s'. The critics' outputs are squashed into [0, 1] and follow
     y by least squares; the greater of the two is the risk. Critic and recovery see the numbers
     `seen` of an observation (None: all).
@@ -69,19 +68,22 @@ class SafetyCritic:
         state: SafetyCriticState,
         lived: Transition,
         following: Float[Array, "n actions"],
-        duration: float | Float[Array, " n"] = 1.0,
+        duration: Float[Array, " n"] | None = None,
     ) -> tuple[SafetyCriticState, dict[str, Array]]:
         """After one update from transitions (n, ...), and figures to log.
 
-        `following` is what the acting policy would do at their next observations; `duration` is in
-        decisions.
+        `following` is what the acting policy would do at their next observations. A `duration`, as
+        a share of a decision, is over at those: then all of y is discounted, by it.
         """
         guard, optimiser = state.guard, adam(self.learning_rate)
         seen, after = guard.part(lived.observation), guard.part(lived.next_observation)
         later = jnp.max(jax.nn.sigmoid(state.target(after, following)), axis=0)
         violated = (lived.cost > 0).astype(later.dtype)
         goes_on = (1.0 - violated) * (1.0 - lived.terminated)
-        wanted = violated + self.discount**duration * goes_on * later
+        if duration is None:
+            wanted = violated + self.discount * goes_on * later
+        else:
+            wanted = self.discount**duration * (violated + goes_on * later)
 
         def critic_loss(critic: Critic) -> Array:
             error = jax.nn.sigmoid(critic(seen, lived.executed)) - wanted

@@ -1,0 +1,168 @@
+"""`palpate reproduce maze-reflex`: motions that are interrupted, against decisions overruled.
+
+Two tasks, the maze that is felt through and the first navigation task of Recovery RL, each learnt
+by `palpate train` with the same agent, critic and recovery: once where the recovery takes the place
+of risky decisions (`srl-vic`), and once where it interrupts what is under way (`bresa`). Violations
+are those of the training itself, the ones before it printed beside. Bresa (arXiv 2503.21989) prints
+that they "sharply decrease", and no number.
+"""
+
+import functools
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.commands import folders, train
+from palpate.commands.episodes import at_its_best, played
+from palpate.experiments.experiment import Experiment, mean_of, ratio, share_of
+from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
+from palpate.families.contact.navigation_options import EvaluateNavigation, TrainNavigation
+from palpate.networks.guarded import load_actor
+from palpate.runs import Figure, Result
+from palpate.runs.result import read_result
+from palpate.runs.run import RESULT
+from palpate.worlds.world import ControlLaw
+
+NAME = "maze-reflex"
+FIRST, TRAININGS, QUICK_TRAININGS = 1, 3, 1  # seeds of the trainings
+TRIED = 400_000  # added to a training's seed: that of the episodes its policy is tried in
+EPISODES, QUICK_EPISODES = 500, 4
+QUICK_STEPS, QUICK_ENVIRONMENTS = 200, 4
+OVERRULED, INTERRUPTED = METHODS = "srl-vic", "bresa"
+TASKS: dict[str, tuple[Any, Any]] = {
+    "maze": (TrainMaze, EvaluateMaze),
+    "navigation": (TrainNavigation, EvaluateNavigation),
+}
+OTHER_RATES = {5: 0.2, 20: 0.05}  # Hz: s of a decision in the maze, trained at 10 Hz
+MINUTES = {"maze": 100, "navigation": 8}  # of a seed
+RATIO, WORSE, ENOUGH, FAST = 0.2, -0.02, 200.0, 0.2  # the bars; the last in ms
+TIMED = 50  # decisions
+
+Found = dict[str, Any]  # of one training: its figures, and how its policy's episodes ended
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Train and try below `out`; a training that is finished there is taken as it is.
+
+    `quick` is one seed, few steps and few episodes. Raises `PalpateError` when `out` holds other
+    runs.
+    """
+    experiment, count = Experiment(NAME, out, quick, seed), QUICK_TRAININGS if quick else TRAININGS
+    minutes = {task: 2 if quick else each * count for task, each in MINUTES.items()}
+    experiment.announce(minutes)
+    first = experiment.uses(FIRST, count)
+    found = {
+        (task, method): [
+            trained(experiment, task, method, seed) for seed in range(first, first + count)
+        ]
+        for task in TASKS
+        for method in METHODS
+    }
+    policy = out / folder_of("maze", INTERRUPTED, first)
+    timed = experiment.found("decision", {"timed": TIMED}, lambda: decision(policy, first))
+    settings = {
+        "methods": METHODS,
+        "episodes": QUICK_EPISODES if quick else EPISODES,
+        "command": [f"palpate train {task} --method {name}" for task in TASKS for name in METHODS],
+    }
+    split = "policies are tried in new episodes of the worlds they were trained in"
+    listed = [figure for task in TASKS for figure in figures_of(task, found)]
+    listed.append(Figure("decision_p99_ms", timed["p99_ms"], "ms", FAST))
+    listed.append(Figure("detail.decision_median_ms", timed["median_ms"], "ms"))
+    return experiment.result(listed, settings, split)
+
+
+def folder_of(task: str, method: str, seed: int) -> str:
+    """Where a training is kept, for whichever reproduction needs it."""
+    return f"{task}-{method}-{seed}"
+
+
+def trained(experiment: Experiment, task: str, method: str, seed: int) -> Found:
+    """What a training cost, and what became of its policy's episodes, at every rate."""
+    (training, evaluation), quick = TASKS[task], experiment.quick
+    folder = experiment.out / folder_of(task, method, seed)
+    small: dict[str, Any] = {}
+    if quick:
+        small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS}
+        training = type(training.__name__, (training,), {"tried": QUICK_EPISODES})
+    train.run(training(method=method, seed=seed, out=folder, **small))
+    result = read_result(folder / RESULT)
+    experiment.seconds += result.wall_time_s
+    found: Found = {figure.name: figure.value for figure in result.figures}
+    policy, manifest = load_actor(folder / folders.POLICY)
+    episodes = QUICK_EPISODES if quick else EPISODES
+
+    def tried(**asked: Any) -> dict[str, Any]:
+        options = evaluation(policy=folder, seed=TRIED + seed, **asked)
+        make = functools.partial(options.make, manifest=manifest, policy=policy)
+        ended = played(make, at_its_best(policy), episodes, options.seed)
+        return {end: int(np.sum(ended["end"] == end)) for end in ("goal", "violation")}
+
+    about = {"episodes": episodes, "trained": manifest["command"]}
+    rates = OTHER_RATES if task == "maze" else {}
+    for rate, asked in {0: {}, **{hz: {"decision_period": s} for hz, s in rates.items()}}.items():
+        stage = f"{folder.name}-tried{f'-at-{rate}-hz' * bool(rate)}"
+        work = functools.partial(tried, **asked)
+        found[f"tried-{rate}"] = experiment.found(stage, about | asked, work) | {"of": episodes}
+    return found
+
+
+def decision(folder: Path, seed: int) -> dict[str, float]:
+    """How long the reflex takes in each control period of one world, its impedance included."""
+    policy, manifest = load_actor(folder / folders.POLICY)
+    environments = EvaluateMaze(policy=folder).make(1, manifest, policy)
+    law, times, act = environments.law, [], at_its_best(policy)
+    assert isinstance(law, ControlLaw)
+    command = law.command
+
+    def clocked(observation: Any) -> np.ndarray:
+        began = time.perf_counter()
+        done = command(observation)
+        times.append(1e3 * (time.perf_counter() - began))
+        return done
+
+    vars(law)["command"] = clocked
+    seen, _ = environments.reset(seed=seed)
+    for _ in range(TIMED):
+        seen = environments.step(act(seen))[0]
+    return {"median_ms": float(np.median(times)), "p99_ms": float(np.quantile(times, 0.99))}
+
+
+def figures_of(task: str, found: dict[tuple[str, str], list[Found]]) -> list[Figure]:
+    """The two methods against each other, pooled over trainings; then each of them."""
+
+    def pooled(method: str, *names: str) -> float:
+        return float(sum(one[name] for one in found[task, method] for name in names))
+
+    def share(method: str, rate: int = 0) -> list[Figure]:
+        ends = [one[f"tried-{rate}"] for one in found[task, method]]
+        name = f"detail.{task}.{method}{f'.{rate}_hz' * bool(rate)}"
+        of = sum(end["of"] for end in ends)
+        return [
+            share_of(f"{name}.success_rate", sum(end["goal"] for end in ends), of),
+            share_of(
+                f"{name}.violation_rate", sum(end["violation"] for end in ends), of, better="lower"
+            ),
+        ]
+
+    own, other = (pooled(method, "training.violations") for method in (INTERRUPTED, OVERRULED))
+    every = "training.violations", "pretraining.violations"
+    whole = ratio(pooled(INTERRUPTED, *every), pooled(OVERRULED, *every) or None)
+    success = {method: share(method)[0].value or 0.0 for method in METHODS}
+    listed = [
+        Figure(f"{task}.violations_ratio", ratio(own, other or None), "", RATIO),
+        Figure(
+            f"{task}.success_difference", success[INTERRUPTED] - success[OVERRULED], "", WORSE,
+            better="higher",
+        ),
+        Figure(f"{task}.baseline_violations", other, "", ENOUGH, better="higher"),
+        Figure(f"detail.{task}.violations_ratio_with_pretraining", whole, ""),
+    ]  # fmt: skip
+    for method in METHODS:
+        counts = [one["training.violations"] for one in found[task, method]]
+        listed += [mean_of(f"detail.{task}.{method}.violations", counts), *share(method)]
+        for rate in OTHER_RATES if task == "maze" else ():
+            listed += share(method, rate)
+    return listed

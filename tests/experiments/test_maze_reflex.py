@@ -58,7 +58,7 @@ def test_violations_are_pooled_over_trainings_and_success_is_set_beside(stood_in
     assert figures["maze.success_difference"].value == pytest.approx(0.1)
     assert figures["navigation.violations_ratio"].value is None  # of nothing there is no share
     assert not figures["navigation.baseline_violations"].met
-    assert figures["detail.maze.bresa.20_hz.success_rate"].value == pytest.approx(0.6)
+    assert figures["detail.maze.bresa.20_hz.goal_rate"].value == pytest.approx(0.6)
     assert figures["decision_p99_ms"].met
     trained = [one for one in stood_in if hasattr(one, "method")]
     assert [(one.task, one.method, one.seed) for one in trained[:3]] == [

@@ -36,7 +36,7 @@ pytestmark = pytest.mark.optimised
 DISCOUNT, LENGTH = 0.7, 5
 CRITIC = SafetyCritic(DISCOUNT, learning_rate=3e-3, target_rate=0.05, width=32)
 AGENT = ReflexAgent(
-    SoftActorCritic(width=16, depth=1), SafetyCritic(DISCOUNT, width=16, depth=1), threshold=0.9
+    SoftActorCritic(width=16, depth=1), SafetyCritic(DISCOUNT, width=16, depth=1), threshold=0.5
 )
 SHORT = OffPolicyTraining(96, warm_up=32, batch=16, capacity=900, pretraining=20, log_every=16,
                           evaluate_every=16, checkpoint_every=48)  # fmt: skip
@@ -123,8 +123,9 @@ def test_a_killed_training_resumes_to_the_same_bits_pieces_and_all(tmp_path: Pat
     assert arrays["buffer.kept"] == 0
     assert arrays["buffer.added"] == SHORT.steps
     lived = slice(len(offline.cost), arrays["motions.added"])
-    pieces = {n: arrays[f"motions.transitions.{n}"][lived] for n in ("cost", "last")}
-    assert (pieces["cost"] * pieces["last"]).sum() == lines[-1]["violations"] > 0
+    pieces = {n: arrays[f"motions.transitions.{n}"][lived] for n in ("cost", "last", "holds")}
+    assert pieces["holds"].any()  # something was interrupted
+    assert (pieces["cost"] * pieces["last"]).sum() == lines[-1]["violations"]
     assert pieces["last"].sum() == SHORT.steps
     for step in (32, 64):
         with pytest.raises(RuntimeError, match="killed"):

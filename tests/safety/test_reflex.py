@@ -155,6 +155,12 @@ def test_a_sensor_that_drops_out_leaves_no_power_until_the_next_decision():
         assert force[1] @ seen.velocity[1] < 0.0  # it brakes
     law.begin(felt([0, 0]), np.ones((2, 4)), np.zeros(2, bool))
     assert law.command(felt([0, 0], speed=0.0))[1, 0] > 1.0
+    spoilt = eqx.tree_at(
+        lambda one: one.critic.network.biases, guard_of_wrench(), (jnp.full((2, 1), jnp.nan),)
+    )
+    law = reflex(spoilt, impedance(), lambda seen: seen.wrench)
+    law.begin(felt([0, 0]), np.ones((2, 4)), np.ones(2, bool))
+    assert (law.command(felt([0, 0]))[:, 0] < 0.0).all()  # it brakes
     alone = reflex(watchful())
     alone.begin(None, np.array([[np.nan], [0.5]]), np.ones(2, bool))
     seen = type("Seen", (), {"position": np.array([[0.0], [np.nan]])})

@@ -50,39 +50,28 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     runs.
     """
     experiment, count = Experiment(NAME, out, quick, seed), QUICK_TRAININGS if quick else TRAININGS
-    minutes = {task: 2 if quick else each * count for task, each in MINUTES.items()}
-    experiment.announce(minutes)
+    experiment.announce({task: 2 if quick else each * count for task, each in MINUTES.items()})
     first = experiment.uses(FIRST, count)
+    seeds = range(first, first + count)
     found = {
-        (task, method): [
-            trained(experiment, task, method, seed) for seed in range(first, first + count)
-        ]
+        (task, method): [trained(experiment, task, method, seed) for seed in seeds]
         for task in TASKS
         for method in METHODS
     }
-    policy = out / folder_of("maze", INTERRUPTED, first)
+    policy = out / f"maze-{INTERRUPTED}-{first}"
     timed = experiment.found("decision", {"timed": TIMED}, lambda: decision(policy, first))
-    settings = {
-        "methods": METHODS,
-        "episodes": QUICK_EPISODES if quick else EPISODES,
-        "command": [f"palpate train {task} --method {name}" for task in TASKS for name in METHODS],
-    }
-    split = "policies are tried in new episodes of the worlds they were trained in"
     listed = [figure for task in TASKS for figure in figures_of(task, found)]
     listed.append(Figure("decision_p99_ms", timed["p99_ms"], "ms", FAST))
     listed.append(Figure("detail.decision_median_ms", timed["median_ms"], "ms"))
+    settings = {"methods": METHODS, "episodes": QUICK_EPISODES if quick else EPISODES}
+    split = "policies are tried in new episodes of the worlds they were trained in"
     return experiment.result(listed, settings, split)
-
-
-def folder_of(task: str, method: str, seed: int) -> str:
-    """Where a training is kept, for whichever reproduction needs it."""
-    return f"{task}-{method}-{seed}"
 
 
 def trained(experiment: Experiment, task: str, method: str, seed: int) -> Found:
     """What a training cost, and what became of its policy's episodes, at every rate."""
     (training, evaluation), quick = TASKS[task], experiment.quick
-    folder = experiment.out / folder_of(task, method, seed)
+    folder = experiment.out / f"{task}-{method}-{seed}"
     small: dict[str, Any] = {}
     if quick:
         small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS}
@@ -136,33 +125,26 @@ def figures_of(task: str, found: dict[tuple[str, str], list[Found]]) -> list[Fig
     def pooled(method: str, *names: str) -> float:
         return float(sum(one[name] for one in found[task, method] for name in names))
 
-    def share(method: str, rate: int = 0) -> list[Figure]:
-        ends = [one[f"tried-{rate}"] for one in found[task, method]]
-        name = f"detail.{task}.{method}{f'.{rate}_hz' * bool(rate)}"
-        of = sum(end["of"] for end in ends)
-        return [
-            share_of(f"{name}.success_rate", sum(end["goal"] for end in ends), of),
-            share_of(
-                f"{name}.violation_rate", sum(end["violation"] for end in ends), of, better="lower"
-            ),
-        ]
+    def share(method: str, end: str, rate: int = 0, better: str = "higher") -> Figure:
+        tried = [one[f"tried-{rate}"] for one in found[task, method]]
+        name = f"detail.{task}.{method}{f'.{rate}_hz' * bool(rate)}.{end}_rate"
+        counts = (sum(one[key] for one in tried) for key in (end, "of"))
+        return share_of(name, *counts, better=better)
 
     own, other = (pooled(method, "training.violations") for method in (INTERRUPTED, OVERRULED))
     every = "training.violations", "pretraining.violations"
     whole = ratio(pooled(INTERRUPTED, *every), pooled(OVERRULED, *every) or None)
-    success = {method: share(method)[0].value or 0.0 for method in METHODS}
+    better, worse = (share(method, "goal").value or 0.0 for method in (INTERRUPTED, OVERRULED))
     listed = [
         Figure(f"{task}.violations_ratio", ratio(own, other or None), "", RATIO),
-        Figure(
-            f"{task}.success_difference", success[INTERRUPTED] - success[OVERRULED], "", WORSE,
-            better="higher",
-        ),
+        Figure(f"{task}.success_difference", better - worse, "", WORSE, better="higher"),
         Figure(f"{task}.baseline_violations", other, "", ENOUGH, better="higher"),
         Figure(f"detail.{task}.violations_ratio_with_pretraining", whole, ""),
-    ]  # fmt: skip
+    ]
     for method in METHODS:
         counts = [one["training.violations"] for one in found[task, method]]
-        listed += [mean_of(f"detail.{task}.{method}.violations", counts), *share(method)]
-        for rate in OTHER_RATES if task == "maze" else ():
-            listed += share(method, rate)
+        listed.append(mean_of(f"detail.{task}.{method}.violations", counts))
+        for rate in (0, *(OTHER_RATES if task == "maze" else ())):
+            listed.append(share(method, "goal", rate))
+            listed.append(share(method, "violation", rate, "lower"))
     return listed

@@ -51,10 +51,12 @@ def test_a_policy_is_trained_kept_tried_and_evaluated_again(short, tmp_path, cap
     assert manifest["options"]["method"] == "srl-vic"
     assert manifest["constants"]["world.force_limit"] == 26
     train.run(options)  # finished: it is only read
-    asked = EvaluateMaze(policy=folder, episodes=2, mazes=("unseen-1",), out=tmp_path / "evaluated")
+    asked = EvaluateMaze(
+        policy=folder, episodes=2, mazes=("unseen-1",), world="arm", out=tmp_path / "evaluated"
+    )
     evaluate.run(asked)
     said = capsys.readouterr().out
-    assert "tried in the maze unseen-1" in said
+    assert "tried in the maze unseen-1, felt by the arm" in said
     assert "held still" in said
     values = {f.name: f.value for f in read_result(tmp_path / "evaluated" / RESULT).figures}
     assert values["success_rate.held_still"] == 0

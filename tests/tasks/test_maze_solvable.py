@@ -7,7 +7,7 @@ the channel and softly across it, with 25.3 N at most.
 import numpy as np
 import pytest
 
-from palpate.families.contact.environments import blind_maze
+from palpate.families.contact.environments import arm_maze, blind_maze
 from palpate.worlds.maze.layout import TIP_RADIUS
 from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE
 
@@ -34,8 +34,8 @@ def decision(truth):
     return np.array([*(0.9 * way / np.linalg.norm(way)), SOFT, SOFTEST], np.float32)
 
 
-def lived(layout, stiffness=None, most=250):
-    environment = blind_maze(layouts=(layout,), constant_stiffness=stiffness)
+def lived(layout, stiffness=None, most=250, make=blind_maze):
+    environment = make(layouts=(layout,), constant_stiffness=stiffness)
     environment.reset(seed=1)
     (world,) = environment.lockstep.worlds
     for _ in range(most):
@@ -51,6 +51,11 @@ def lived(layout, stiffness=None, most=250):
 @pytest.mark.parametrize("layout", ["home", "unseen-3"])
 def test_who_sees_everything_reaches_the_goal_without_a_violation(layout):
     assert lived(layout)[0] == "goal"
+
+
+@pytest.mark.parametrize("layout", ["home", "unseen-3"])
+def test_who_sees_everything_reaches_it_with_an_arm_too(layout):
+    assert lived(layout, make=arm_maze)[0] == "goal"
 
 
 def test_one_stiffness_for_all_is_stuck_or_breaks_the_limit():

@@ -21,6 +21,7 @@ FAMILY = Family(
     },
     experiments={
         "contact-model": "palpate.experiments.contact.contact_model:reproduce",
+        "maze-arm": "palpate.experiments.contact.maze_arm:reproduce",
         "maze-reflex": "palpate.experiments.contact.maze_reflex:reproduce",
     },
 )

@@ -14,14 +14,6 @@ import numpy as np
 
 from palpate.commands import folders, train
 from palpate.commands.episodes import at_its_best, played
-from palpate.experiments.contact.maze_reflex import (
-    FIRST,
-    OVERRULED,
-    QUICK_ENVIRONMENTS,
-    QUICK_STEPS,
-    TRIED,
-    folder_of,
-)
 from palpate.experiments.experiment import Experiment
 from palpate.families.contact.episodes import figures
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
@@ -31,7 +23,10 @@ from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 
 NAME = "maze-arm"
-POLICIES, QUICK_POLICIES = 3, 1
+METHOD = "srl-vic"
+FIRST, POLICIES, QUICK_POLICIES = 1, 3, 1  # seeds of the trainings
+TRIED = 400_000  # added to a training's seed: that of the episodes its policy is tried in
+QUICK_STEPS, QUICK_ENVIRONMENTS = 200, 4
 EPISODES, QUICK_EPISODES = {"arm": 500, "tip": 500, "still": 30}, {"arm": 3, "tip": 3, "still": 1}
 MINUTES = {"training": 90, "arm": 5, "tip": 1, "still": 1}  # of a policy
 BARS = {"success_rate": 0.80, "violation_rate": 0.02}
@@ -57,19 +52,19 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             about = {"policy": folder.name, "episodes": share}
             work = functools.partial(tried, folder, who, share, TRIED + first + number)
             found[who].append(experiment.found(f"{folder.name}-{who}", about, work)["episodes"])
-    settings = {"episodes": whole, "command": f"palpate train maze --method {OVERRULED}"}
+    settings = {"episodes": whole, "command": f"palpate train maze --method {METHOD}"}
     split = "new episodes in the maze that the policies were trained in, on the tip alone"
     return experiment.result(held_against(found), settings, split)
 
 
 def trained(experiment: Experiment, seed: int) -> Path:
     """The folder of the training on the tip."""
-    folder, options = experiment.out / folder_of("maze", OVERRULED, seed), TrainMaze
+    folder, options = experiment.out / f"maze-{METHOD}-{seed}", TrainMaze
     small: dict[str, Any] = {}
     if experiment.quick:
         small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS}
         options = type(TrainMaze.__name__, (TrainMaze,), {"tried": QUICK_EPISODES["tip"]})
-    train.run(options(method=OVERRULED, seed=seed, out=folder, **small))
+    train.run(options(method=METHOD, seed=seed, out=folder, **small))
     experiment.seconds += read_result(folder / RESULT).wall_time_s
     return folder
 

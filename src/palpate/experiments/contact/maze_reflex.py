@@ -57,7 +57,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         for task in TASKS
         for method in METHODS
     }
-    policy = out / folder_of("maze", INTERRUPTED, first)
+    policy = out / f"maze-{INTERRUPTED}-{first}"
     timed = experiment.found("decision", {"timed": TIMED}, lambda: decision(policy, first))
     listed = [figure for task in TASKS for figure in figures_of(task, found)]
     listed.append(Figure("decision_p99_ms", timed["p99_ms"], "ms", FAST))
@@ -67,15 +67,10 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     return experiment.result(listed, settings, split)
 
 
-def folder_of(task: str, method: str, seed: int) -> str:
-    """Where a training is kept, for whichever reproduction needs it."""
-    return f"{task}-{method}-{seed}"
-
-
 def trained(experiment: Experiment, task: str, method: str, seed: int) -> Found:
     """What a training cost, and what became of its policy's episodes, at every rate."""
     (training, evaluation), quick = TASKS[task], experiment.quick
-    folder = experiment.out / folder_of(task, method, seed)
+    folder = experiment.out / f"{task}-{method}-{seed}"
     small: dict[str, Any] = {}
     if quick:
         small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS}

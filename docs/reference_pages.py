@@ -73,7 +73,13 @@ STAGES = {
         *("worlds.maze.maze", "worlds.maze.layout", "worlds.maze.navigation"),
         *("worlds.arm.maze", "worlds.arm.panda", "worlds.arm.control"),
         *("worlds.contact.plates", "worlds.contact.touching"),
-        *("safety.impedance", "safety.reflex", "tasks.maze.maze", "tasks.maze.navigation"),
+        *(
+            "safety.impedance",
+            "safety.self_tuning",
+            "safety.reflex",
+            "tasks.maze.maze",
+            "tasks.maze.navigation",
+        ),
     ],
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),

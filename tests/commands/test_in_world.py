@@ -26,6 +26,7 @@ def short(monkeypatch):
     """Episodes of six decisions, and few of everything."""
     monkeypatch.setattr(MazeTask, "horizon", 6)
     monkeypatch.setattr(NavigationTask, "horizon", 6)
+    monkeypatch.setattr(methods, "TRAINING_HORIZON", 6)
     monkeypatch.setattr(TrainInWorld, "tried", 3)
     monkeypatch.setattr(methods, "PRETRAINING_UPDATES", 2)
 

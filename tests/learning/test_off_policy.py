@@ -152,16 +152,28 @@ def test_buffer_forgets_the_oldest_but_what_is_kept_and_what_violated() -> None:
         buffer = add(buffer, numbered(first, 10))
     drawn = np.unique(sample(buffer, jax.random.key(0), 2000).reward)
     np.testing.assert_array_equal(drawn, np.arange(60, 80))  # 20 places beside the kept ones
-    batch = sample_violating(buffer, jax.random.key(1), 1000, 0.25)
+    batch, weight = sample_violating(buffer, jax.random.key(1), 1000, 0.25)
     np.testing.assert_array_equal(np.unique(batch.reward[:250]), [0, 5])
     assert (batch.cost[:250] == 1).all()
     np.testing.assert_array_equal(np.unique(batch.reward[250:]), [*range(10), *range(60, 80)])
     for first in (100, 110, 120, 130, 140):
         buffer = add(buffer, numbered(first, 10, every=10))
-    batch = sample_violating(buffer, jax.random.key(2), 1000, 0.25)
+    batch, _ = sample_violating(buffer, jax.random.key(2), 1000, 0.25)
     np.testing.assert_array_equal(np.unique(batch.reward[:250]), [110, 120, 130, 140])
     none = add(ReplayBuffer.create(1, 1, 10), numbered(1, 3))
-    assert set(np.unique(sample_violating(none, jax.random.key(0), 100, 0.5).reward)) == {1, 2, 3}
+    batch, weight = sample_violating(none, jax.random.key(0), 100, 0.5)
+    assert set(np.unique(batch.reward)) == {1, 2, 3}
+    assert (weight == 1).all()
+
+
+def test_violations_drawn_too_often_weigh_less() -> None:
+    buffer = ReplayBuffer.create(1, 1, 100).add(numbered(0, 100, every=10))
+    batch, weight = buffer.sample_violating(jax.random.key(0), 20_000, 0.3)
+    assert batch.cost.mean() == pytest.approx(0.37, abs=0.01)  # and a tenth of the other 70 %
+    assert weight.mean() == pytest.approx(1.0, abs=0.01)
+    assert (weight * batch.cost).mean() == pytest.approx(0.1, abs=0.003)
+    even = np.mean(np.arange(100))
+    assert (weight * batch.reward).mean() == pytest.approx(even, rel=0.02)
 
 
 def test_environments_that_reset_a_step_later_are_refused() -> None:

@@ -74,7 +74,7 @@ def test_risk_is_that_of_going_on_until_the_decision_ends():
     )
     agent = ReflexAgent(Backwards(), CRITIC, 0.5)
     state = RecoveryState(None, CRITIC.init(jax.random.key(0), LENGTH, 1))
-    batch = Batch(lived, lived, jnp.zeros(()))
+    batch = Batch(lived, lived, jnp.ones(2 * LENGTH), jnp.zeros(()))
 
     def update(_, state):
         return agent.pretrain(state, batch, jax.random.key(0))[0]

@@ -15,6 +15,7 @@ from palpate.runs.figure_names import name_in_words, value_in_words
 from palpate.runs.storage import write_text
 
 STILL = "held still"
+STILL_EPISODES = 20  # of holding still, which goes on to the horizon and hardly varies
 
 
 def evaluate_in_world(options: EvaluateInWorld) -> Path:
@@ -32,16 +33,20 @@ def evaluate_in_world(options: EvaluateInWorld) -> Path:
     with folders.begin(options, words, {"policy": file}) as run:
         if not run.finished:
             who = {
-                "policy": at_its_best(policy),
-                STILL: lambda seen: np.zeros((len(seen), sum(c.count for c in policy.actions))),
+                "policy": (at_its_best(policy), options.episodes),
+                STILL: (
+                    lambda seen: np.zeros((len(seen), sum(c.count for c in policy.actions))),
+                    min(options.episodes, STILL_EPISODES),
+                ),
             }
             rows: dict[str, list[Figure]] = {}
-            for name, act in who.items():
+            for name, (act, episodes) in who.items():
                 suffix = "" if name == "policy" else f".{name.replace(' ', '_')}"
                 watching = policy if name == "policy" else None
                 make = functools.partial(options.make, manifest=manifest, policy=watching)
-                found = played(make, act, options.episodes, options.seed)
+                found = played(make, act, episodes, options.seed)
                 rows[name] = options.figures(found, suffix)
+            rows["policy"] += options.probed(policy, manifest)
             options.show(run, policy, manifest)
             about = options.about(manifest)
             lines = [about, *(line_of(name, figures) for name, figures in rows.items())]

@@ -110,6 +110,10 @@ class EvaluateInWorld(Options, ABC):
     def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
         """See `TrainInWorld.figures`."""
 
+    def probed(self, policy: ActorPolicy, manifest: Mapping[str, Any]) -> list[Figure]:
+        """What the policy knows and how it acts, beside how its episodes end; here nothing."""
+        return []
+
     @abstractmethod
     def about(self, manifest: Mapping[str, Any]) -> str:
         """A line that says in which world the policy is tried."""

@@ -20,6 +20,7 @@ FAMILY = Family(
         },
     },
     experiments={
+        "maze-safe": "palpate.experiments.contact.maze_safe:reproduce",
         "contact-model": "palpate.experiments.contact.contact_model:reproduce",
         "maze-arm": "palpate.experiments.contact.maze_arm:reproduce",
         "maze-reflex": "palpate.experiments.contact.maze_reflex:reproduce",

@@ -19,6 +19,7 @@ import gymnasium
 from palpate.networks.guarded import ActorPolicy, GuardedPolicy
 from palpate.safety.impedance import ImpedanceLaw
 from palpate.safety.reflex import Reflex
+from palpate.safety.self_tuning import SelfTuningLaw
 from palpate.tasks.maze.maze import MazeTask
 from palpate.tasks.maze.navigation import NavigationTask
 from palpate.worlds.arm.maze import ArmMaze
@@ -30,14 +31,21 @@ from palpate.worlds.maze.scene import TIP_MASS
 from palpate.worlds.world import ControlLaw
 
 DECISION_PERIOD = 0.1  # s, in the maze
+SELF_TUNING = "self-tuning"  # in place of a stiffness
+TUNING = {"resting": 250.0, "contact_force": 5.0, "gain": 6e4}  # N/m, N, N/m per m s
 REFLEX_PACE = 10, 1  # control periods in the maze and between obstacles: tenths of a decision
 
 
-def maze_law(constant_stiffness: float | None = None) -> ImpedanceLaw:
-    """The tip's impedance, with the limits of the maze; N/m, None where the policy chooses it."""
-    return ImpedanceLaw(
-        DISPLACEMENT_LIMIT, STIFFNESS_RANGE, mass=TIP_MASS, constant_stiffness=constant_stiffness
-    )
+def maze_law(stiffness: float | str | None = None) -> ImpedanceLaw:
+    """The tip's impedance, with the limits of the maze.
+
+    `stiffness` is a constant in N/m, `SELF_TUNING`, or None where the policy chooses it.
+    """
+    limits = DISPLACEMENT_LIMIT, STIFFNESS_RANGE
+    if stiffness == SELF_TUNING:
+        return SelfTuningLaw(*limits, mass=TIP_MASS, **TUNING)
+    constant = None if stiffness is None else float(stiffness)
+    return ImpedanceLaw(*limits, mass=TIP_MASS, constant_stiffness=constant)
 
 
 def _with_reflex(
@@ -56,9 +64,10 @@ def _maze_parts(
     layouts: Sequence[str | Layout] = ("home",),
     noise: float = 1.0,
     scattered: float = 0.0,
-    constant_stiffness: float | None = None,
+    stiffness: float | str | None = None,
     decision_period: float = DECISION_PERIOD,
     reflex: bool | ActorPolicy = False,
+    horizon: int | None = None,
     count: int = 1,
     world: type[BlindMaze] = BlindMaze,
 ) -> tuple[list[BlindMaze], MazeTask, ControlLaw | None, int]:
@@ -66,15 +75,15 @@ def _maze_parts(
         world(layouts, noise=noise, scattered=number < scattered * count) for number in range(count)
     ]
     every = max(1, round(decision_period / worlds[0].control_period))
-    task, law = MazeTask(), maze_law(constant_stiffness)
+    task, law = MazeTask(horizon=horizon), maze_law(stiffness)
     return worlds, task, _with_reflex(law, task, REFLEX_PACE[0], reflex), every
 
 
 def blind_maze(render_mode: str | None = None, **options: Any) -> GymnasiumWorld:
     """One blind maze. `options`: `layouts` and `noise` as `BlindMaze` has them, `scattered`, the
-    share of the worlds side by side that begin anywhere, `constant_stiffness` as `ImpedanceLaw`,
-    `decision_period` in s, and `reflex`: a policy whose guard is to interrupt motions (`Reflex`),
-    or whether something is to learn that."""
+    share of the worlds side by side that begin anywhere, `stiffness` as `maze_law`,
+    `decision_period` in s, `horizon` as `MazeTask`, and `reflex`: a policy whose guard is to
+    interrupt motions (`Reflex`), or whether something is to learn that."""
     worlds, task, law, every = _maze_parts(**options)
     return GymnasiumWorld(worlds[0], task, law, every, render_mode)
 

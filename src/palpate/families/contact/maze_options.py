@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from palpate.families.contact.methods import Skill
     from palpate.networks.guarded import ActorPolicy
-    from palpate.runs import Run
+    from palpate.runs import Figure, Run
     from palpate.worlds.gymnasium import GymnasiumWorlds
 
 Mazes = Annotated[tuple[str, ...], arg(metavar="NAME ...")]
@@ -38,13 +38,14 @@ class TrainMaze(TrainSkill):
     scattered: ClassVar[float] = 0.5  # begin anywhere on the way to the goal
 
     method: Literal[
-        "srl-vic", "bresa", "no-recovery", "k300", "k500", "k700", "k1000", "lagrangian", "penalty",
-        "position-critic",
+        "srl-vic", "bresa", "no-recovery", "k300", "k500", "k600", "k1000", "self-tuning",
+        "lagrangian", "penalty", "position-critic",
     ] = "srl-vic"  # fmt: skip
     """srl-vic: a critic of risks that feels forces alone overrules the policy by a recovery;
     bresa: it is asked a thousand times a second, and interrupts what is under way;
-    position-critic: it is told positions too; k...: srl-vic at that stiffness (N/m); no-recovery:
-    nothing overrules it; lagrangian, penalty: violations as a constraint, or at a price."""
+    position-critic: it is told positions too; k...: srl-vic at that stiffness (N/m);
+    self-tuning: at one that rises while something resists; no-recovery: nothing overrules it;
+    lagrangian, penalty: violations as a constraint, or at a price."""
     mazes: Mazes = ("home",)
     """To train in, one drawn for each episode."""
     noise: float = 1.0
@@ -59,6 +60,7 @@ class TrainMaze(TrainSkill):
         self, count: int, policy: ActorPolicy | None = None, scattered: float = 0.0
     ) -> GymnasiumWorlds:
         from palpate.families.contact.environments import blind_mazes
+        from palpate.families.contact.methods import TRAINING_HORIZON
 
         method = self.skill().method(self.method)
         return blind_mazes(
@@ -66,7 +68,8 @@ class TrainMaze(TrainSkill):
             layouts=self.mazes,
             noise=self.noise,
             scattered=scattered,
-            constant_stiffness=method.stiffness,
+            horizon=TRAINING_HORIZON if scattered else None,
+            stiffness=method.stiffness,
             reflex=method.interrupts and (policy or True),
         )
 
@@ -125,10 +128,20 @@ class EvaluateMaze(EvaluateSkill):
             count,
             layouts=self.mazes or tuple(trained["mazes"]),
             noise=self.noise,
-            constant_stiffness=method.stiffness,
+            stiffness=method.stiffness,
             decision_period=self.decision_period or DECISION_PERIOD,
             reflex=method.interrupts and (policy or False),
         )
+
+    def probed(self, policy: ActorPolicy, manifest: Mapping[str, Any]) -> list[Figure]:
+        from palpate.families.contact import probes
+        from palpate.families.contact.methods import MAZE
+
+        method = MAZE.method(manifest["options"]["method"])
+        environments = self.make(min(probes.PROBES, self.episodes), manifest, None)
+        found = probes.probe(policy, environments, self.seed)
+        environments.close()
+        return probes.figures(found, guarded=method.guarded, free=method.stiffness is None)
 
     def about(self, manifest: Mapping[str, Any]) -> str:
         mazes = self.mazes or manifest["options"]["mazes"]

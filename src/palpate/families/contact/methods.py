@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.families.contact.environments import DECISION_PERIOD
+from palpate.families.contact.environments import DECISION_PERIOD, SELF_TUNING
 from palpate.family import check_name
 from palpate.learning.off_policy import (
     Lagrangian,
@@ -33,20 +33,22 @@ from palpate.worlds.maze import scene
 
 WRENCH = (0, 1, 2, 3, 4, 5)  # of the features: SRL-VIC's critic and recovery see no position
 DISCOUNT, TARGET_ENTROPY = 0.98, -1.0  # of the task's agent
+WIDTH = 128  # of the two hidden layers of every network
 RISK_DISCOUNT, RISK_THRESHOLD = 0.8, 0.2
 NAVIGATION_THRESHOLD = 0.3  # as Recovery RL's, which has this discount there too
 VIOLATION_PRICE = 50.0  # of the penalty, in rewards: more than the whole way to the goal is worth
 COST_LIMIT = 0.02  # Lagrangian: violations an episode
 PRETRAINING_STEPS, PRETRAINING_UPDATES = 20_000, 5_000
+TRAINING_HORIZON = 150  # decisions: whoever is stuck begins anew sooner, somewhere else
 HELD = (3, 15)  # decisions for which a scripted collision keeps its direction
 
 
 @dataclass(frozen=True)
 class Method:
-    """An agent, and the stiffness (N/m) that it is given; None: it chooses its own."""
+    """An agent, and the `stiffness` of `maze_law` that it is given; None: it chooses its own."""
 
     agent: Agent
-    stiffness: float | None = None
+    stiffness: float | str | None = None
 
     @property
     def guarded(self) -> bool:
@@ -60,7 +62,7 @@ class Method:
 
 
 def _agent() -> SoftActorCritic:
-    return SoftActorCritic(discount=DISCOUNT, target_entropy=TARGET_ENTROPY)
+    return SoftActorCritic(discount=DISCOUNT, target_entropy=TARGET_ENTROPY, width=WIDTH)
 
 
 def _guarded(
@@ -68,7 +70,8 @@ def _guarded(
     kind: type[RecoveryAgent] = RecoveryAgent,
     threshold: float = RISK_THRESHOLD,
 ) -> RecoveryAgent:
-    return kind(_agent(), SafetyCritic(discount=RISK_DISCOUNT, seen=seen), threshold)
+    safety = SafetyCritic(discount=RISK_DISCOUNT, seen=seen, width=WIDTH)
+    return kind(_agent(), safety, threshold)
 
 
 METHODS: dict[str, Callable[[], Method]] = {
@@ -78,10 +81,11 @@ METHODS: dict[str, Callable[[], Method]] = {
     "no-recovery": lambda: Method(_agent()),
     "k300": lambda: Method(_guarded(), 300.0),
     "k500": lambda: Method(_guarded(), 500.0),
-    "k700": lambda: Method(_guarded(), 700.0),
+    "k600": lambda: Method(_guarded(), 600.0),  # with 3 cm what the heaviest block resists
     "k1000": lambda: Method(_guarded(), 1000.0),
+    "self-tuning": lambda: Method(_guarded(), SELF_TUNING),
     "lagrangian": lambda: Method(
-        Lagrangian(_agent(), COST_LIMIT, discount=DISCOUNT, multiplier_rate=1e-3)
+        Lagrangian(_agent(), COST_LIMIT, discount=DISCOUNT, multiplier_rate=1e-3, width=WIDTH)
     ),
     "penalty": lambda: Method(Penalty(_agent(), VIOLATION_PRICE)),
 }

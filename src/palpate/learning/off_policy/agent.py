@@ -16,6 +16,7 @@ class Batch(eqx.Module):
 
     task: Transition  # lived through in this training
     risk: Transition  # of all there are, a fixed share of them violating
+    risk_weight: Float[Array, " n"]  # of each of those, as if all had been drawn evenly; mean 1
     episode_cost: Float[Array, ""]  # mean of the last episodes' summed costs; NaN before any ended
 
 

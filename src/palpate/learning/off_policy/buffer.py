@@ -128,11 +128,14 @@ class ReplayBuffer(eqx.Module):
         chosen = jax.random.randint(key, (count,), self.kept, self.filled)
         return jax.tree.map(lambda leaf: leaf[chosen], self.transitions)
 
-    def sample_violating(self, key: PRNGKeyArray, count: int, share: float) -> Transition:
-        """`count` of all transitions, of which the first `share` violate a constraint.
+    def sample_violating(
+        self, key: PRNGKeyArray, count: int, share: float
+    ) -> tuple[Transition, Float[Array, " n"]]:
+        """`count` of all transitions, of which the first `share` violate a constraint; weights.
 
         As long as none does, the whole is drawn from all. Recovery RL (arXiv 2010.15920) draws so
-        where violations are rare.
+        where violations are rare, and so makes them seem likely. With the weights a sum over what
+        is drawn expects what one over an even draw does.
         """
         violating = round(share * count)
         keys = jax.random.split(key, 2)
@@ -145,7 +148,11 @@ class ReplayBuffer(eqx.Module):
             first = jnp.where(there > 0, own[rare], leaf[:violating])
             return jnp.concatenate([first, leaf[violating:]])
 
-        return jax.tree.map(mixed, drawn, self.violating)
+        batch = jax.tree.map(mixed, drawn, self.violating)
+        extra = jnp.where(there > 0, violating / count, 0.0)
+        rate = self.violated / jnp.maximum(self.added, 1)
+        of_violating = rate / jnp.maximum(extra + (1.0 - extra) * rate, 1e-9)
+        return batch, jnp.where(batch.cost > 0, of_violating, 1.0 / (1.0 - extra))
 
 
 def _written(

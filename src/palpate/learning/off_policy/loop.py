@@ -265,8 +265,8 @@ class Compiled:
         transitions, motions = memory
         task = transitions.sample(keys[0], size)
         source = transitions if motions is None else motions
-        risk = source.sample_violating(keys[1], size, share)
-        return update(state, Batch(task, risk, episode_cost), keys[2])
+        risk, weight = source.sample_violating(keys[1], size, share)
+        return update(state, Batch(task, risk, weight, episode_cost), keys[2])
 
 
 @functools.lru_cache(maxsize=8)

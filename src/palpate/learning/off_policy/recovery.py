@@ -68,5 +68,5 @@ class RecoveryAgent:
     ) -> tuple[RecoveryState, dict[str, Array]]:
         """Critic and recovery alone."""
         following = self.task.propose(state.task, batch.risk.next_observation, key)
-        safety, figures = self.safety.update(state.safety, batch.risk, following)
+        safety, figures = self.safety.update(state.safety, batch.risk, following, batch.risk_weight)
         return RecoveryState(state.task, safety), figures

@@ -39,5 +39,6 @@ class ReflexAgent(RecoveryAgent):
             raise PalpateError("a reflex learns from pieces of decisions, not from whole ones")
         decided = self.task.propose(state.task, lived.next_observation, key)
         following = jnp.where(lived.holds[:, None] > 0, lived.executed, decided)
-        safety, figures = self.safety.update(state.safety, lived, following, lived.duration)
+        weight = batch.risk_weight
+        safety, figures = self.safety.update(state.safety, lived, following, weight, lived.duration)
         return RecoveryState(state.task, safety), figures

@@ -68,12 +68,14 @@ class SafetyCritic:
         state: SafetyCriticState,
         lived: Transition,
         following: Float[Array, "n actions"],
+        weight: float | Float[Array, " n"] = 1.0,
         duration: Float[Array, " n"] | None = None,
     ) -> tuple[SafetyCriticState, dict[str, Array]]:
         """After one update from transitions (n, ...), and figures to log.
 
-        `following` is what the acting policy would do at their next observations. A `duration`, as
-        a share of a decision, is over at those: then all of y is discounted, by it.
+        `following` is what the acting policy would do at their next observations, and `weight` how
+        much each counts for the critic. A `duration`, as a share of a decision, is over at those:
+        then all of y is discounted, by it.
         """
         guard, optimiser = state.guard, adam(self.learning_rate)
         seen, after = guard.part(lived.observation), guard.part(lived.next_observation)
@@ -87,7 +89,7 @@ class SafetyCritic:
 
         def critic_loss(critic: Critic) -> Array:
             error = jax.nn.sigmoid(critic(seen, lived.executed)) - wanted
-            return jnp.sum(jnp.mean(error**2, axis=-1))
+            return jnp.sum(jnp.mean(weight * error**2, axis=-1))
 
         def recovery_loss(recovery: DeterministicActor, critic: Critic) -> Array:
             return jnp.mean(jnp.max(jax.nn.sigmoid(critic(seen, recovery.mean(seen))), axis=0))

@@ -32,13 +32,16 @@ class MazeTask(WorldTask):
     A policy sees the wrench (6) and the position (3), as they are measured, each divided by what
     makes it about 1, and acts by [dx, dy, stiffness along, stiffness across]. More than
     `force_limit` N of horizontal contact force is a violation and costs no reward: only the rest of
-    the episode. A method that wants it to cost more adds that itself.
+    the episode. A method that wants it to cost more adds that itself. `horizon`: decisions after
+    which an episode is cut off (None: the printed number).
     """
 
     features, actions, horizon = 9, 4, HORIZON
 
-    def __init__(self, force_limit: float = FORCE_LIMIT):
+    def __init__(self, force_limit: float = FORCE_LIMIT, horizon: int | None = None):
         self.force_limit = force_limit
+        if horizon is not None:
+            self.horizon = horizon
 
     def observe(self, observation: TipObservation) -> Float[np.ndarray, "worlds 9"]:
         return np.concatenate(

@@ -97,18 +97,19 @@ class Layout:
         above = (1 - u) * table[i, j + 1] + u * table[i + 1, j + 1]
         return np.asarray((1 - v) * below + v * above)
 
-    def drawn_place(self, random: np.random.Generator) -> np.ndarray:
-        """A place (2,) m near the way from start to goal, free of walls, block and goal.
+    def drawn_place(self, random: np.random.Generator, pushed: float = 0.0) -> np.ndarray:
+        """A place (2,) m near the way from start to goal, free of walls, goal and a pushed block.
 
         Even along that way, so that the narrow channel is drawn as often as its length asks for,
-        and `SCATTER` m beside it.
+        and `SCATTER` m beside it. `pushed`: m by which the block has been.
         """
         way = self._table[2]
         way = way[np.linalg.norm(way - self.goal, axis=1) > 3 * self.goal_radius]
         place = way[random.integers(len(way))]
         while True:
             drawn = place + SCATTER * random.standard_normal(2)
-            beyond = np.abs(drawn - self.obstacle.position) - self.obstacle.half_sizes
+            block = np.add(self.obstacle.position, (pushed, 0.0))
+            beyond = np.abs(drawn - block) - self.obstacle.half_sizes
             if (
                 self.clearance(drawn) >= TIP_RADIUS
                 and beyond.max() > TIP_RADIUS

@@ -31,7 +31,7 @@ FORCE_LIMIT = 26.0  # N, of the horizontal contact force on the tip; more is a v
 DISPLACEMENT_LIMIT = 0.03  # m from where the tip is to where a decision sends it
 STIFFNESS_RANGE = (50.0, 1000.0)  # N/m
 
-OBSTACLE_FRICTION = (16.0, 24.0)  # N, dry: what it takes to move the block
+OBSTACLE_FRICTION = (12.0, 18.0)  # N, dry: what it takes to move the block
 OBSTACLE_MASS = (0.5, 1.5)  # kg
 CONTACT_FRICTION = (0.2, 0.4)  # coefficient, of the tip on walls and block
 
@@ -83,7 +83,8 @@ class BlindMaze(World):
     frequency about 1 Hz and a random phase; position and velocity are seen relative to it. The tip
     keeps its height by itself and gravity is compensated. `layouts` names mazes, one of which is
     drawn at each reset; `noise` scales the sensors' Ornstein-Uhlenbeck noise, 0 switches it off;
-    `scattered` lets episodes begin all along the way to the goal, to collect collisions;
+    `scattered` lets episodes begin all along the way to the goal, half of them with the block
+    pushed already, so that all can be found out;
     `control_period` is a whole number of milliseconds, in s.
 
     A command that is not finite is a fault of who commands: the drives give no force in that
@@ -149,8 +150,10 @@ class BlindMaze(World):
         self._phase = random.uniform(0, 2 * math.pi)
         if layout is not None:
             drawn = _layout(layout)
+        pushed = 0.0
         if start is None and self._scattered:
-            place = drawn.drawn_place(random)
+            pushed = drawn.obstacle.travel * max(0.0, random.uniform(-1, 1))
+            place = drawn.drawn_place(random, pushed)
         elif start is None:
             place = drawn.start + place * drawn.start_half_sizes
         else:
@@ -163,7 +166,7 @@ class BlindMaze(World):
         self._layout = drawn
         self._obstacle_friction = _positive("obstacle's friction", obstacle_friction, friction)
         self._contact_friction = _positive("contact's friction", contact_friction, touch)
-        self._place(place)
+        self._place(place, pushed)
         self._noise = np.zeros(9)
         self._drawn = BLOCK_OF_NOISE  # none are left
         if self._noise_scale:
@@ -172,7 +175,7 @@ class BlindMaze(World):
         self._ready = True
         return self._observe()
 
-    def _place(self, place: np.ndarray) -> None:
+    def _place(self, place: np.ndarray, pushed: float) -> None:
         """A maze's engine with the constants of this episode, the tip at rest on its base."""
         if self._layout not in self._models:
             model = self._compiled(self._layout)
@@ -190,7 +193,7 @@ class BlindMaze(World):
         self._applied, self._felt = data.qfrc_applied, data.sensor(FEELER).data
         self._constraint, self._tip_place = data.qfrc_constraint, data.xpos[tip]
         offset, data.qvel[0], _ = self._sway(0.0)
-        data.qpos[0] = offset
+        data.qpos[0], data.qpos[-1] = offset, pushed
         self._seat(place[0], place[1] - offset)
         mujoco.mj_forward(model, data)
 

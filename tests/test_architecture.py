@@ -54,8 +54,8 @@ TRUTH_FILES = {
     *("experiments/rope/bound.py", "experiments/rope/swing.py"),
     "experiments/furniture/one_shot.py",
     "families/rope/robot.py",
-    "families/contact/path_picture.py",
-    "families/contact/probes.py",  # which draws what happened
+    "families/contact/path_picture.py",  # which draws what happened
+    "families/contact/probes.py",  # which asks what happened next
 }
 
 # Tables of places: their strings name what is resolved when a command runs.

@@ -12,7 +12,6 @@ from palpate.families.contact import methods
 from palpate.families.contact.episodes import figures
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
 from palpate.families.contact.navigation_options import EvaluateNavigation, TrainNavigation
-from palpate.families.world_options import TrainInWorld
 from palpate.networks.guarded import GuardedPolicy, load_actor
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
@@ -27,7 +26,6 @@ def short(monkeypatch):
     monkeypatch.setattr(MazeTask, "horizon", 6)
     monkeypatch.setattr(NavigationTask, "horizon", 6)
     monkeypatch.setattr(methods, "TRAINING_HORIZON", 6)
-    monkeypatch.setattr(TrainInWorld, "tried", 3)
     monkeypatch.setattr(methods, "PRETRAINING_UPDATES", 2)
 
     def training_of(steps, method, real=methods.training_of):

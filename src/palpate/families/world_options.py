@@ -32,7 +32,7 @@ class TrainInWorld(Options, ABC):
     """Training in a world; each task says which environments, which agent, and how to judge it."""
 
     task: ClassVar[str]
-    tried: ClassVar[int] = 100  # episodes of the trained policy, for the figures
+    most_tried: ClassVar[int] = 100  # episodes of the trained policy, for the figures
 
     steps: int = 150_000
     """Decisions, those of all environments together."""
@@ -44,6 +44,11 @@ class TrainInWorld(Options, ABC):
         for name in ("steps", "environments"):
             if getattr(self, name) < 1:
                 raise PalpateError(f"--{name} is 1 or greater, not {getattr(self, name)}")
+
+    @property
+    def tried(self) -> int:
+        """How many episodes of the trained policy there are: fewer after a short training."""
+        return max(1, min(self.most_tried, self.steps // 1000))
 
     @abstractmethod
     def make(self, count: int, policy: ActorPolicy | None = None) -> VectorEnv:

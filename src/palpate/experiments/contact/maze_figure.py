@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.report.picture import canvas_of, save_picture
+from palpate.report.picture import canvas_of, legend_of, save_picture
 from palpate.runs.run import read_metrics
 
 BINS = 30  # of a training, over each of which episodes are counted
@@ -33,7 +33,7 @@ def draw(path: Path, trained: Mapping[str, Sequence[Path]]) -> None:
     costs.set(ylabel="violations so far", yscale="symlog")
     for axis in (goals, costs):
         axis.set_xlabel("decisions")
-    costs.legend(fontsize=7, ncols=2, frameon=False)
+    legend_of(canvas, "lower center", fontsize=7, ncols=6)
     save_picture(path, canvas)
 
 

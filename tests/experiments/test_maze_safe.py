@@ -50,5 +50,10 @@ def test_curves_count_episodes_between_lines(tmp_path):
     np.testing.assert_array_equal(steps, np.arange(20, 601, 20))
     np.testing.assert_allclose(share, 0.25)
     np.testing.assert_array_equal(violations, np.arange(2, 61, 2))
+    for line in lines[:2]:
+        line |= {"episodes": 0, "ends": {}}
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    (tmp_path / "metrics.jsonl").write_text(text)
+    assert np.isnan(maze_figure.curves_of(tmp_path)[1, 0])  # nothing ended there
     maze_figure.draw(tmp_path / "curves.png", {"srl-vic": [tmp_path], "k300": [tmp_path]})
     assert (tmp_path / "curves.png").stat().st_size > 10_000

@@ -23,10 +23,10 @@ def draw(path: Path, trained: Mapping[str, Sequence[Path]]) -> None:
         steps, colour = curves[0][0], f"C{number % 10}"
         style = "-" if number < 10 else "--"
         for axis, of in ((goals, 1), (costs, 2)):
-            values = np.array([curve[of] for curve in curves])
-            axis.plot(steps, np.nanmean(values, axis=0), style, color=colour, label=name, lw=1.3)
+            values = np.ma.masked_invalid([curve[of] for curve in curves])  # where none ended
+            axis.plot(steps, values.mean(axis=0), style, color=colour, label=name, lw=1.3)
             axis.fill_between(
-                steps, np.nanmin(values, axis=0), np.nanmax(values, axis=0), color=colour,
+                steps, values.min(axis=0), values.max(axis=0), color=colour,
                 alpha=0.12, lw=0,
             )  # fmt: skip
     goals.set(ylabel="share of episodes that reach the goal", ylim=(0, 1))

@@ -42,7 +42,7 @@ def test_stiffness_rises_with_the_error_while_something_resists_and_falls_when_i
     assert tuned.stiffness[0, 0, 0] == RESTING
 
 
-@pytest.mark.parametrize("force", [(6.0, 0.0), (0.0, -9.0), (np.nan, 0.0)])
+@pytest.mark.parametrize("force", [(6.0, 0.0), (0.0, -9.0), (np.nan, 0.0), (-np.inf, 0.0)])
 def test_what_does_not_resist_the_motion_stiffens_nothing(force):
     tuned = law()
     tuned.begin(seen(), ALONG_X, np.ones(1, bool))
@@ -54,7 +54,10 @@ def test_what_does_not_resist_the_motion_stiffens_nothing(force):
 def test_a_position_that_is_lost_leaves_damping_alone():
     tuned = law()
     tuned.begin(seen(), ALONG_X, np.ones(1, bool))
-    lost = seen(force=(-6.0, 0.0), position=(np.nan, 0.0))
+    for place in (np.nan, np.inf):
+        lost = seen(force=(-6.0, 0.0), position=(place, 0.0))
+        np.testing.assert_array_equal(tuned.command(lost), np.zeros((1, 3)))
+        assert tuned.stiffness[0, 0, 0] == RESTING
     np.testing.assert_array_equal(tuned.command(lost), np.zeros((1, 3)))
     tuned.begin(lost, ALONG_X, np.zeros(1, bool))
     np.testing.assert_array_equal(tuned.command(seen()), np.zeros((1, 3)))
@@ -64,4 +67,4 @@ def test_values_that_are_not_positive_are_refused():
     with pytest.raises(PalpateError, match="contact force is positive"):
         law(contact_force=0.0)
     with pytest.raises(PalpateError, match="gain is positive"):
-        law(gain=-1.0)
+        law(gain=np.inf)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ class SelfTuningLaw(ImpedanceLaw):
     only the displacement counts; the other two numbers are ignored. All else is `ImpedanceLaw`'s.
 
     Observations have a `wrench` (worlds, 2 or more) in N besides; where it is not finite the
-    stiffness does not rise. Raises `PalpateError` for values that are not positive.
+    stiffness does not rise. Raises `PalpateError` for values that are not positive and finite.
     """
 
     def __init__(
@@ -39,8 +40,8 @@ class SelfTuningLaw(ImpedanceLaw):
             control_period=control_period, **limits,
         )  # fmt: skip
         for name, value in (("contact force", contact_force), ("gain", gain)):
-            if not value > 0:
-                raise PalpateError(f"the {name} is positive, not {value}")
+            if not 0 < value < math.inf:
+                raise PalpateError(f"the {name} is positive and finite, not {value}")
         self._range, self._resting = stiffness_range, resting
         self._contact_force, self._rise = contact_force, gain * control_period
         self._along = np.zeros(0)
@@ -61,10 +62,12 @@ class SelfTuningLaw(ImpedanceLaw):
 
     def command(self, observation: Any) -> Float[np.ndarray, "worlds 3"]:
         """See `ImpedanceLaw.command`."""
-        against = -np.sum(observation.wrench[:, :2] * self._direction, axis=1)
-        error = np.sum((self._wanted[0] - observation.position[:, :2]) * self._direction, axis=1)
-        risen = np.minimum(self._along + self._rise * np.maximum(error, 0.0), self._range[1])
-        felt = (against > self._contact_force) & np.isfinite(risen)
+        with np.errstate(invalid="ignore", over="ignore"):  # a sensor that fails stiffens nothing
+            against = -np.sum(observation.wrench[:, :2] * self._direction, axis=1)
+            ahead = self._wanted[0] - observation.position[:, :2]
+            error = np.maximum(np.sum(ahead * self._direction, axis=1), 0.0)
+            risen = np.minimum(self._along + self._rise * error, self._range[1])
+        felt = (against > self._contact_force) & np.isfinite(against + error)
         self._along = np.where(felt, risen, self._resting)
         across = np.full(len(felt), self._range[0])
         self._wanted = self._wanted[0], turned(self._along, across, self._direction)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from maze_worlds import held
 from palpate.errors import PalpateError
 from palpate.safety.impedance import ImpedanceLaw
 from palpate.worlds.arm.control import OperationalSpace
@@ -129,15 +130,6 @@ def test_its_dynamics_are_those_of_newton_and_euler(arm):
 
 def still(**options) -> ArmMaze:
     return ArmMaze(sway=0.0, noise=0.0, **options)
-
-
-def held(world, force, steps, damping=0.0):
-    """The last observation under a force, and a damper (N s/m) where what bounces is to rest."""
-    velocity = np.zeros(3)
-    for _ in range(steps):
-        observation = world.step(force - damping * velocity)
-        velocity = observation.velocity
-    return observation
 
 
 @pytest.mark.parametrize("force", [2.0, 10.0, FORCE_LIMIT])

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from maze_worlds import held
 from palpate.errors import PalpateError
 from palpate.worlds.maze.layout import BLOCK_HALF_SIZES, TIP_RADIUS, named_layout
 from palpate.worlds.maze.maze import (
@@ -31,15 +32,6 @@ OPEN = (-0.12, -0.15)  # 5 cm from every wall, between the thin wall and the thi
 
 def still(**options) -> BlindMaze:
     return BlindMaze(sway=0.0, noise=0.0, **options)
-
-
-def held(world, force, steps, damping=0.0):
-    """The last observation under a force, and a damper (N s/m) where what bounces is to rest."""
-    velocity = np.zeros(3)
-    for _ in range(steps):
-        observation = world.step(force - damping * velocity)
-        velocity = observation.velocity
-    return observation
 
 
 @pytest.mark.parametrize("force", [2.0, 10.0, FORCE_LIMIT])

@@ -59,12 +59,11 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
 def trained(experiment: Experiment, seed: int) -> Path:
     """The folder of the training on the tip."""
-    folder, options = experiment.out / f"maze-{METHOD}-{seed}", TrainMaze
+    folder = experiment.out / f"maze-{METHOD}-{seed}"
     small: dict[str, Any] = {}
     if experiment.quick:
         small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS}
-        options = type(TrainMaze.__name__, (TrainMaze,), {"tried": QUICK_EPISODES["tip"]})
-    train.run(options(method=METHOD, seed=seed, out=folder, **small))
+    train.run(TrainMaze(method=METHOD, seed=seed, out=folder, **small))
     experiment.seconds += read_result(folder / RESULT).wall_time_s
     return folder
 

@@ -69,18 +69,17 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 
 def trained(experiment: Experiment, task: str, method: str, seed: int) -> Found:
     """What a training cost, and what became of its policy's episodes, at every rate."""
-    (training, evaluation), quick = TASKS[task], experiment.quick
+    training, evaluation = TASKS[task]
     folder = experiment.out / f"{task}-{method}-{seed}"
     small: dict[str, Any] = {}
-    if quick:
+    if experiment.quick:
         small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS}
-        training = type(training.__name__, (training,), {"tried": QUICK_EPISODES})
     train.run(training(method=method, seed=seed, out=folder, **small))
     result = read_result(folder / RESULT)
     experiment.seconds += result.wall_time_s
     found: Found = {figure.name: figure.value for figure in result.figures}
     policy, manifest = load_actor(folder / folders.POLICY)
-    episodes = QUICK_EPISODES if quick else EPISODES
+    episodes = QUICK_EPISODES if experiment.quick else EPISODES
 
     def tried(**asked: Any) -> dict[str, Any]:
         options = evaluation(policy=folder, seed=TRIED + seed, **asked)

@@ -139,8 +139,10 @@ class EvaluateMaze(EvaluateSkill):
 
         method = MAZE.method(manifest["options"]["method"])
         environments = self.make(min(probes.PROBES, self.episodes), manifest, None)
-        found = probes.probe(policy, environments, self.seed)
-        environments.close()
+        try:
+            found = probes.probe(policy, environments, self.seed)
+        finally:
+            environments.close()
         return probes.figures(found, guarded=method.guarded, free=method.stiffness is None)
 
     def about(self, manifest: Mapping[str, Any]) -> str:

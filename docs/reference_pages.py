@@ -52,7 +52,7 @@ STAGES = {
         *("learning.off_policy.sac", "learning.off_policy.ddpg", "learning.off_policy.recovery"),
         *("learning.off_policy.constrained", "learning.off_policy.reflex"),
         *("learning.off_policy.safety_critic", "learning.off_policy.rollouts"),
-        *("networks.actor", "networks.guarded"),
+        *("networks.actor", "networks.guarded", "networks.in_numpy"),
         *("tasks.task", "tasks.rope.stabilization", "tasks.rope.tracking", "tasks.rope.paths"),
         "tasks.furniture.cart",
     ],
@@ -94,7 +94,7 @@ STAGES = {
         *("deployment.deployment", "deployment.supervisor", "deployment.intake"),
         *("deployment.decision", "deployment.loop", "deployment.transport"),
         *("deployment.messages", "deployment.plausibility", "deployment.onnx_export"),
-        *("deployment.contract", "deployment.onnx_actor"),
+        *("deployment.contract", "deployment.onnx_actor", "deployment.scaling"),
     ],
     "runs": [
         *("runs.run", "runs.result", "runs.progress", "runs.storage", "report.evidence"),

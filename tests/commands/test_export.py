@@ -2,12 +2,13 @@
 
 import json
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from deployed import manifest, rope_policy
+from deployed import actor_file, manifest, rope_policy
 from palpate.cli import main
 from palpate.commands import export
 from palpate.networks import save_controller
@@ -45,6 +46,35 @@ def test_export_and_again(policy, tmp_path, capsys):
     result = read_result(tmp_path / "runs/export-001/result.json")
     assert result.figures[0].name == "onnx_difference"
     assert result.figures[0].met
+
+
+@pytest.mark.parametrize(
+    ("method", "stiffness"), [("bresa", (50.0, 1000.0)), ("k300", (300.0,) * 2)]
+)
+def test_an_actor_with_its_reflex_and_the_constants_of_its_training(method, stiffness, capsys):
+    actor_file(method)
+    assert main(["export", "actor.safetensors", "--onnx", "out/tip.onnx"]) == 0
+    contract = json.loads(Path("out/tip.json").read_text())
+    command = contract["outputs"]["command"]
+    assert [row["name"] for row in command["order"]] == ["displacement", "stiffness"]
+    assert (command["high"][0], command["rest"]) == (0.02, [0.0, 0.0, 50.0, 50.0])
+    assert (command["low"][2], command["high"][3]) == stiffness
+    assert contract["inputs"]["features"]["normalisation"]["scale"][0] == 20.0
+    assert Path("out/tip.reflex.onnx").exists() == ("reflex" in contract) == (method == "bresa")
+    if method == "bresa":
+        assert contract["reflex"]["file"] == "tip.reflex.onnx"
+        assert (contract["reflex"]["period_s"], contract["reflex"]["pace"]) == (0.001, 10)
+        assert contract["guard"]["threshold"] == 0.5
+
+
+def test_actors_that_cannot_be_connected(capsys):
+    actor_file("self-tuning")
+    assert "method self-tuning chooses no stiffness" in refused(
+        "actor.safetensors --onnx a.onnx", capsys
+    )
+    actor_file("srl-vic", constants={})
+    sentence = refused("actor.safetensors --onnx a.onnx", capsys)
+    assert sentence.startswith("the policy does not say its constant task.force_limit")
 
 
 def test_sentences(capsys, tmp_path, monkeypatch):

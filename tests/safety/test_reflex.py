@@ -10,8 +10,9 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.networks.guarded import untrained_guard
+from palpate.networks.in_numpy import GuardInNumpy
 from palpate.safety.impedance import ImpedanceLaw
-from palpate.safety.reflex import Reflex, _GuardOfNumpy
+from palpate.safety.reflex import Reflex
 from palpate.worlds.gymnasium import GymnasiumWorlds
 from runway import EDGE, PERIODS, Run, Runway, watchful
 
@@ -173,7 +174,7 @@ def test_networks_say_the_same_by_numpy():
         guard = untrained_guard(jax.random.key(1), 2 if seen else 3, 2, (16, 16), seen)
         features = random.normal(size=(5, 3)).astype(np.float32)
         action = random.uniform(-1, 1, (5, 2)).astype(np.float32)
-        quick, shown = _GuardOfNumpy(guard), jnp.asarray(features)
+        quick, shown = GuardInNumpy(guard), jnp.asarray(features)
         risk = guard.risk(shown, jnp.asarray(action))
         np.testing.assert_allclose(quick.risk(features, action), risk, atol=1e-6)
         np.testing.assert_allclose(quick.recover(features), guard.recover(shown), atol=1e-6)

@@ -1,4 +1,4 @@
-"""A trained policy in NumPy: what sensors show in, command out, without JAX in the loop.
+"""Trained policies in NumPy: what sensors show in, command out, without JAX in the loop.
 
 Of NumPy, ONNX Runtime and JAX, asked one decision at a time on a busy machine, NumPy has the
 shortest tail; `python -m benchmarks.serve` measures it.
@@ -7,7 +7,9 @@ shortest tail; `python -m benchmarks.serve` measures it.
 import numpy as np
 
 from palpate.deployment.plausibility import Values
-from palpate.networks import CommandPolicy, count_of
+from palpate.deployment.scaling import Scaling
+from palpate.networks import ActorPolicy, CommandPolicy, GuardedPolicy, count_of
+from palpate.networks.in_numpy import ActorInNumpy, GuardInNumpy
 
 
 class NetworkDecision:
@@ -59,6 +61,8 @@ class NetworkDecision:
 class ChannelDecision:
     """A policy that is shown exactly what it observes, channel by channel."""
 
+    held = 0
+
     def __init__(self, policy: CommandPolicy):
         self._network = NetworkDecision(policy)
         self._features = np.zeros(count_of(policy.observations), np.float32)
@@ -68,11 +72,52 @@ class ChannelDecision:
 
     def see(self, values: Values) -> None:
         """See `palpate.deployment.supervisor.Decision.see`."""
-        first = 0
-        for value in values.values():
-            self._features[first : first + value.size] = value.reshape(-1)
-            first += value.size
+        _fill(self._features, values)
 
     def decide(self, command: np.ndarray) -> np.ndarray:
         """See `palpate.deployment.supervisor.Decision.decide`."""
         return self._network(self._features, command)
+
+
+class ActorDecision:
+    """An actor, under its guard if it has one, that decides on every state as the policy does.
+
+    What is not finite becomes a command that is not, at which a supervisor brakes.
+    """
+
+    held = 0
+
+    def __init__(self, policy: ActorPolicy, scaling: Scaling):
+        self._actor = ActorInNumpy(policy.actor, count_of(policy.actions))
+        self._guard, self._threshold = None, 1.0
+        if isinstance(policy, GuardedPolicy):
+            self._guard, self._threshold = GuardInNumpy(policy.guard), policy.threshold
+        self._scaling = scaling
+        self._measured = np.zeros(count_of(scaling.sensors), np.float32)
+
+    def forget(self) -> None:
+        """See `palpate.deployment.supervisor.Decision.forget`: nothing is remembered."""
+
+    def see(self, values: Values) -> None:
+        """See `palpate.deployment.supervisor.Decision.see`."""
+        _fill(self._measured, values)
+
+    def decide(self, command: np.ndarray) -> np.ndarray:
+        """See `palpate.deployment.supervisor.Decision.decide`."""
+        return self._scaling.command(self._decided(self._scaling.features(self._measured[None])))[0]
+
+    def _decided(self, features: np.ndarray) -> np.ndarray:
+        """The action (1, actions) in [-1, 1], or NaN."""
+        action = self._actor(features)
+        if self._guard is not None and not self._guard.risk(features, action) <= self._threshold:
+            action = self._guard.recover(features)
+        lost = not (np.isfinite(features).all() and np.isfinite(action).all())
+        return np.full_like(action, np.nan) if lost else action
+
+
+def _fill(flat: np.ndarray, values: Values) -> None:
+    """The numbers of all channels, one after the other."""
+    first = 0
+    for value in values.values():
+        flat[first : first + value.size] = value.reshape(-1)
+        first += value.size

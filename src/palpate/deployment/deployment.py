@@ -1,22 +1,36 @@
 """How a policy is connected to a robot: what its sensors send, what is believed and decided on."""
 
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from palpate.deployment.decision import ChannelDecision
+from palpate.deployment.decision import ActorDecision, ChannelDecision
 from palpate.deployment.plausibility import ChannelCheck, Check
+from palpate.deployment.scaling import Scaling
 from palpate.deployment.supervisor import Decision
 from palpate.errors import PalpateError
 from palpate.family import places, resolve
-from palpate.networks import Channel, CommandPolicy
+from palpate.networks import ActorPolicy, CommandPolicy, load_controller
 from palpate.runs import Figure
 
+NetworkPolicy = CommandPolicy | ActorPolicy
+Policy = TypeVar("Policy", bound=NetworkPolicy)
 
-class Deployment:
+
+class Pace(NamedTuple):
+    """Of a reflex: it is asked every `period` s, and interrupts again after `count` of them."""
+
+    period: float
+    count: int
+
+
+class Deployment(Generic[Policy]):
     """By the policy's declared channels: the robot sends exactly what the policy observes.
 
     A family whose robots send something else, or whose sensors can be checked better, names a
-    class derived from this one in its table, as `deployments`, by task.
+    class derived from this one in its table, as `deployments`, by task. `sensors` are the channels
+    that are sent, `actions` those that the robot is told; `period` is that of states and commands,
+    in s: a decision's, or a reflex's.
 
     Args:
         policy: to be served.
@@ -27,13 +41,25 @@ class Deployment:
         PalpateError: the policy or the rows do not fit.
     """
 
-    def __init__(self, policy: CommandPolicy, manifest: Mapping[str, Any], rows: Mapping[str, int]):
-        self.policy, self.manifest = policy, manifest
-        self.sensors: tuple[Channel, ...] = policy.observations
+    def __init__(self, policy: Policy, manifest: Mapping[str, Any], rows: Mapping[str, int]):
+        self.policy: Policy = policy
+        self.manifest = manifest
+        self.pace = self.reflex_pace()
+        self.period = policy.period if self.pace is None else self.pace.period
+        self.scaling = self.actor_scaling()
+        self.sensors, self.actions = self.scaling.sensors, self.scaling.actions
         names = [channel.name for channel in self.sensors]
         if len(set(names)) != len(names):
             raise PalpateError(f"two sensor channels have one name: {', '.join(names)}")
         self.set_rows(rows)
+
+    def actor_scaling(self) -> Scaling:
+        """How an actor's numbers are those of the robot; here they are the same."""
+        return Scaling.none(self.policy)
+
+    def reflex_pace(self) -> Pace | None:
+        """Of the reflex that the policy was trained under; None where its motions are finished."""
+        return None
 
     def set_rows(self, rows: Mapping[str, int]) -> None:
         """Take the rows of sensor channels; here none is open."""
@@ -46,11 +72,13 @@ class Deployment:
 
     def decision(self) -> Decision:
         """The policy, fed by `sensors`."""
+        if isinstance(self.policy, ActorPolicy):
+            return ActorDecision(self.policy, self.scaling)
         return ChannelDecision(self.policy)
 
     def check(self) -> Check:
         """What tells possible states of `sensors` from impossible ones."""
-        return ChannelCheck(self.sensors, self.policy.period)
+        return ChannelCheck(self.sensors, self.period)
 
     def simulated_robot(self, endpoint: str, seconds: float, seed: int) -> list[str]:
         """A Python module, and arguments, that simulate the robot of a loop at `endpoint`.
@@ -68,8 +96,22 @@ class Deployment:
         return []
 
 
+def load_network(path: str | Path) -> tuple[NetworkPolicy, dict[str, Any]]:
+    """A trained network, of any kind that can be exported and served, and its manifest.
+
+    Raises `PalpateError` for a controller of another kind, and as `load_controller`.
+    """
+    policy, manifest = load_controller(path)
+    if not isinstance(policy, CommandPolicy | ActorPolicy):
+        raise PalpateError(
+            f"{path} holds a {manifest['controller']['kind']}: expected a network, as "
+            "`palpate train` writes it"
+        )
+    return policy, manifest
+
+
 def deployment_of(
-    policy: CommandPolicy, manifest: Mapping[str, Any], rows: Mapping[str, int] | None = None
+    policy: NetworkPolicy, manifest: Mapping[str, Any], rows: Mapping[str, int] | None = None
 ) -> Deployment:
     """As the family of the policy's task connects it, else by its declared channels."""
     place = places("deployments").get(str(manifest.get("task")))

@@ -1,7 +1,8 @@
 """An actor as an ONNX graph, with or without its guard, and the guard alone.
 
 The guard alone is what a robot asks between two decisions, while it carries out an action: is that
-still safe, and what else to do?
+still safe, and what else to do? Both take and give a robot's units; `action`, in [-1, 1], is what
+one tells the other.
 """
 
 from pathlib import Path
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palpate.deployment.onnx_graph import EXTRA, Graph
+from palpate.deployment.scaling import Scaling
 from palpate.errors import extra_module
 from palpate.networks import ActorPolicy, Guard, GuardedPolicy, count_of
 from palpate.networks.actor import Perceptron
@@ -18,41 +20,43 @@ from palpate.runs.storage import write_bytes
 
 _LARGEST = float(np.finfo(np.float32).max)
 _NEAR = 1e-4  # risks as near to the threshold as that may fall on either side of it
+_ROWS = 512  # compared
+_WIDE = 3.0  # deviations, of half of them: features are about 1
+_LOST = 8  # of them, in each of which a sensor has dropped out
 
 
-def actor_model(policy: ActorPolicy) -> Any:
-    """The policy as an `onnx.ModelProto`: input `features` (batch, features), output `command`.
+def actor_model(policy: ActorPolicy, scaling: Scaling) -> Any:
+    """The policy as an `onnx.ModelProto`: input `features`; outputs `command`, `action`.
 
-    The command, (batch, *shape), is in [-1, 1], and zero where it is not finite. A `GuardedPolicy`
-    gives that after recovery, and `risk` (batch, 1), of what its actor proposed.
+    `features` (batch, features) and `command` (batch, *shape) are in the units of the scaling;
+    `action` (batch, actions) is what the command is made of, in [-1, 1]. Where a number that is
+    seen or given is not finite, the command is that of rest and the action zeros. A `GuardedPolicy`
+    gives both after recovery, and `risk` (batch, 1), of what its actor proposed.
 
     Raises `PalpateError` without the extra `deploy`.
     """
     graph = Graph()
-    features, actions = count_of(policy.observations), count_of(policy.actions)
-    proposed = _action(graph, policy.actor.network, "features", actions)
+    seen = graph.add("Div", "features", graph.constant(scaling.scale))
+    proposed = _action(graph, policy.actor.network, seen, count_of(policy.actions))
     outputs: dict[str, Any] = {}
     if isinstance(policy, GuardedPolicy):
-        proposed = _overruled(graph, policy.guard, policy.threshold, proposed)
+        proposed = _overruled(graph, policy.guard, policy.threshold, seen, proposed)
         outputs["risk"] = [1]
-    shape = policy.actions[0].shape if len(policy.actions) == 1 else (actions,)
-    command = _still(graph, proposed)
-    graph.add("Reshape", command, graph.constant([-1, *shape], np.int64), output="command")
-    return graph.model({"features": [features]}, {"command": shape, **outputs})
+    return _model(graph, scaling, seen, proposed, {}, outputs)
 
 
-def guard_model(policy: GuardedPolicy) -> Any:
-    """Its guard alone: inputs `features`, `action` (batch, actions); outputs `command`, `risk`.
+def guard_model(policy: GuardedPolicy, scaling: Scaling) -> Any:
+    """Its guard alone: inputs `features`, `action`; outputs `command`, `action_out` and `risk`.
 
-    `command` (batch, actions) is the action, or the recovery's where `risk` (batch, 1) is above
-    the threshold, and zero where it is not finite. Raises as `actor_model`.
+    `action` (batch, actions), in [-1, 1], is what is under way, and so is `action_out`, or the
+    recovery's action where `risk` (batch, 1) is above the threshold; `command` is made of that. All
+    else is as in `actor_model`, which also says what is raised.
     """
     graph = Graph()
-    features, actions = count_of(policy.observations), count_of(policy.actions)
-    executed = _overruled(graph, policy.guard, policy.threshold, "action")
-    graph.add("Identity", _still(graph, executed), output="command")
-    inputs = {"features": [features], "action": [actions]}
-    return graph.model(inputs, {"command": [actions], "risk": [1]})
+    seen = graph.add("Div", "features", graph.constant(scaling.scale))
+    executed = _overruled(graph, policy.guard, policy.threshold, seen, "action")
+    inputs = {"action": [count_of(policy.actions)]}
+    return _model(graph, scaling, seen, executed, inputs, {"risk": [1]})
 
 
 def write_model(path: str | Path, model: Any) -> None:
@@ -60,33 +64,76 @@ def write_model(path: str | Path, model: Any) -> None:
     write_bytes(path, model.SerializeToString(deterministic=True))
 
 
-def actor_difference(path: str | Path, policy: ActorPolicy, seed: int) -> float:
-    """The largest difference of any number of a command between the file and the policy.
+def actor_difference(path: str | Path, policy: ActorPolicy, scaling: Scaling, seed: int) -> float:
+    """The largest difference of a command between the file and the policy, as a share of its range.
 
-    The file is that of `actor_model`, run by ONNX Runtime, on random features of deviations 1 and
-    10. Commands whose risk is at the threshold are left out: rounding decides there who acts.
+    The file is that of `actor_model` or, of a guard, `guard_model`, run by ONNX Runtime, on random
+    features of deviations 1 and 3 in some of which a sensor has dropped out. Where the risk is at
+    the threshold rounding decides who acts: that is left out. Infinite where one is finite alone.
 
     Raises `PalpateError` without the extra `deploy`.
     """
     runtime = extra_module("onnxruntime", EXTRA)
     session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    size = (512, count_of(policy.observations))
-    features = np.random.default_rng(seed).normal(size=size).astype(np.float32)
-    features[256:] *= 10.0
-    theirs = session.run(["command"], {"features": features})[0]
-    ours = policy(None, jnp.asarray(features))[1]
-    off = np.abs(np.asarray(ours) - theirs).reshape(len(features), -1).max(axis=1)
+    random = np.random.default_rng(seed)
+    measured = random.normal(size=(_ROWS, len(scaling.scale))) * scaling.scale
+    measured[_ROWS // 2 :] *= _WIDE
+    measured[np.arange(_LOST), random.integers(len(scaling.scale), size=_LOST)] = np.nan
+    inputs = {"features": measured.astype(np.float32)}
+    seen = jnp.asarray(scaling.features(inputs["features"]))
+    name, near = "action", np.zeros(_ROWS, bool)
+    sound = np.all(np.isfinite(measured), axis=1, keepdims=True)
+    if reflex := any(one.name == "action" for one in session.get_inputs()):
+        name, size = "action_out", (_ROWS, len(scaling.low))
+        inputs["action"] = random.uniform(-1, 1, size).astype(np.float32)
     if isinstance(policy, GuardedPolicy):
-        risk = policy.risk(jnp.asarray(features), policy.propose(jnp.asarray(features)))
-        off = off[np.abs(np.asarray(risk) - policy.threshold) > _NEAR]
-    return float(off.max())
+        proposed = jnp.asarray(inputs["action"]) if reflex else policy.propose(seen)
+        near = np.abs(np.asarray(policy.risk(seen, proposed)) - policy.threshold) <= _NEAR
+        ours = policy.guard.overrule(seen, proposed, policy.threshold)
+    else:
+        ours = policy.propose(seen)
+    ours = np.where(sound, np.asarray(ours), 0.0)
+    action, command = session.run([name, "command"], inputs)
+    told = np.where(sound, scaling.command(ours), scaling.rest)
+    span = np.where(scaling.high > scaling.low, scaling.high - scaling.low, np.abs(scaling.high))
+    apart = np.stack([action - ours, (command.reshape(_ROWS, -1) - told) / span])[:, ~near]
+    return float(np.abs(np.where(np.isfinite(apart), apart, np.inf)).max())
 
 
-def _overruled(graph: Graph, guard: Guard, threshold: float, action: str) -> str:
+def _model(
+    graph: Graph,
+    scaling: Scaling,
+    seen: str,
+    proposed: str,
+    inputs: dict[str, Any],
+    outputs: dict[str, Any],
+) -> Any:
+    """What is left to do: to stretch an action to a command, or to rest where all is not finite."""
+    nothing, (middle, half) = graph.constant(0.0), scaling.stretch
+    finite = _finite(graph, graph.add("Concat", seen, proposed, axis=1))
+    name = "action_out" if inputs else "action"
+    action = graph.add("Where", finite, proposed, nothing, output=name)
+    away = graph.add("Add", graph.add("Mul", action, graph.constant(half)), graph.constant(middle))
+    away = graph.add("Where", finite, away, nothing)
+    parts, first = [], 0
+    for channel in scaling.actions:
+        part = graph.part(away, first, channel)
+        if channel.limit is not None:
+            part = graph.shortened(part, channel.limit)
+        parts.append(graph.flat(part, channel.count))
+        first += channel.count
+    command = graph.add("Add", graph.add("Concat", *parts, axis=1), graph.constant(scaling.rest))
+    shape = scaling.actions[0].shape if len(scaling.actions) == 1 else (first,)
+    graph.add("Reshape", command, graph.constant([-1, *shape], np.int64), output="command")
+    inputs = {"features": [len(scaling.scale)], **inputs}
+    return graph.model(inputs, {"command": shape, name: [first], **outputs})
+
+
+def _overruled(graph: Graph, guard: Guard, threshold: float, seen: str, action: str) -> str:
     """The action, or the recovery's where it is risky; the risk is the output `risk`."""
-    part = "features"
+    part = seen
     if guard.seen is not None:
-        part = graph.add("Gather", part, graph.constant(guard.seen, np.int64), axis=1)
+        part = graph.add("Gather", seen, graph.constant(guard.seen, np.int64), axis=1)
     inputs, critic = graph.add("Concat", part, action, axis=1), guard.critic.network
     members = [
         graph.add("Sigmoid", _layers(graph, critic, inputs, member))
@@ -124,11 +171,6 @@ def _finite(graph: Graph, values: str) -> str:
     counted = graph.add("Cast", each, to=1)  # to float: there is no minimum of truth values
     least = graph.add("ReduceMin", counted, axes=[1], keepdims=1)
     return graph.add("Greater", least, graph.constant(0.5))
-
-
-def _still(graph: Graph, action: str) -> str:
-    """The action, or zeros where any of its numbers is not finite."""
-    return graph.add("Where", _finite(graph, action), action, graph.constant(0.0))
 
 
 def _one(graph: Graph) -> str:

@@ -54,9 +54,7 @@ def _moved(graph: Graph, channel: Channel, period: float, output: str, before: s
     if channel.rate_limit is None:
         return graph.add("Mul", direction, limit)
     change = graph.add("Mul", direction, graph.constant(period * channel.rate_limit))
-    moved = graph.add("Add", before, change)
-    square = graph.add("Max", graph.square(moved), graph.constant(channel.bound**2))
-    return graph.add("Mul", moved, graph.add("Div", limit, graph.add("Sqrt", square)))
+    return graph.shortened(graph.add("Add", before, change), channel.bound)
 
 
 def write_onnx(path: str | Path, policy: CommandPolicy) -> None:

@@ -46,6 +46,13 @@ class Graph:
         """The squared length along the last axis, which stays with size 1."""
         return self.add("ReduceSum", self.add("Mul", vector, vector), self._sum_axis, keepdims=1)
 
+    def shortened(self, vector: str, limit: float) -> str:
+        """The vector itself up to the length `limit`, else the one of that length beside it."""
+        square = self.add("Max", self.square(vector), self.constant(limit**2))
+        return self.add(
+            "Mul", vector, self.add("Div", self.constant(limit), self.add("Sqrt", square))
+        )
+
     def part(self, flat: str, first: int, channel: Channel) -> str:
         """The numbers of a channel from `first` on, in its shape."""
         places = [self.constant([place], np.int64) for place in (first, first + channel.count, 1)]

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from palpate.errors import PalpateError
-from palpate.networks.actor import Perceptron
 from palpate.networks.guarded import Guard
+from palpate.networks.in_numpy import GuardInNumpy
 from palpate.worlds.world import ControlLaw, InterruptingLaw
 
 
@@ -28,8 +28,8 @@ class Reflex(InterruptingLaw):
     brakes); without a law the command is zero.
 
     `executed` (worlds, actions) is what is under way, `interrupted` (worlds,) bool whether it was
-    replaced in the last control period. The networks are evaluated by NumPy: for few worlds that
-    takes less than half as long as a compiled call, and waits for no other that is in flight.
+    replaced in the last control period. The networks are evaluated by NumPy
+    (`palpate.networks.in_numpy`).
 
     Raises `PalpateError` for a pace below 1.
     """
@@ -44,7 +44,7 @@ class Reflex(InterruptingLaw):
             raise PalpateError(f"the pace is at least 1 control period, not {pace}")
         self.law, self.pace = law, pace
         self._observe = observe
-        self._guard: _GuardOfNumpy | None = None
+        self._guard: GuardInNumpy | None = None
         self._threshold = 1.0
 
     def watch_with(self, guard: Guard, threshold: float) -> None:
@@ -54,7 +54,7 @@ class Reflex(InterruptingLaw):
         """
         if not 0.0 <= threshold <= 1.0:
             raise PalpateError(f"the threshold is {threshold}: expected a risk in [0, 1]")
-        self._guard, self._threshold = _GuardOfNumpy(guard), threshold
+        self._guard, self._threshold = GuardInNumpy(guard), threshold
 
     def begin(
         self,
@@ -98,41 +98,3 @@ class Reflex(InterruptingLaw):
             )
             self._began = type(observation)._make(began)
             self.law.begin(self._began, self.executed, np.zeros(len(which), bool))
-
-
-class _GuardOfNumpy:
-    """What a `Guard` says, with NumPy."""
-
-    def __init__(self, guard: Guard):
-        self._seen = slice(None) if guard.seen is None else list(guard.seen)
-        self._critic = _layers(guard.critic.network)
-        self._recovery = _layers(guard.recovery.network)
-
-    def risk(self, features: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """(worlds,), not finite where what it sees or does is not."""
-        inputs = np.concatenate([features[:, self._seen], action.astype(np.float32)], axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return (1.0 / (1.0 + np.exp(-_values(self._critic, inputs)[..., 0]))).max(axis=0)
-
-    def recover(self, features: np.ndarray) -> np.ndarray:
-        """The recovery's actions (worlds, actions)."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.tanh(_values(self._recovery, features[:, self._seen]))
-
-
-_Layers = list[tuple[np.ndarray, np.ndarray]]
-
-
-def _layers(network: Perceptron) -> _Layers:
-    """Weights, and biases that a batch can be added to."""
-    pairs = zip(network.weights, network.biases, strict=True)
-    return [(np.array(weight), np.array(bias)[..., None, :]) for weight, bias in pairs]
-
-
-def _values(layers: _Layers, inputs: np.ndarray) -> np.ndarray:
-    """See `Perceptron.__call__`."""
-    values = inputs
-    for number, (weight, bias) in enumerate(layers):
-        values = np.maximum(values, 0.0) if number else values
-        values = values @ weight + bias
-    return values

@@ -10,6 +10,10 @@ FAMILY = Family(
     name="contact",
     about="a compliant tip that touches walls",
     models={"tip": "palpate.models.contact:Tip"},
+    deployments={
+        "maze": "palpate.families.contact.deployment:MazeDeployment",
+        "navigation": "palpate.families.contact.deployment:NavigationDeployment",
+    },
     options={
         "record": {"contact": f"{_TOUCH}:RecordContact"},
         "identify": {"contact": f"{_TOUCH}:IdentifyContact"},

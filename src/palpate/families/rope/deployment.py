@@ -38,6 +38,8 @@ class RopeDecision:
         PalpateError: the policy observes something else, or more nodes than there are markers.
     """
 
+    held = 0
+
     def __init__(self, policy: CommandPolicy, markers: int, network: Network | None = None):
         nodes = nodes_of(policy)
         at_nodes(np.zeros((markers, 3)), nodes)  # which says now if there are too few
@@ -70,7 +72,7 @@ class RopeDecision:
         return self._network(self._features.reshape(-1), command)
 
 
-class RopeDeployment(Deployment):
+class RopeDeployment(Deployment[CommandPolicy]):
     """See `Deployment`: the sensors are the gripper's encoder and the markers, gripper to tip."""
 
     def set_rows(self, rows: Mapping[str, int]) -> None:

@@ -22,6 +22,7 @@ from palpate.safety.reflex import Reflex
 from palpate.safety.self_tuning import SelfTuningLaw
 from palpate.tasks.maze.maze import MazeTask
 from palpate.tasks.maze.navigation import NavigationTask
+from palpate.worlds import velocity
 from palpate.worlds.arm.maze import ArmMaze
 from palpate.worlds.gymnasium import GymnasiumWorld, GymnasiumWorlds, WorldTask, features_of
 from palpate.worlds.maze.layout import Layout
@@ -138,7 +139,8 @@ ENVIRONMENTS = {
 
 
 def register() -> None:
-    """Enter the environments into Gymnasium's registry, once."""
+    """Enter the environments into Gymnasium's registry, once; those with a speed limit, too."""
+    velocity.register()
     for name, (single, vector) in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             places = (f"{__name__}:{function.__name__}" for function in (single, vector))

@@ -1,0 +1,180 @@
+"""What the commands need to know of environments that somebody else wrote."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from tyro.conf import arg
+
+from palpate.errors import PalpateError, PalpateWarning
+from palpate.families.world_options import EvaluateInWorld, TrainInWorld
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from gymnasium.vector import VectorEnv
+
+    from palpate.families.gymnasium.environments import Described
+    from palpate.learning.off_policy import OffPolicyTraining
+    from palpate.learning.off_policy.agent import Agent
+    from palpate.networks.guarded import ActorPolicy
+    from palpate.runs import Figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainGymnasium(TrainInWorld):
+    """Train a policy in any environment of Gymnasium that tells in `info["cost"]` what to avoid.
+
+    What it sees and does are vectors, the latter with bounds. A module that registers it may stand
+    before its id, and lie in the current folder. Learns by soft actor-critic, with the same
+    settings everywhere. There is no srl-vic: its critic of risks learns ahead from scripted
+    collisions, and nobody knows how to collide in an environment of yours.
+
+    1. A cheetah that may not run too fast:     palpate train gymnasium
+                                                    --environment palpate/VelocityHalfCheetah-v0
+    2. One of your own, in mine.py:             palpate train gymnasium
+                                                    --environment mine:Mine-v0 --cost-limit 1
+    """
+
+    task: ClassVar[str] = "gymnasium"
+    most_tried: ClassVar[int] = 20
+
+    environment: Annotated[str, arg(metavar="ID")]
+    """As gymnasium.make takes it."""
+    method: Literal["lagrangian", "penalty", "no-recovery"] = "lagrangian"
+    """lagrangian: an episode's cost as a constraint, whose price is found; penalty: at a price;
+    no-recovery: costs are counted, and nothing is done about them."""
+    cost_limit: float = 25.0
+    """On the summed cost of an episode; for lagrangian."""
+    price: float = 10.0
+    """Of a cost of 1, in rewards; for penalty."""
+    steps: int = 1_000_000
+    """Decisions, those of all environments together."""
+    environments: int = 4
+    """That run side by side."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value in (("cost-limit", self.cost_limit), ("price", self.price)):
+            if not 0.0 <= value < float("inf"):
+                raise PalpateError(f"--{name} is 0 or greater, not {value}")
+
+    @functools.cached_property
+    def described(self) -> Described:
+        """What the environment is; raises `PalpateError` where nothing can learn in it."""
+        from palpate.families.gymnasium.environments import LOOKED_AT, described
+
+        found = described(self.environment)
+        silent = f"'{self.environment}' told no info[\"cost\"] in {LOOKED_AT} random steps"
+        if not found.costs and self.method != "no-recovery":
+            raise PalpateError(
+                f"{silent}: expected a cost of every step, 0 where nothing is violated; --method "
+                "no-recovery learns without"
+            )
+        if not found.costs:
+            warnings.warn(f"{silent}: all costs count as 0", PalpateWarning, stacklevel=2)
+        return found
+
+    def make(self, count: int, policy: ActorPolicy | None = None) -> VectorEnv:
+        from palpate.families.gymnasium.environments import made
+
+        return made(self.environment, count)
+
+    def agent(self) -> Agent:
+        from palpate.families.gymnasium.methods import agent_of
+
+        return agent_of(self.method, self.cost_limit, self.price)
+
+    def training(self) -> OffPolicyTraining:
+        from palpate.families.gymnasium.methods import training_of
+
+        return training_of(self.steps)
+
+    def policy(self, state: Any) -> ActorPolicy:
+        from palpate.families.gymnasium.methods import policy_of
+
+        return policy_of(self.agent(), state, self.described.period)
+
+    def constants(self) -> dict[str, Any]:
+        agent = self.agent()
+        return {
+            "method": type(agent).__name__,
+            "agent": dataclasses.asdict(agent),  # type: ignore[call-overload]
+            "environment": dataclasses.asdict(self.described),
+        }
+
+    def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
+        return figures(episodes, suffix)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateGymnasium(EvaluateInWorld):
+    """Try a policy in the environment that it was trained in, or in one like it.
+
+    1. Where it was trained:                    palpate evaluate gymnasium --policy P
+    2. In another, of the same size:            palpate evaluate gymnasium --policy P
+                                                    --environment ID
+    """
+
+    task: ClassVar[str] = "gymnasium"
+
+    environment: Annotated[
+        str | None, arg(metavar="ID", help_behavior_hint="(default: as trained)")
+    ] = None
+    """As gymnasium.make takes it."""
+
+    def make(
+        self, count: int, manifest: Mapping[str, Any], policy: ActorPolicy | None
+    ) -> VectorEnv:
+        from palpate.families.gymnasium.environments import made
+        from palpate.learning.off_policy.environments import check
+        from palpate.networks.channels import channels_of, count_of
+
+        environments, declared = made(self.where(manifest), count), manifest["controller"]
+        wanted = tuple(
+            count_of(channels_of(declared[what])) for what in ("observations", "actions")
+        )
+        if (found := check(environments)) != wanted:
+            environments.close()
+            raise PalpateError(
+                f"'{self.where(manifest)}' shows {found[0]} numbers and takes {found[1]}: the "
+                f"policy expects {wanted[0]} and {wanted[1]}"
+            )
+        return environments
+
+    def where(self, manifest: Mapping[str, Any]) -> str:
+        """The id of the environment that it is tried in."""
+        return self.environment or manifest["options"]["environment"]
+
+    def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
+        return figures(episodes, suffix)
+
+    def about(self, manifest: Mapping[str, Any]) -> str:
+        trained = manifest["options"]
+        return f"tried in {self.where(manifest)}, trained by {trained['method']}"
+
+
+def figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
+    """Means of episodes as `palpate.learning.off_policy.evaluate` gives them: rewards and costs."""
+    from palpate.runs import Figure
+    from palpate.runs.result import two_standard_errors
+
+    return [
+        Figure(
+            f"{name}{suffix}",
+            float(episodes[of].mean()),
+            "",
+            better=better,
+            spread=two_standard_errors(episodes[of]),
+        )
+        for name, of, better in (
+            ("reward", "return", "higher"),
+            ("cost", "cost", "lower"),
+            ("length", "length", "higher"),
+        )
+    ]

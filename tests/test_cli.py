@@ -167,14 +167,14 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "train rope-stabilisation",
             "unknown task 'rope-stabilisation'; did you mean 'rope-stabilization'? there are: "
-            "maze, navigation, rope-stabilization, rope-tracking, FILE.py:CLASS",
+            "maze, navigation, gymnasium, rope-stabilization, rope-tracking, FILE.py:CLASS",
         ),
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
             "maze-safe, contact-model, maze-arm, maze-reflex, namo-scenarios, namo-scaling, "
             "namo-online, "
-            "calibration, one-shot, cart-online, "
+            "calibration, one-shot, cart-online, velocity-yardstick, "
             "own-model, rope-model, rope-stabilization, rope-ablation, rope-rivals, rope-bound, "
             "rope-generalization, rope-tracking, rope-dagger, rope-posterior, own-rope, "
             "rope-residual, rope-markerless",

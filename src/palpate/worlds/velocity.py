@@ -31,11 +31,12 @@ class SpeedLimit(gymnasium.Wrapper, RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step of the environment, and its cost."""
-        *rest, info = self.env.step(action)
+        seen, reward, terminated, truncated, info = self.env.step(action)
         x, y = info["x_velocity"], info.get("y_velocity")
         # Forwards alone where there is one direction: backwards is never too fast.
         speed = x if y is None else math.hypot(x, y)
-        return *rest, info | {"cost": 0.0 if speed <= self.limit else 1.0}
+        cost = 0.0 if speed <= self.limit else 1.0
+        return seen, reward, terminated, truncated, info | {"cost": cost}
 
 
 def register() -> None:

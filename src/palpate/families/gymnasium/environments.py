@@ -2,7 +2,7 @@
 
 import os
 import sys
-from dataclasses import dataclass
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -28,25 +28,22 @@ def made(name: str, count: int) -> VectorEnv:
     register()  # ours are found without a module
     if ":" in name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
+    cannot, autoreset = f"the environment '{name}' cannot be made", AutoresetMode.SAME_STEP
     try:
         environments = gymnasium.make_vec(
-            name,
-            num_envs=count,
-            vectorization_mode="sync",
-            vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+            name, count, "sync", vector_kwargs={"autoreset_mode": autoreset}
         )
     except ModuleNotFoundError as error:
         brought = BROUGHT_BY.get(error.name or "")
         advice = f"`pip install '{brought}'` brings it" if brought else "is its package installed?"
-        raise PalpateError(f"the environment '{name}' cannot be made: {error}; {advice}") from error
+        raise PalpateError(f"{cannot}: {str(error).rstrip('.')}; {advice}") from error
     except gymnasium.error.UnregisteredEnv as error:
         raise PalpateError(
             f"unknown environment '{name}': {error} Expected an id that gymnasium.make takes; "
             "module:Name-v0 imports the module that registers it"
         ) from error
     except Exception as error:  # whatever is wrong with somebody's environment
-        kind = type(error).__name__
-        raise PalpateError(f"the environment '{name}' cannot be made: {kind}: {error}") from error
+        raise PalpateError(f"{cannot}: {type(error).__name__}: {error}") from error
     try:
         check(environments)
     except PalpateError as error:
@@ -55,36 +52,20 @@ def made(name: str, count: int) -> VectorEnv:
     return environments
 
 
-@dataclass(frozen=True)
-class Described:
-    """What an environment is: numbers seen, bounds of its actions, s of a step, and costs.
+def described(name: str) -> dict[str, Any]:
+    """What is found of an environment in `LOOKED_AT` random steps.
 
-    A `period` of 1 where it does not say how fast it runs. `costs`: whether its info had a "cost"
-    in `LOOKED_AT` random steps.
+    The bounds of its actions ("low", "high"), s of a step by its frames per second ("period", 1
+    where it has none), and whether its info had a "cost" ("costs"). Raises as `made`.
     """
-
-    features: int
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    period: float
-    costs: bool
-
-
-def described(name: str) -> Described:
-    """What is found of the environment of that name; raises `PalpateError` as `made`."""
-    environments = made(name, 1)
-    try:
-        features, _ = check(environments)
-        done = environments.single_action_space
-        assert isinstance(done, Box)
-        environments.reset(seed=0)
-        environments.action_space.seed(0)
-        costs = False
-        for _ in range(LOOKED_AT):
-            infos = environments.step(environments.action_space.sample())[-1]
-            costs = costs or "cost" in infos or "cost" in infos.get("final_info", {})
-        frames = environments.metadata.get("render_fps")
-    finally:
-        environments.close()
-    bounds = (tuple(np.asarray(bound, float).tolist()) for bound in (done.low, done.high))
-    return Described(features, *bounds, 1.0 / frames if frames else 1.0, costs)
+    environments, costs = made(name, 1), False
+    space, frames = environments.single_action_space, environments.metadata.get("render_fps")
+    assert isinstance(space, Box)
+    environments.reset(seed=0)
+    environments.action_space.seed(0)
+    for _ in range(LOOKED_AT):
+        *_, infos = environments.step(environments.action_space.sample())
+        costs = costs or "cost" in infos or "cost" in infos.get("final_info", {})
+    environments.close()
+    bounds = {side: np.asarray(getattr(space, side), float).tolist() for side in ("low", "high")}
+    return {**bounds, "period": 1.0 / frames if frames else 1.0, "costs": costs}

@@ -4,25 +4,16 @@ Chosen before the first training in any of them, from what is usual for tasks of
 nothing of it is fitted to one environment.
 """
 
-from collections.abc import Callable
 from typing import Any
 
-from palpate.family import check_name
-from palpate.learning.off_policy import (
-    Lagrangian,
-    OffPolicyTraining,
-    Penalty,
-    SoftActorCritic,
-)
+from palpate.learning.off_policy import Lagrangian, OffPolicyTraining, Penalty, SoftActorCritic
 from palpate.learning.off_policy.agent import Agent
 from palpate.networks import Channel
 from palpate.networks.guarded import ActorPolicy
 
 DISCOUNT, WIDTH = 0.99, 256  # of two layers; both as in soft actor-critic (arXiv 1812.05905)
 BATCH, CAPACITY = 256, 1_000_000
-RATIO = (
-    0.25  # updates a step: the least that a comparison by steps asks for, and what takes longest
-)
+RATIO = 0.25  # updates a step: the least that a comparison by steps asks for; they take longest
 WARM_UP = 10_000  # random steps: ten episodes of a thousand, as OmniSafe's SAC-Lag has
 # The multiplier moves as fast as every weight: in 250,000 updates up to 75, where a step that
 # breaks the limit gains about 10. OmniSafe's 1e-5 is for four times as many updates.
@@ -31,25 +22,15 @@ MULTIPLIER_RATE = 3e-4
 CHECKPOINT_EVERY, LOG_EVERY = 100_000, 4_000  # steps
 
 
-def _agent() -> SoftActorCritic:
-    return SoftActorCritic(discount=DISCOUNT, width=WIDTH)
-
-
-METHODS: dict[str, Callable[[float, float], Agent]] = {
-    "no-recovery": lambda limit, price: _agent(),
-    "lagrangian": lambda limit, price: Lagrangian(
-        _agent(), limit, discount=DISCOUNT, multiplier_rate=MULTIPLIER_RATE, width=WIDTH
-    ),
-    "penalty": lambda limit, price: Penalty(_agent(), price),
-}
-
-
 def agent_of(method: str, cost_limit: float, price: float) -> Agent:
-    """What learns: under a limit on an episode's cost, at a price in rewards, or regardless.
-
-    Raises `PalpateError` for another method.
-    """
-    return METHODS[check_name("method", method, METHODS)](cost_limit, price)
+    """What learns: under a limit on an episode's cost, at a price in rewards, or regardless."""
+    agent = SoftActorCritic(discount=DISCOUNT, width=WIDTH)
+    if method == "penalty":
+        return Penalty(agent, price)
+    if method == "lagrangian":
+        rate = MULTIPLIER_RATE
+        return Lagrangian(agent, cost_limit, discount=DISCOUNT, multiplier_rate=rate, width=WIDTH)
+    return agent
 
 
 def training_of(steps: int) -> OffPolicyTraining:
@@ -69,5 +50,5 @@ def policy_of(agent: Agent, state: Any, period: float) -> ActorPolicy:
     """The controller of an agent's state, with a decision every `period` s."""
     actor = state.agent.actor if isinstance(agent, Lagrangian) else state.actor
     seen, *_, both = actor.network.sizes  # it gives means and deviations
-    channels = (Channel("observation", (seen,)),), (Channel("action", (both // 2,)),)
-    return ActorPolicy(actor, *channels, period)
+    sees, does = Channel("observation", (seen,)), Channel("action", (both // 2,))
+    return ActorPolicy(actor=actor, observations=(sees,), actions=(does,), period=period)

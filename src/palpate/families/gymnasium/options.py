@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium.vector import VectorEnv
 
-    from palpate.families.gymnasium.environments import Described
     from palpate.learning.off_policy import OffPolicyTraining
     from palpate.learning.off_policy.agent import Agent
     from palpate.networks.guarded import ActorPolicy
@@ -30,14 +29,13 @@ if TYPE_CHECKING:
 class TrainGymnasium(TrainInWorld):
     """Train a policy in any environment of Gymnasium that tells in `info["cost"]` what to avoid.
 
-    What it sees and does are vectors, the latter with bounds. A module that registers it may stand
-    before its id, and lie in the current folder. Learns by soft actor-critic, with the same
-    settings everywhere. There is no srl-vic: its critic of risks learns ahead from scripted
+    What it sees and does are vectors, the latter with bounds. Soft actor-critic learns, with the
+    same settings everywhere. There is no srl-vic: its critic of risks learns ahead from scripted
     collisions, and nobody knows how to collide in an environment of yours.
 
     1. A cheetah that may not run too fast:     palpate train gymnasium
                                                     --environment palpate/VelocityHalfCheetah-v0
-    2. One of your own, in mine.py:             palpate train gymnasium
+    2. One that ./mine.py registers:            palpate train gymnasium
                                                     --environment mine:Mine-v0 --cost-limit 1
     """
 
@@ -45,7 +43,7 @@ class TrainGymnasium(TrainInWorld):
     most_tried: ClassVar[int] = 20
 
     environment: Annotated[str, arg(metavar="ID")]
-    """As gymnasium.make takes it."""
+    """As gymnasium.make takes it, after the module that registers it and a colon."""
     method: Literal["lagrangian", "penalty", "no-recovery"] = "lagrangian"
     """lagrangian: an episode's cost as a constraint, whose price is found; penalty: at a price;
     no-recovery: costs are counted, and nothing is done about them."""
@@ -62,21 +60,21 @@ class TrainGymnasium(TrainInWorld):
         super().__post_init__()
         for name, value in (("cost-limit", self.cost_limit), ("price", self.price)):
             if not 0.0 <= value < float("inf"):
-                raise PalpateError(f"--{name} is 0 or greater, not {value}")
+                raise PalpateError(f"--{name} is a number, 0 or greater, not {value}")
 
     @functools.cached_property
-    def described(self) -> Described:
+    def described(self) -> dict[str, Any]:
         """What the environment is; raises `PalpateError` where nothing can learn in it."""
         from palpate.families.gymnasium.environments import LOOKED_AT, described
 
         found = described(self.environment)
         silent = f"'{self.environment}' told no info[\"cost\"] in {LOOKED_AT} random steps"
-        if not found.costs and self.method != "no-recovery":
+        if not found["costs"] and self.method != "no-recovery":
             raise PalpateError(
                 f"{silent}: expected a cost of every step, 0 where nothing is violated; --method "
                 "no-recovery learns without"
             )
-        if not found.costs:
+        if not found["costs"]:
             warnings.warn(f"{silent}: all costs count as 0", PalpateWarning, stacklevel=2)
         return found
 
@@ -98,15 +96,12 @@ class TrainGymnasium(TrainInWorld):
     def policy(self, state: Any) -> ActorPolicy:
         from palpate.families.gymnasium.methods import policy_of
 
-        return policy_of(self.agent(), state, self.described.period)
+        return policy_of(self.agent(), state, self.described["period"])
 
     def constants(self) -> dict[str, Any]:
-        agent = self.agent()
-        return {
-            "method": type(agent).__name__,
-            "agent": dataclasses.asdict(agent),  # type: ignore[call-overload]
-            "environment": dataclasses.asdict(self.described),
-        }
+        agent: Any = self.agent()
+        about = {"method": type(agent).__name__, "agent": dataclasses.asdict(agent)}
+        return {**about, "environment": self.described}
 
     def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
         return figures(episodes, suffix)
@@ -114,49 +109,26 @@ class TrainGymnasium(TrainInWorld):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateGymnasium(EvaluateInWorld):
-    """Try a policy in the environment that it was trained in, or in one like it.
+    """Try a policy in the environment that it was trained in.
 
-    1. Where it was trained:                    palpate evaluate gymnasium --policy P
-    2. In another, of the same size:            palpate evaluate gymnasium --policy P
-                                                    --environment ID
+    1. What was trained:                        palpate evaluate gymnasium --policy P
     """
 
     task: ClassVar[str] = "gymnasium"
-
-    environment: Annotated[
-        str | None, arg(metavar="ID", help_behavior_hint="(default: as trained)")
-    ] = None
-    """As gymnasium.make takes it."""
 
     def make(
         self, count: int, manifest: Mapping[str, Any], policy: ActorPolicy | None
     ) -> VectorEnv:
         from palpate.families.gymnasium.environments import made
-        from palpate.learning.off_policy.environments import check
-        from palpate.networks.channels import channels_of, count_of
 
-        environments, declared = made(self.where(manifest), count), manifest["controller"]
-        wanted = tuple(
-            count_of(channels_of(declared[what])) for what in ("observations", "actions")
-        )
-        if (found := check(environments)) != wanted:
-            environments.close()
-            raise PalpateError(
-                f"'{self.where(manifest)}' shows {found[0]} numbers and takes {found[1]}: the "
-                f"policy expects {wanted[0]} and {wanted[1]}"
-            )
-        return environments
-
-    def where(self, manifest: Mapping[str, Any]) -> str:
-        """The id of the environment that it is tried in."""
-        return self.environment or manifest["options"]["environment"]
+        return made(manifest["options"]["environment"], count)
 
     def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
         return figures(episodes, suffix)
 
     def about(self, manifest: Mapping[str, Any]) -> str:
         trained = manifest["options"]
-        return f"tried in {self.where(manifest)}, trained by {trained['method']}"
+        return f"tried in {trained['environment']}, trained by {trained['method']}"
 
 
 def figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
@@ -164,17 +136,12 @@ def figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure
     from palpate.runs import Figure
     from palpate.runs.result import two_standard_errors
 
-    return [
-        Figure(
-            f"{name}{suffix}",
-            float(episodes[of].mean()),
-            "",
-            better=better,
-            spread=two_standard_errors(episodes[of]),
-        )
-        for name, of, better in (
-            ("reward", "return", "higher"),
-            ("cost", "cost", "lower"),
-            ("length", "length", "higher"),
-        )
-    ]
+    found = []
+    for name, of, better in (
+        *(("reward", "return", "higher"), ("cost", "cost", "lower")),
+        ("length", "length", "higher"),
+    ):
+        values = episodes[of]
+        spread, mean = two_standard_errors(values), float(values.mean())
+        found.append(Figure(f"{name}{suffix}", mean, "", better=better, spread=spread))
+    return found

@@ -1,7 +1,7 @@
 """Whether the maze asks for what it is meant to: one who sees everything, stiff and soft.
 
 The agent reads the truth: it follows the way to the goal softly, and pushes the block stiffly along
-the channel and softly across it, with 22 N at most.
+the channel and softly across it, with 18 N at most.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ def decision(truth):
     abreast, stopped = abs(place[1] - y), truth.obstacle > layout.obstacle.travel - 2e-3
     if abreast < 8e-3 and -0.085 < place[0] < face and not stopped:
         if face - TIP_RADIUS - place[0] < 4e-3:
-            push = 22.0 / STIFFNESS_RANGE[1] / DISPLACEMENT_LIMIT
+            push = 18.0 / STIFFNESS_RANGE[1] / DISPLACEMENT_LIMIT
             return np.array([push, 0, STIFFEST, SOFTEST], np.float32)
         return np.array([0.35, 0, SOFT, SOFTEST], np.float32)
     if abreast < 0.035 and 0.07 < place[0] < face:

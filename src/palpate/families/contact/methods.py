@@ -35,7 +35,7 @@ from palpate.worlds.maze import scene
 WRENCH = (0, 1, 2, 3, 4, 5)  # of the features: SRL-VIC's critic and recovery see no position
 DISCOUNT, TARGET_ENTROPY = 0.98, -1.0  # of the task's agent
 WIDTH = 128  # of the two hidden layers of every network
-RISK_DISCOUNT, RISK_THRESHOLD = 0.8, 0.15
+RISK_DISCOUNT, RISK_THRESHOLD = 0.5, 0.03
 NAVIGATION_THRESHOLD = 0.3  # as Recovery RL's, which has this discount there too
 VIOLATION_PRICE = 50.0  # of the penalty, in rewards: more than the whole way to the goal is worth
 COST_LIMIT = 0.02  # Lagrangian: violations an episode
@@ -82,7 +82,7 @@ METHODS: dict[str, Callable[[], Method]] = {
     "no-recovery": lambda: Method(_agent()),
     "k300": lambda: Method(_guarded(), 300.0),
     "k500": lambda: Method(_guarded(), 500.0),
-    "k600": lambda: Method(_guarded(), 600.0),  # with 3 cm what the heaviest block resists
+    "k600": lambda: Method(_guarded(), 600.0),  # with 3 cm 4 N more than the heaviest block resists
     "k1000": lambda: Method(_guarded(), 1000.0),
     "self-tuning": lambda: Method(_guarded(), SELF_TUNING),
     "lagrangian": lambda: Method(

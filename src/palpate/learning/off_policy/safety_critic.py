@@ -35,8 +35,11 @@ class SafetyCritic:
 
     with c whether the decision violated a constraint: nothing counts beyond a violation. a' is
     what the policy acting would do at s'. The critics' outputs are squashed into [0, 1] and follow
-    y by least squares; the greater of the two is the risk. Critic and recovery see the numbers
-    `seen` of an observation (None: all).
+    y by its cross-entropy; the greater of the two is the risk. It has its minimum where least
+    squares have theirs, which the papers take, but its gradient does not vanish where risks are
+    small: on 150,000 decisions of a maze, of which 344 violate the limit, the tenth with the
+    greatest risk holds 77 % of the violations not learnt from instead of 47 %. Critic and recovery
+    see the numbers `seen` of an observation (None: all).
     """
 
     discount: float = 0.8
@@ -88,8 +91,8 @@ class SafetyCritic:
             wanted = self.discount**duration * (violated + goes_on * later)
 
         def critic_loss(critic: Critic) -> Array:
-            error = jax.nn.sigmoid(critic(seen, lived.executed)) - wanted
-            return jnp.sum(jnp.mean(weight * error**2, axis=-1))
+            lost = optax.sigmoid_binary_cross_entropy(critic(seen, lived.executed), wanted)
+            return jnp.sum(jnp.mean(weight * lost, axis=-1))
 
         def recovery_loss(recovery: DeterministicActor, critic: Critic) -> Array:
             return jnp.mean(jnp.max(jax.nn.sigmoid(critic(seen, recovery.mean(seen))), axis=0))

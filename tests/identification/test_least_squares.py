@@ -1,5 +1,6 @@
 """Combinations that the data leave free are named, beside parameters they say nothing of."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +8,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
-from palpate.identification.gradient.least_squares import _undecided, intervals
+from palpate.identification.data.prediction import observation_scale
+from palpate.identification.data.segments import SegmentSource
+from palpate.identification.gradient.least_squares import (
+    KNEE,
+    Objective,
+    _undecided,
+    intervals,
+    pseudo_huber,
+)
 from palpate.models.model import Model, rollout
 from palpate.parameters import FreeParameters, LogNormal, parameter
 from palpate.recordings import Aligned
@@ -61,6 +70,34 @@ def test_a_combination_is_named_whatever_else_is_undecided(push, together):
     found = intervals(coordinates, coordinates.initial, aligned)
     assert (found.verdict["gear"] is None) == (push > 0.0)
     assert [named(warning) for warning in found.warnings] == [together]
+
+
+def test_curved_products_are_the_derivatives_of_the_loss_beyond_its_knee():
+    """By the starts, in which a cart is linear: intervals stand on them, so on no larger ones."""
+    cart = GearedCart(gear=1.0, mass=1.0, friction=1.0)
+    noise = np.random.default_rng(0).normal(size=(2, 31, 1))
+    moving = np.linspace(0.0, 1.0, 31)[:, None] + 0.03 * noise
+    aligned = Aligned(0.05, moving, np.zeros((2, 30, 1)), np.full(2, 31))
+    segments = SegmentSource.of(aligned, cart).whole()
+    coordinates = FreeParameters(cart)
+    objective = Objective(coordinates, observation_scale(aligned, cart), KNEE)
+    start = jnp.zeros((2, 2, 1))
+
+    def loss(offset):
+        relative = objective.relative(coordinates.initial, offset.reshape(start.shape), segments)
+        return jnp.sum(pseudo_huber(relative, KNEE))
+
+    curved, straight = (
+        objective.products(coordinates.initial, start, segments, False, curved).sum(axis=1)
+        for curved in (True, False)
+    )
+    slope, curvature = jax.grad(loss)(start.ravel()), jax.hessian(loss)(start.ravel())
+    np.testing.assert_allclose(curved[:, :-1, -1].ravel(), slope, rtol=1e-4, atol=1e-6)
+    for trial in range(2):
+        own = slice(2 * trial, 2 * trial + 2)
+        np.testing.assert_allclose(curved[trial, :-1, :-1], curvature[own, own], rtol=1e-4)
+    assert np.all(np.diagonal(straight / curved, axis1=1, axis2=2)[:, :-1] > 1.3)
+    np.testing.assert_allclose(curved[:, -1, -1], straight[:, -1, -1], rtol=1e-5)
 
 
 def test_a_trial_that_jumps_out_of_all_bounds_is_named():

@@ -73,17 +73,24 @@ class Objective(eqx.Module):
         return residuals(model, predict(model, begun), segments) / self.scale
 
     def products(
-        self, free: Free, offset: Array, segments: Segments, parameters: bool = True
+        self,
+        free: Free,
+        offset: Array,
+        segments: Segments,
+        parameters: bool = True,
+        curved: bool = False,
     ) -> Float[np.ndarray, "segments blocks columns columns"]:
         """Products of the weighted columns of the Jacobian and the residual, by tenth of a segment.
 
         Columns: the free values in the order of `ravel_pytree` (not without `parameters`), the
-        errors of a segment's own start, the residual. A few segments at a time.
+        errors of a segment's own start, the residual. A few segments at a time. Those of the
+        Jacobian with itself have the weights whose slope is the loss's, or, `curved`, its curvature
+        (pseudo-Huber's is less, beyond the knee by far).
         """
         parts = []
         for first in range(0, segments.count, GROUP):
             own = jax.tree.map(lambda x, f=first: x[f : f + GROUP], (offset, segments))
-            parts.append(np.asarray(_products(self, free, own, parameters)))
+            parts.append(np.asarray(_products(self, free, own, parameters, curved)))
         return np.concatenate(parts)
 
     def step(
@@ -116,7 +123,11 @@ class Objective(eqx.Module):
 
 @eqx.filter_jit
 def _products(
-    objective: Objective, free: Free, starting: tuple[Array, Segments], parameters: bool
+    objective: Objective,
+    free: Free,
+    starting: tuple[Array, Segments],
+    parameters: bool,
+    curved: bool,
 ) -> Array:
     offset, segments = starting
     flat, unravel = ravel_pytree(free)
@@ -133,15 +144,19 @@ def _products(
 
     directions = jnp.eye(unknowns + starts, dtype=flat.dtype)
     columns = jax.vmap(along)(directions[0 if parameters else unknowns :])
-    columns = jnp.concatenate([columns, residual[None]])
-    weight = segments.seen.astype(flat.dtype)
+    weight, bend = segments.seen.astype(flat.dtype), jnp.ones_like(residual)
     if objective.knee is not None:
-        weight *= objective.knee / jnp.sqrt(jnp.square(residual) + objective.knee**2)
-    columns *= jnp.sqrt(weight)
+        share = objective.knee / jnp.sqrt(jnp.square(residual) + objective.knee**2)
+        weight, bend = weight * share, share if curved else bend
+    # The curvature is the weight times `bend` squared; with the residual it is the slope.
+    columns = jnp.concatenate([columns * bend, residual[None] / bend]) * jnp.sqrt(weight)
     time = -residual.shape[1] % BLOCKS
     padded = jnp.pad(columns, [(0, 0), (0, 0), (0, time)] + [(0, 0)] * (columns.ndim - 3))
     blocks = padded.reshape(len(columns), segments.count, BLOCKS, -1)
-    return jnp.einsum("isbt,jsbt->sbij", blocks, blocks)
+    products = jnp.einsum("isbt,jsbt->sbij", blocks, blocks)
+    straight = jnp.pad(bend * columns[-1], [(0, 0), (0, time)] + [(0, 0)] * (residual.ndim - 2))
+    squares = jnp.sum(jnp.square(straight.reshape(segments.count, BLOCKS, -1)), axis=-1)
+    return products.at[..., -1, -1].set(squares)
 
 
 @eqx.filter_jit
@@ -207,11 +222,13 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     """Gauss-Newton intervals of a fit, in the sandwich form that forgives correlated residuals.
 
     With J the derivatives of the residuals by the parameters, the starts following as fits best,
-    A = J^T W J / s^2 + 1 (the prior's precision is one in whitened coordinates) and the scores
+    A = J^T C J / s^2 + 1 (the prior's precision is one in whitened coordinates) and the scores
     g_b = J^T W r / s^2 over a tenth of a trial each, the covariance is
     A^-1 (sum g_b g_b^T + 1) A^-1 (Huber 1967; White 1982): residuals next to each other in time are
-    not counted as independent evidence. Never below the covariance A^-1 of independent noise. The
-    Gauss-Newton step that a descent has left to go widens them as an error of its size.
+    not counted as independent evidence. W r is the loss's slope and C its curvature: beyond the
+    knee far less than W, by which intervals of noise of twice the knee were half as wide as they
+    should be. Never below the covariance A^-1 of independent noise. The step that a descent has
+    left to go widens them as an error of its size.
 
     Raises `PalpateError` for a trial that cannot be predicted to its end.
     """
@@ -230,7 +247,7 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     nowhere = np.zeros((segments.count, offset[0].size))
     own = _eliminated(alone, 0, _noise(alone, freedom), nowhere).start
     offset = jnp.asarray(own.reshape(offset.shape), offset.dtype)
-    products = objective.products(free, offset, segments).astype(np.float64)
+    products = objective.products(free, offset, segments, curved=True).astype(np.float64)
     total = products.sum(axis=1)
     noise = _noise(total[:, flat.size :, flat.size :], freedom)
     reduced = _eliminated(total, flat.size, noise, own)

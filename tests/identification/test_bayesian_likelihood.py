@@ -12,7 +12,11 @@ from bayesian_toys import NOISE, Sled, pushes
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import residuals
 from palpate.identification.data.segments import VAGUE, Segments, cut, known_start, noise_scale
-from palpate.identification.posterior.discrepancy import MEMORY, discrepancy_covariance
+from palpate.identification.posterior.discrepancy import (
+    MEMORY,
+    discrepancy_covariance,
+    eigenvectors,
+)
 from palpate.identification.posterior.likelihood import (
     from_start,
     inferred_scales,
@@ -161,6 +165,18 @@ def test_the_discrepancy_is_twice_integrated_from_an_acceleration_that_is_forgot
     at = [49, 249, 499, 999]
     expected = discrepancy_covariance(step * (np.array(at) + 1.0))
     np.testing.assert_allclose(np.cov(path[:, at], rowvar=False), expected, rtol=0.1)
+
+
+@pytest.mark.usefixtures("float64")
+def test_the_discrepancy_of_a_force_comes_and_goes_and_that_of_a_place_grows():
+    """A likelihood that takes a sensor's lasting noise for white counts it many times."""
+    seen = np.ones((2, 15, 3), bool)
+    vectors, values, _ = eigenvectors(seen, 0.02, ("m", "N", "N"))
+    kernel = np.einsum("wcts,wcs,wcus->wctu", vectors, values, vectors)
+    time = 0.02 * np.arange(1, 16)
+    forgotten = np.exp(-np.abs(time[:, None] - time) / MEMORY)
+    np.testing.assert_allclose(kernel[:, 1:], np.broadcast_to(forgotten, (2, 2, 15, 15)), atol=1e-9)
+    np.testing.assert_allclose(kernel[0, 0], discrepancy_covariance(time), atol=1e-12)
 
 
 def test_angles_are_wrapped():

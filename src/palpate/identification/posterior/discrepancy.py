@@ -1,10 +1,12 @@
 """What a model does not explain: as from a random acceleration that is soon forgotten.
 
 Twice integrated (Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001, with the kernel of Singer's
-filter for targets that manoeuvre, IEEE Trans. Aerosp. Electron. Syst. 6, 1970).
+filter for targets that manoeuvre, IEEE Trans. Aerosp. Electron. Syst. 6, 1970). Of a force, which
+no motion adds up to, it is soon forgotten itself: Ornstein-Uhlenbeck, as the noise of its sensor.
 """
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,30 +29,51 @@ def discrepancy_covariance(time: Float[np.ndarray, " time"]) -> Float[np.ndarray
     return white - begun + 0.5 * m**2 * np.exp((s - t) / m) * (m - (s + m) * fading)
 
 
+def force_covariance(time: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time time"]:
+    """Covariance of a force's discrepancy of unit deviation at times (s)."""
+    return np.exp(-np.abs(time[:, None] - time) / MEMORY)
+
+
+COVARIANCES = discrepancy_covariance, force_covariance  # by whether it is of a force
+FORCES = "N", "N m"  # units of what a sensor shows of itself, and no motion adds up to
+
+
+def of_force(units: Sequence[str]) -> Bool[np.ndarray, " last"]:
+    """Which entries of the last axis of an observation, in these units, are forces."""
+    return np.isin(units, FORCES)
+
+
 def eigenvectors(
-    seen: Bool[np.ndarray, "segments time ..."], period: float
+    seen: Bool[np.ndarray, "segments time ..."],
+    period: float,
+    units: Sequence[str],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the unit discrepancy over the frames seen: vectors, values, and one where there is data.
 
-    (segments, channels, time, time) and (segments, channels, time), in float64. Frames not seen
+    (segments, channels, time, time) and (segments, channels, time), in float64; of unit s^3, or of
+    one where an entry of the last axis of what is seen has the unit of a force. Frames not seen
     have zero columns.
     """
     count, horizon = seen.shape[:2]
     masks = np.moveaxis(seen.reshape(count, horizon, -1), 1, 2)
     time = period * np.arange(1, horizon + 1)
-    kernel = discrepancy_covariance(time)
+    kernels = [covariance(time) for covariance in COVARIANCES]
+    force = np.broadcast_to(of_force(units), seen.shape[2:]).ravel()
 
     @functools.cache
-    def decomposed(mask: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def decomposed(mask: bytes, force: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         where = np.flatnonzero(np.frombuffer(mask, bool))
         vectors, values = np.zeros((horizon, horizon)), np.zeros(horizon)
         counted = np.zeros(horizon)
         if where.size:
-            found, basis = np.linalg.eigh(kernel[np.ix_(where, where)])
+            found, basis = np.linalg.eigh(kernels[force][np.ix_(where, where)])
             vectors[where, : where.size] = basis
             values[: where.size] = np.maximum(found, 0.0)
             counted[: where.size] = 1.0
         return vectors, values, counted
 
-    parts = [[decomposed(mask.tobytes()) for mask in masks[w]] for w in range(count)]
+    parts = [
+        [decomposed(mask.tobytes(), bool(kind)) for mask, kind in zip(masks[w], force, strict=True)]
+        for w in range(count)
+    ]
     return tuple(np.array([[part[i] for part in row] for row in parts]) for i in range(3))  # type: ignore[return-value]

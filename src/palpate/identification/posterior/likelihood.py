@@ -4,7 +4,8 @@ An observed channel c (the x of one body, say) is what the model predicts from t
 piece, plus
 
 - white sensor noise of standard deviation s;
-- a discrepancy that the model does not explain, of strength w (`discrepancy`). Without it residuals
+- a discrepancy that the model does not explain, of strength w (`discrepancy`), which grows with
+  time, or, of a force, comes and goes. Without it residuals
   that follow one another in time would count as independent evidence, and intervals be too narrow.
   An s and a w for each unit of each body;
 - what errors of the initial pose and rate become: linear in them, with the derivatives of a model
@@ -30,7 +31,7 @@ from jaxtyping import Array, Float
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import predict, residuals
 from palpate.identification.data.segments import Segments
-from palpate.identification.posterior.discrepancy import eigenvectors
+from palpate.identification.posterior.discrepancy import FORCES, eigenvectors, of_force
 from palpate.identification.samplers.target import Target
 from palpate.models.model import Model
 from palpate.numerics.devices import compiled_at_once
@@ -46,8 +47,8 @@ GROWTH_RATIO, GROWTH_SPREAD = 3.0, 1.5  # median of w over that of s (after 1 s)
 class Scales(eqx.Module):
     """Prior medians of the noise and the discrepancy, or their values where they are known.
 
-    Both by leading entry of an observation (a body) and unit, in the unit and in unit / s^1.5:
-    `of_channel` indexes them.
+    Both by leading entry of an observation (a body) and unit, in the unit and in unit / s^1.5, of a
+    force in the unit: `of_channel` indexes them.
     """
 
     noise: Float[Array, " groups"]
@@ -87,7 +88,8 @@ def _scales(model: Model, noise: np.ndarray, known: bool, one_object: bool = Fal
     of_last = [distinct.index(unit) for unit in units]
     of = [f" of {body}" if bodies > 1 else "" for body in range(bodies)]
     labels = [f"noise{body} ({unit or 1})" for body in of for unit in distinct]
-    labels += [f"discrepancy{body} ({unit or 1}/s^1.5)" for body in of for unit in distinct]
+    grown = {unit: "" if unit in FORCES else "/s^1.5" for unit in distinct}
+    labels += [f"discrepancy{body} ({unit or 1}{grown[unit]})" for body in of for unit in distinct]
     noises = jnp.asarray(np.tile(medians, bodies), jnp.zeros(()).dtype)
     return Scales(
         noise=noises,
@@ -111,7 +113,7 @@ class MotionPosterior(Target):
     rotation: Float[
         Array, "_ _ time time"
     ]  # eigenvectors of the discrepancy; one where all is seen
-    spectrum: Float[Array, "segments channels time"]  # its eigenvalues, s^3
+    spectrum: Float[Array, "segments channels time"]  # its eigenvalues, s^3; of a force one
     counted: Float[Array, "segments channels time"]  # one where there is data, else zero
     sensitivity: Float[Array, "segments starts channels time"] | None  # of rotated residuals
     # Sums over channels of products of sensitivities, where one variance is that of all channels.
@@ -153,7 +155,7 @@ class MotionPosterior(Target):
         return scale[np.array(self.scales.of_channel)]
 
     def growth(self, position: Float[Array, " free"]) -> Float[Array, " channels"]:
-        """Scale w of the discrepancy of each channel, in its unit / s^1.5."""
+        """Scale w of the discrepancy of each channel, in its unit / s^1.5, or of a force in its."""
         scale = self.scales.growth
         if not self.scales.known:
             scale = scale * jnp.exp(GROWTH_SPREAD * position[self.dimension - scale.size :])
@@ -259,12 +261,15 @@ class MotionPosterior(Target):
     def with_one_rotation(self) -> "MotionPosterior":
         """The same where something is not seen; else with the eigenvectors that all pieces share.
 
-        One product of matrices then, a sixth of a density's time less. Not for a target whose
-        pieces are exchanged: another shape would be compiled anew.
+        And all channels, where none or all are forces: one product of matrices then, a sixth of a
+        density's time less. Not for a target whose pieces are exchanged: another shape would be
+        compiled anew.
         """
         if not np.all(self.counted):
             return self
-        return eqx.tree_at(lambda t: t.rotation, self, self.rotation[:1, :1])
+        force = of_force(self.coordinates.reference.observation_units)
+        channels = 1 if np.all(force) or not np.any(force) else None
+        return eqx.tree_at(lambda t: t.rotation, self, self.rotation[:1, :channels])
 
     def _rotated(self, positions: Array) -> tuple[Array, Array]:
         """Residuals (batch, segments, channels, time) along the eigenvectors, and variances."""
@@ -291,6 +296,8 @@ class MotionPosterior(Target):
         flat = residual.reshape(*residual.shape[:2], -1)
         if self.rotation.shape[:2] == (1, 1):
             return jnp.einsum("ts,wtc->wcs", self.rotation[0, 0], flat)
+        if len(self.rotation) == 1:
+            return jnp.einsum("cts,wtc->wcs", self.rotation[0], flat)
         return jnp.einsum("wcts,wtc->wcs", self.rotation, flat)
 
     def _by_segment(self, residual: Array, variance: Array) -> Array:
@@ -335,7 +342,8 @@ def motion_posterior(
             f"{type(model).__name__} observes {expected[0]} and takes actions {expected[1]}, "
             f"but the pieces have {found[0]} and {found[1]}"
         )
-    rotation, spectrum, counted = eigenvectors(np.asarray(segments.seen), model.control_period)
+    seen, period = np.asarray(segments.seen), model.control_period
+    rotation, spectrum, counted = eigenvectors(seen, period, model.observation_units)
     dtype = jnp.zeros(()).dtype
     deviations = np.asarray(segments.pose_deviation), np.asarray(segments.rate_deviation)
     uncertain = any(np.any(deviation > 0) for deviation in deviations)

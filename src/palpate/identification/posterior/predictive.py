@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import or_nan
 from palpate.identification.data.segments import Segments, difference
-from palpate.identification.posterior.discrepancy import discrepancy_covariance
+from palpate.identification.posterior.discrepancy import COVARIANCES, of_force
 from palpate.identification.posterior.likelihood import MotionPosterior, from_start
 
 LANES = 2048  # pieces times draws that are simulated at a time
@@ -79,8 +79,10 @@ def predict(
     """
     time = target.coordinates.reference.control_period * np.arange(1, segments.horizon + 1)
     # A little of the identity: in the first frames nothing has grown yet.
-    covariance = discrepancy_covariance(time) + 1e-9 * time[-1] ** 3 * np.eye(len(time))
-    root = jnp.asarray(np.linalg.cholesky(covariance), jnp.zeros(()).dtype)
+    little = 1e-9 * time[-1] ** 3 * np.eye(len(time))
+    roots = [np.linalg.cholesky(covariance(time) + little) for covariance in COVARIANCES]
+    units = target.coordinates.reference.observation_units
+    root = jnp.asarray(np.stack(roots)[of_force(units).astype(int)], jnp.zeros(()).dtype)
     chunk = max(1, LANES // segments.count)
     keys = jax.random.split(jax.random.key(seed), len(position))
     parts = []
@@ -196,9 +198,11 @@ def _predict(
         motion = from_start(target.model(position), begun)
         noise = target.noise(position).reshape(channels)
         growth = target.growth(position).reshape(channels)
-        grown = jnp.einsum("ts,ws...->wt...", root, jax.random.normal(growing, shape, root.dtype))
+        kicks = jax.random.normal(growing, shape, root.dtype)
+        grown = jnp.einsum("kts,ws...k->wt...k", root, kicks)
         added = growth * grown + noise * jax.random.normal(white, shape, root.dtype)
-        size = jnp.sum(jnp.square(root), axis=1).reshape(-1, *(1,) * len(channels))
+        size = jnp.sum(jnp.square(root), axis=2).T
+        size = size.reshape(len(size), *(1,) * (len(channels) - 1), channels[-1])
         deviation = jnp.sqrt(jnp.square(noise) + jnp.square(growth) * size)
         return motion, motion + added, jnp.broadcast_to(deviation, shape)
 

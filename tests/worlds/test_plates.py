@@ -37,9 +37,12 @@ def test_a_pressed_plate_pushes_with_its_spring_and_with_the_impedance(monkeypat
 def test_what_slides_along_a_plate_feels_its_friction():
     world = PlatesWorld()
     _, truth = pressed(world, (DISTANCE + 0.04, 0.0), 1000)
+    forces = []
     for number in range(400):
         world.step(np.array([DISTANCE + 0.04, 1.5e-4 * number, 500.0, 500.0]))
-    angle, force = truth.plates.angle[0], world.truth().force
+        forces.append(world.truth().force)
+    # A mean: the light plate chatters, and for single steps of the simulation is not touched.
+    angle, force = truth.plates.angle[0], np.mean(forces[-100:], axis=0)
     normal = np.array([np.cos(angle), np.sin(angle)])
     along = np.array([np.sin(angle), -np.cos(angle)])
     assert world.truth().velocity[1] > 0.05

@@ -90,7 +90,7 @@ def test_friction_holds_what_pushes_less_than_it_and_lets_go_of_what_pushes_more
 
 
 def test_dry_friction_of_the_arm_slows_a_free_tip_straight_to_a_stop():
-    tip = walled([LEFT], mass=2.0, arm_friction=0.6, position=-9.0)
+    tip = walled([LEFT], mass=2.0, arm_friction=0.6, arm_creep=1e-5, position=-9.0)
     states = run(tip, moving([0.0, 0.0], [0.3, 0.4]), held([0.0, 0.0], [0.0, 0.0], 400))
     slowed_down = np.maximum(0.5 - 0.3 * tip.control_period * np.arange(1, 401), 0.0)
     expected = np.outer(slowed_down, [0.6, 0.8])

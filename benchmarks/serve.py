@@ -102,7 +102,8 @@ def benchmark(seconds: float, trials: int) -> Result:
     began = time.monotonic()
     file = importlib.resources.files("palpate") / "assets" / "rope-stabilization.safetensors"
     policy, manifest = load_policy(str(file))
-    deployment, limits = deployment_of(policy, manifest), limits_of(policy, (), ())
+    deployment = deployment_of(policy, manifest)
+    limits = limits_of(deployment, (), ())
     ((_, _, change),) = limits.vectors
     markers, period = deployment.sensors[-1].shape[0], policy.period
 

@@ -53,7 +53,7 @@ TRUTH_FILES = {
     "trials/furniture/namo_episode.py",  # the planner that is told
     *("experiments/rope/bound.py", "experiments/rope/swing.py"),
     "experiments/furniture/one_shot.py",
-    "families/rope/robot.py",
+    *("families/rope/robot.py", "families/contact/robot.py"),
     "families/contact/path_picture.py",  # which draws what happened
     "families/contact/probes.py",  # which asks what happened next
 }

@@ -7,13 +7,14 @@ import subprocess
 import sys
 import time
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from deployed import PERIOD, impedance_policy, manifest, rope_policy
+from deployed import PERIOD, actor_file, impedance_policy, manifest, rope_policy
 from palpate.cli import main
 from palpate.commands.serve import free_endpoint, limits_of, stopped_by, supervisor_of
-from palpate.deployment.deployment import deployment_of
+from palpate.deployment.deployment import deployment_of, load_network
 from palpate.deployment.loop import Record
 from palpate.deployment.messages import StateMessage, encode_state
 from palpate.deployment.supervisor import GOOD, Mode
@@ -91,7 +92,7 @@ def test_a_policy_of_no_family_is_served_by_its_declared_channels(tmp_path):
     save_controller("policy.safetensors", impedance_policy(period=PERIOD), {"task": "a toy"})
     policy, manifest = load_policy("policy.safetensors")
     deployment = deployment_of(policy, manifest)
-    limits = limits_of(policy, ["displacement=0.02"], ["damping ratio=3"])
+    limits = limits_of(deployment, ["displacement=0.02"], ["damping ratio=3"])
     supervisor = supervisor_of(deployment, limits)
     assert [channel.name for channel in deployment.sensors] == ["features"]
     random, actions = np.random.default_rng(0), []
@@ -114,6 +115,38 @@ def test_a_policy_of_no_family_is_served_by_its_declared_channels(tmp_path):
     wrong = encode_state(StateMessage(1, 1, 0.0, {"features": np.zeros(6, np.float32)}))
     order = supervisor_of(deployment, limits).tick(0.0, [(0.0, wrong)])
     assert order.reason == "6 features where 7 were agreed"
+
+
+def test_an_actor_is_served_in_the_robots_units_and_rests_without_eyes(capsys):
+    policy = actor_file()
+    deployment = deployment_of(*load_network("actor.safetensors"))
+    supervisor = supervisor_of(deployment, limits_of(deployment, ["stiffness=600"], []))
+    random, actions = np.random.default_rng(0), []
+    for step in range(30):
+        features = random.normal(size=9).astype(np.float32)
+        wrench, position = 20.0 * features[:6] * [1, 1, 1, 0.05, 0.05, 0.05], 0.01 * features[6:]
+        values = {"wrench": wrench, "position": position}
+        order = supervisor.tick(0.1 * step, [(0.1 * step, _state(step, values))])
+        actions.append(order.action)
+        if order.mode is Mode.WAITING:
+            np.testing.assert_array_equal(order.action, [0, 0, 50, 50])
+    assert order.mode is Mode.RUNNING
+    seen = np.concatenate([features[:6], position / np.float32(0.3)])
+    wanted = deployment.scaling.command(np.asarray(policy(None, jnp.asarray(seen))[1]))
+    np.testing.assert_allclose(order.action[:2], wanted[:2], atol=1e-6)
+    np.testing.assert_allclose(order.action[2:], np.minimum(wanted[2:], 650.0), rtol=1e-4)
+    assert np.linalg.norm(np.array(actions)[:, :2], axis=1).max() <= 0.02 * (1 + 1e-6)
+    values["wrench"] = np.full(6, np.nan)
+    order = supervisor.tick(3.0, [(3.0, _state(30, values))])
+    assert (order.mode, order.reason) == (Mode.STOPPED, "the wrench has no value")
+    np.testing.assert_array_equal(order.action, [0, 0, 50, 50])
+    actor_file("bresa")
+    assert main(["serve", "actor.safetensors"]) == 2
+    assert "trained under a reflex, which is not served yet" in capsys.readouterr().err
+
+
+def _state(step, values):
+    return encode_state(StateMessage(1, step + 1, 0.1 * step, values))
 
 
 def own_policy():

@@ -96,7 +96,7 @@ def test_it_wakes_shortly_after_a_state_has_come(clock, phase):
     assert record.turnaround.count == record.decisions.count > 200
     assert record.turnaround.quantile(0.9) == pytest.approx(LEAD, abs=1.5e-4)
     wakes = np.diff([time for time, _ in robot.commands])
-    assert np.abs(wakes[1:] - PERIOD).max() < FOLLOW + 1e-4
+    assert np.abs(wakes[1:] - PERIOD).max() < FOLLOW * PERIOD + 1e-4
 
 
 def test_a_late_wake_up_is_counted_and_not_made_up_for(clock):

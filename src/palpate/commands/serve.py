@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.commands import folders
 from palpate.commands.options import Serve
-from palpate.deployment.deployment import Deployment, deployment_of
+from palpate.deployment.deployment import Deployment, deployment_of, load_network
 from palpate.deployment.intake import MISSING, Intake
 from palpate.deployment.loop import Record, run_loop
 from palpate.deployment.scheduling import real_time
@@ -21,7 +21,6 @@ from palpate.deployment.supervisor import ASKED, NOTHING, Limits, Mode, Supervis
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.errors import PalpateError, StoppedError
 from palpate.family import check_name
-from palpate.networks import CommandPolicy, load_policy
 from palpate.runs import Figure
 from palpate.runs.figure_names import lines_of
 from palpate.runs.progress import Stop, interruptible
@@ -43,9 +42,9 @@ def run(options: Serve) -> Path:
     written down, where a fault kept the policy from going on.
     """
     file = folders.product_of(options.policy, folders.POLICY, "train")
-    policy, manifest = load_policy(file)
+    policy, manifest = load_network(file)
     deployment = deployment_of(policy, manifest, numbers(options.rows, "--rows", [], int))
-    limits = limits_of(policy, options.limit, options.rate_limit)
+    limits = limits_of(deployment, options.limit, options.rate_limit)
     supervisor = supervisor_of(deployment, limits)
     listen, words = options.listen, None
     if options.simulate:
@@ -66,7 +65,7 @@ def run(options: Serve) -> Path:
             if not prompt:
                 print(f"note: {ORDINARY}")
             print(f"listening at {listen}; Ctrl-C brakes and ends", flush=True)
-            record, asked = _served(supervisor, link, policy.period, options.seconds, robot)
+            record, asked = _served(supervisor, link, limits.period, options.seconds, robot)
             printed, status = ([], 0) if robot is None else _ended(robot)
         write_json(run.path / LATENCY, record.to_dict())
         figures = figures_of(record) + (deployment.outcome(printed[-1]) if printed else [])
@@ -93,13 +92,13 @@ def stopped_by(record: Record) -> str:
     return "" if mode is Mode.RUNNING or reason.startswith((NOTHING, MISSING)) else reason
 
 
-def limits_of(policy: CommandPolicy, limit: Sequence[str], rate_limit: Sequence[str]) -> Limits:
+def limits_of(deployment: Deployment, limit: Sequence[str], rate_limit: Sequence[str]) -> Limits:
     """The policy's limits, or lower ones, as "NUMBER" or "CHANNEL=NUMBER".
 
     Raises `PalpateError` for higher ones, for a rate without any, and for other channels.
     """
-    names = [channel.name for channel in policy.actions]
-    actions = {channel.name: channel for channel in policy.actions}
+    names = [channel.name for channel in deployment.actions]
+    actions = {channel.name: channel for channel in deployment.actions}
     for field, given in (("limit", limit), ("rate_limit", rate_limit)):
         option = f"--{field.replace('_', '-')}"
         for name, value in numbers(given, option, names).items():
@@ -111,7 +110,7 @@ def limits_of(policy: CommandPolicy, limit: Sequence[str], rate_limit: Sequence[
                     "give that, or less"
                 )
             actions[name] = dataclasses.replace(channel, **{field: value})
-    return Limits(tuple(actions.values()), policy.period)
+    return Limits(tuple(actions.values()), deployment.period, deployment.scaling.rest)
 
 
 def numbers(
@@ -142,7 +141,7 @@ def supervisor_of(deployment: Deployment, limits: Limits) -> Supervisor:
     nothing = {channel.name: np.zeros(channel.shape, np.float32) for channel in sensors}
     for _ in range(WARM_UP):
         decision.see(nothing)
-        decision.decide(np.zeros(limits.count, np.float32))
+        decision.decide(limits.rest)
     decision.forget()
     intake = Intake(deployment.check(), sensors, limits.period)
     return Supervisor(intake, decision, limits)

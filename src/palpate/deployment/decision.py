@@ -61,8 +61,6 @@ class NetworkDecision:
 class ChannelDecision:
     """A policy that is shown exactly what it observes, channel by channel."""
 
-    held = 0
-
     def __init__(self, policy: CommandPolicy):
         self._network = NetworkDecision(policy)
         self._features = np.zeros(count_of(policy.observations), np.float32)
@@ -84,8 +82,6 @@ class ActorDecision:
 
     What is not finite becomes a command that is not, at which a supervisor brakes.
     """
-
-    held = 0
 
     def __init__(self, policy: ActorPolicy, scaling: Scaling):
         self._actor = ActorInNumpy(policy.actor, count_of(policy.actions))

@@ -72,6 +72,11 @@ class Deployment(Generic[Policy]):
 
     def decision(self) -> Decision:
         """The policy, fed by `sensors`."""
+        if self.pace is not None:
+            raise PalpateError(
+                "the policy was trained under a reflex, which is not served yet: export it, and "
+                "ask both graphs in a loop of your own"
+            )
         if isinstance(self.policy, ActorPolicy):
             return ActorDecision(self.policy, self.scaling)
         return ChannelDecision(self.policy)

@@ -14,7 +14,7 @@ from palpate.deployment.supervisor import Mode, Supervisor
 SPIN = 5e-4  # s before a deadline from which on the clock is watched instead of sleeping
 LATE = 1e-3  # s after a deadline from which on it counts as missed
 LEAD = 2e-3  # s after a state by which the loop wakes: time for it to arrive
-FOLLOW = 2e-4  # s by which a deadline may move to keep that lead
+FOLLOW = 0.02  # of a period, by which a deadline may move to keep that lead
 EVENTS = 1000  # changes of mode that are kept
 
 
@@ -73,7 +73,7 @@ def run_loop(
     """One order every `period` s while `goes_on(seconds since the start)`; then a brake to rest.
 
     Deadlines lie `LEAD` after the arrival of a state, as far as following the sender's clock by
-    `FOLLOW` in a period allows, or when a state becomes missing, if that is sooner. One that has
+    `FOLLOW` of a period allows, or when a state becomes missing, if that is sooner. One that has
     passed is skipped, not made up for. A first call may be slow: warm up what decides before.
     Garbage is collected before and after, not in between. `report` hears of every change of mode.
     """
@@ -108,13 +108,14 @@ def run_loop(
                 if order.mode is Mode.RUNNING:
                     record.decisions.add(decided - now)
                     record.turnaround.add(clock() - newest)
-                deadline += min(max(newest + LEAD - now, -FOLLOW), FOLLOW)
+                most = FOLLOW * period
+                deadline += min(max(newest + LEAD - now, -most), most)
             if (order.mode, order.reason) != (mode, reason):
                 mode, reason = order.mode, order.reason
                 report(mode, reason)
                 if len(record.events) < EVENTS:
                     record.events.append((now - began, mode, reason))
-            if not going and not order.action.any():
+            if not going and order.mode is Mode.STOPPED:
                 return record
             behind = int((clock() - deadline) / period)
             if behind > 0:

@@ -8,7 +8,8 @@ tried in a test.
     braking   down to rest, every channel at the limit of its rate, whatever is seen meanwhile
     stopped   at rest; the last state was bad, or none comes. A good one: waiting
 
-At rest every number of the action is zero. A brake is never left before rest, and there is no way
+At rest every number of the action is that of the channels' rest, zero unless said otherwise, and
+all limits count from there. A brake is never left before rest, and there is no way
 from rest to motion but through `GOOD` states in a row during which the robot stood still; then
 the rate of the action grows softly to its limit.
 """
@@ -46,15 +47,18 @@ class Mode(IntEnum):
 class Limits:
     """What an action may be: as its channels declare, one every `period` s.
 
-    `vectors`: of each vector of a channel its place in the flat action, the largest norm, and the
-    largest norm of its change in a period.
+    `vectors`: of each vector of a channel its place in the flat action, its largest distance from
+    `rest` (an action; None: zeros), and the largest norm of its change in a period.
 
     Raises `PalpateError` for a channel without limits and for one that is not greater than 0.
     """
 
-    def __init__(self, actions: Sequence[Channel], period: float):
+    def __init__(self, actions: Sequence[Channel], period: float, rest: np.ndarray | None = None):
         _check_greater("period", period)
         self.period, self.count = period, count_of(actions)
+        self.rest = np.zeros(self.count, np.float32)
+        if rest is not None:
+            self.rest += rest
         self.vectors: list[tuple[slice, float, float]] = []
         first = 0
         for channel in actions:
@@ -121,7 +125,7 @@ class Supervisor:
         self._ran = 0  # decisions since the start
         self._first: StateMessage | None = None  # when counting began
         self.mode = Mode.WAITING
-        self.action = np.zeros(limits.count, np.float32)
+        self.action = limits.rest
         self.reason = NOTHING
         self._needed, self._soft = (
             max(FEWEST, round(count * AT / limits.period)) for count in (GOOD, SOFT)
@@ -209,18 +213,19 @@ class Supervisor:
         share = min(1.0, self._ran / self._soft)
         action = np.empty_like(self.action)
         for part, limit, change in self._limits.vectors:
-            own = self.action[part]
+            own, rest = self.action[part], self._limits.rest[part]
             moved = own + shortened(wanted[part] - own, change * share)
-            action[part] = shortened(moved, limit)
+            action[part] = rest + shortened(moved - rest, limit)
         self.action = action
 
     def _brake(self, periods: float) -> None:
         """Every vector along its own direction, so that no power is put in."""
         action = np.empty_like(self.action)
         for part, _, change in self._limits.vectors:
-            action[part] = slowed(self.action[part], change * periods)
+            rest = self._limits.rest[part]
+            action[part] = rest + slowed(self.action[part] - rest, change * periods)
         self.action = action
-        if not action.any():
+        if (action == self._limits.rest).all():
             self.mode = Mode.STOPPED
             self._good = 0
 

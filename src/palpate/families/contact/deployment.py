@@ -4,14 +4,19 @@ The robot has a Cartesian impedance of its own. From the position that it was at
 displacement, as stiff as it is told along that way and across it.
 """
 
+import json
+
 import numpy as np
 
 from palpate.deployment.deployment import Deployment, Pace
 from palpate.deployment.scaling import Scaling
 from palpate.errors import PalpateError
+from palpate.families.contact import robot
 from palpate.families.contact.environments import REFLEX_PACE, SELF_TUNING
+from palpate.families.contact.episodes import GOAL
 from palpate.families.contact.methods import MAZE, NAVIGATION, Method, Skill
 from palpate.networks import ActorPolicy, Channel
+from palpate.runs import Figure
 from palpate.tasks.maze.navigation import FEATURE_SCALE
 from palpate.worlds.maze.navigation import PERIODS
 from palpate.worlds.maze.scene import TIME_STEP
@@ -83,6 +88,23 @@ class MazeDeployment(_SkillDeployment):
             high=np.array([displacement, displacement, chosen[1], chosen[1]]),
             rest=np.array([0.0, 0.0, low, low]),
         )
+
+    def simulated_robot(self, endpoint: str, seconds: float, seed: int) -> list[str]:
+        """See `Deployment.simulated_robot`: `palpate.families.contact.robot`, where it learnt."""
+        mazes = self.manifest["options"]["mazes"]
+        return [
+            *(robot.__name__, "--connect", endpoint, "--seconds", f"{seconds}"),
+            *("--seed", f"{seed}", "--period", f"{self.period}", "--mazes", *mazes),
+        ]
+
+    def outcome(self, printed: str) -> list[Figure]:
+        """How far the tip came, and how hard it pushed; see `Deployment.outcome`."""
+        found = json.loads(printed)
+        return [
+            Figure("reached_goal", float(found["end"] == GOAL), ""),
+            Figure("progress", found["progress"], ""),
+            Figure("greatest_force_n", found["force"], "N"),
+        ]
 
 
 class NavigationDeployment(_SkillDeployment):

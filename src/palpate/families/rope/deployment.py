@@ -38,8 +38,6 @@ class RopeDecision:
         PalpateError: the policy observes something else, or more nodes than there are markers.
     """
 
-    held = 0
-
     def __init__(self, policy: CommandPolicy, markers: int, network: Network | None = None):
         nodes = nodes_of(policy)
         at_nodes(np.zeros((markers, 3)), nodes)  # which says now if there are too few

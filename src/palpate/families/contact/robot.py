@@ -1,0 +1,118 @@
+"""A simulated tip in a maze in a process of its own, in real time, behind a link.
+
+`palpate serve POLICY --simulate` starts it; it stands for the program of an impedance-controlled
+robot: publish what was felt every period, go where the newest command says, and brake when none
+comes.
+"""
+
+import argparse
+import json
+import secrets
+import signal
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from palpate.deployment.loop import Link
+from palpate.deployment.messages import StateMessage, decode_command, encode_state
+from palpate.deployment.scheduling import ROBOT, real_time
+from palpate.deployment.supervisor import PAUSE
+from palpate.deployment.transport import COMMAND, STATE, ZenohLink
+from palpate.families.contact.environments import maze_law
+from palpate.tasks.maze.maze import MazeTask
+from palpate.worlds.gymnasium import VIOLATION
+from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE, BlindMaze
+from palpate.worlds.world import side_by_side
+
+LISTENS = 0.005  # s, from one look for commands to the next
+
+
+class TipRobot:
+    """A tip whose impedance moves it from where it is when a command comes.
+
+    Args:
+        link: to the loop.
+        mazes: one of which it is in.
+        seed: of the world.
+        period: seconds between states, a whole number of `LISTENS`.
+    """
+
+    def __init__(self, link: Link, mazes: Sequence[str], seed: int, period: float):
+        self._link, self.period = link, period
+        self._world, self._law, self._task = BlindMaze(mazes), maze_law(), MazeTask()
+        self._seen = self._world.reset(seed)
+        self._first = self._world.truth()
+        self._session, self._sequence = secrets.randbits(64), 0
+        self._deadline = self._heard_at = link.clock()
+        self._begin(np.full(4, np.nan), fresh=True)
+        self.force, self.end = 0.0, ""
+
+    @property
+    def progress(self) -> float:
+        """The share of the way to the goal that is behind it."""
+        return self._task.progress(self._first, self._world.truth())
+
+    def advance(self) -> None:
+        """One period of real time; `end` then says whether, and how, the episode is over."""
+        self._publish()
+        for _ in range(round(self.period / LISTENS)):
+            time.sleep(max(0.0, self._deadline - self._link.clock()))
+            self._deadline += LISTENS
+            self._listen()
+            for _ in range(round(LISTENS / self._world.control_period)):
+                force = self._law.command(side_by_side([self._seen]))[0]
+                self._seen = self._world.step(force)
+                truth = self._world.truth()
+                self.force = max(self.force, self._task.force(truth))
+                if self._task.violates(truth):
+                    self.end = VIOLATION
+                    return
+        self.end = self._task.end(truth)
+
+    def _publish(self) -> None:
+        self._sequence += 1
+        values = {"wrench": self._seen.wrench, "position": self._seen.position}
+        message = StateMessage(self._session, self._sequence, self._link.clock(), values)
+        self._link.send(encode_state(message))
+
+    def _listen(self) -> None:
+        arrivals = self._link.arrivals()
+        if arrivals:
+            self._heard_at, data = arrivals[-1]
+            told = decode_command(data, 4).action
+            low, high = STIFFNESS_RANGE
+            stiffness = 2 * (told[2:] - low) / (high - low) - 1
+            self._begin(np.concatenate([told[:2] / DISPLACEMENT_LIMIT, stiffness]))
+        elif self._link.clock() - self._heard_at > PAUSE * self.period:
+            self._begin(np.full(4, np.nan))  # damping alone
+
+    def _begin(self, action: np.ndarray, fresh: bool = False) -> None:
+        self._law.begin(side_by_side([self._seen]), action[None], np.array([fresh]))
+
+
+def main() -> None:
+    """Run for some seconds, until the episode is over or SIGTERM; print what happened."""
+    parser = argparse.ArgumentParser(description="a simulated tip in a maze")
+    parser.add_argument("--connect", required=True, help="where the loop listens")
+    parser.add_argument("--mazes", nargs="+", required=True)
+    parser.add_argument("--period", type=float, required=True)
+    parser.add_argument("--seconds", type=float, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    asked: list[Any] = []
+    signal.signal(signal.SIGTERM, lambda *given: asked.append(given))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's, which says when to end
+    # Urgent, because it stands for a robot with a computer of its own.
+    with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
+        robot = TipRobot(link, options.mazes, options.seed, options.period)
+        ends = link.clock() + options.seconds
+        while link.clock() < ends and not asked and not robot.end:
+            robot.advance()
+    found = {"end": robot.end, "progress": robot.progress, "force": robot.force}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""The simulated tip behind a link: it goes where it is told, and brakes when nobody speaks."""
+
+import numpy as np
+
+from palpate.deployment.messages import CommandMessage, decode_state, encode_command
+from palpate.families.contact import robot
+from palpate.networks import Channel
+
+SENSORS = Channel("wrench", (6,)), Channel("position", (3,))
+
+
+class Loop:
+    """Says the same in every period, on a clock that moves with the robot's sleep."""
+
+    def __init__(self, monkeypatch):
+        self.now, self.states = 0.0, []
+        self.command: tuple[float, ...] | None = None
+        monkeypatch.setattr(robot.time, "sleep", self.sleep)
+
+    def clock(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+    def send(self, data):
+        self.states.append(decode_state(data, SENSORS))
+
+    def arrivals(self):
+        if self.command is None:
+            return []
+        command = CommandMessage(1, len(self.states), 1, 0, np.array(self.command))
+        return [(self.now, encode_command(command))]
+
+
+def test_it_goes_where_it_is_told_and_brakes_when_nobody_speaks(monkeypatch):
+    loop = Loop(monkeypatch)
+    tip = robot.TipRobot(loop, ["home"], seed=0, period=0.1)
+    loop.command = (0.01, 0.0, 400.0, 400.0)
+    for _ in range(3):
+        tip.advance()
+    first, last = loop.states[0], loop.states[-1]
+    assert last.values["position"][0] - first.values["position"][0] > 0.01
+    np.testing.assert_allclose(last.time - first.time, 0.2, atol=0.01)
+    assert tip.end == ""
+    loop.command = None
+    for _ in range(4):
+        tip.advance()
+    assert np.abs(tip._law.stiffness).max() == 0.0
+    assert abs(tip._seen.velocity[0]) < 0.01  # along y the base sways under it
+    assert tip.force >= 0.0
+    assert tip.progress < 1.0

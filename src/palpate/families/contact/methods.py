@@ -35,11 +35,13 @@ from palpate.worlds.maze import scene
 WRENCH = (0, 1, 2, 3, 4, 5)  # of the features: SRL-VIC's critic and recovery see no position
 DISCOUNT, TARGET_ENTROPY = 0.98, -1.0  # of the task's agent
 WIDTH = 128  # of the two hidden layers of every network
-RISK_DISCOUNT, RISK_THRESHOLD = 0.5, 0.03
-NAVIGATION_THRESHOLD = 0.3  # as Recovery RL's, which has this discount there too
+# A tenth a decision: one that is soft at once averts nearly every violation, and what later ones
+# risk would count against all actions alike. So a risk far below a percent can be told from more.
+RISK_DISCOUNT, RISK_THRESHOLD = 0.1, 0.003
+NAVIGATION_DISCOUNT, NAVIGATION_THRESHOLD = 0.8, 0.3  # Recovery RL's
 VIOLATION_PRICE = 50.0  # of the penalty, in rewards: more than the whole way to the goal is worth
 COST_LIMIT = 0.02  # Lagrangian: violations an episode
-PRETRAINING_STEPS, PRETRAINING_UPDATES = 20_000, 5_000
+PRETRAINING_STEPS, PRETRAINING_UPDATES = 60_000, 12_000
 TRAINING_HORIZON = 150  # decisions: whoever is stuck begins anew sooner, somewhere else
 HELD = (3, 15)  # decisions for which a scripted collision keeps its direction
 
@@ -69,9 +71,10 @@ def _agent() -> SoftActorCritic:
 def _guarded(
     seen: tuple[int, ...] | None = WRENCH,
     kind: type[RecoveryAgent] = RecoveryAgent,
+    discount: float = RISK_DISCOUNT,
     threshold: float = RISK_THRESHOLD,
 ) -> RecoveryAgent:
-    safety = SafetyCritic(discount=RISK_DISCOUNT, seen=seen, width=WIDTH)
+    safety = SafetyCritic(discount=discount, seen=seen, width=WIDTH)
     return kind(_agent(), safety, threshold)
 
 
@@ -92,7 +95,9 @@ METHODS: dict[str, Callable[[], Method]] = {
 }
 
 
-_beside = functools.partial(_guarded, seen=None, threshold=NAVIGATION_THRESHOLD)
+_beside = functools.partial(
+    _guarded, seen=None, discount=NAVIGATION_DISCOUNT, threshold=NAVIGATION_THRESHOLD
+)
 NAVIGATION_METHODS: dict[str, Callable[[], Method]] = {
     "srl-vic": lambda: Method(_beside()),
     "bresa": lambda: Method(_beside(kind=ReflexAgent)),

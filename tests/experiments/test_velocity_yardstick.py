@@ -2,7 +2,7 @@
 
 import pytest
 
-from palpate.experiments.contact import velocity_yardstick
+from palpate.experiments import velocity_yardstick
 from palpate.families.gymnasium.options import EvaluateGymnasium, TrainGymnasium
 from palpate.runs import Figure, Result
 from palpate.runs.storage import write_json

@@ -13,7 +13,6 @@ STEPS = 40
 
 def pushed(name: str, direction: tuple[float, ...]) -> tuple[list[dict], np.ndarray]:
     """What steps tell of a robot that is thrown, and its root's positions before and after each."""
-    pytest.importorskip("imageio", reason="Gymnasium's MuJoCo environments need it")
     velocity.register()
     environment = gymnasium.make(name)
     environment.reset(seed=1)

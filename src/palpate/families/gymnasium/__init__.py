@@ -11,5 +11,5 @@ FAMILY = Family(
         "train": {"gymnasium": f"{_OPTIONS}:TrainGymnasium"},
         "evaluate": {"gymnasium": f"{_OPTIONS}:EvaluateGymnasium"},
     },
-    experiments={"velocity-yardstick": "palpate.experiments.contact.velocity_yardstick:reproduce"},
+    experiments={"velocity-yardstick": "palpate.experiments.velocity_yardstick:reproduce"},
 )

@@ -18,6 +18,7 @@ from palpate.worlds.gymnasium import GymnasiumWorlds
 from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
 
 PICTURE, FILM = "path.png", "rendering.webp"
+LEAST_RISK = 1e-5  # that is drawn
 _INK, _WALL, _BLOCK, _WAY, _FORCE = "#1c2127", "#8a94a0", "#e8a33d", "#0062a8", "#c04d00"
 _GOAL = "#007a59"
 _STIFFEST = 0.022  # m: how long an ellipse's half axis is drawn at the greatest stiffness
@@ -41,6 +42,7 @@ class Episode:
     force: np.ndarray  # (decisions, 2) N, at the decision
     greatest: np.ndarray  # (decisions,) N, within it
     risk: np.ndarray | None  # (decisions,) of what the policy proposed
+    threshold: float = 1.0  # of the risk, above which the guard acts
 
 
 def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Episode:
@@ -68,10 +70,10 @@ def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Epi
         rows.append((*before, impedance.stiffness[0].copy(), felt, float(risk[0])))
     position, block, force, stiffness, greatest, risk = map(np.array, zip(*rows, strict=True))
     period = inside.every * world.control_period
-    risk = None if np.isnan(risk).all() else risk
-    return Episode(
-        layout, period, task.force_limit, end, position, block, stiffness, force, greatest, risk
-    )
+    seen = layout, period, task.force_limit, end, position, block, stiffness, force, greatest
+    if isinstance(policy, GuardedPolicy):
+        return Episode(*seen, risk, policy.threshold)
+    return Episode(*seen, None)
 
 
 def show_path(folder: Path, policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> None:
@@ -105,8 +107,14 @@ def path_picture(out: Path, episode: Episode) -> None:
             last.legend(frameon=False, loc="upper left")
             last.set(ylabel="stiffness (N/m)")
         else:
-            last.plot(time, episode.risk, color=_WAY, lw=1)
-            last.set(ylabel="risk of what is proposed", ylim=(0, 1))
+            # Of what matters most is less than a percent.
+            last.semilogy(time, np.maximum(episode.risk, LEAST_RISK), color=_WAY, lw=1)
+            last.axhline(episode.threshold, color=_INK, lw=1, ls=(0, (4, 3)))
+            last.annotate(
+                f"recovery above {episode.threshold:g}", (time[-1], episode.threshold), ha="right",
+                va="bottom", color=_INK,
+            )  # fmt: skip
+            last.set(ylabel="risk of what is proposed", ylim=(LEAST_RISK, 1))
         last.set(xlabel="time (s)")
         save_picture(out, canvas)
 

@@ -121,11 +121,12 @@ def our_updates() -> Callable[[], None]:
     buffer = jax.jit(ReplayBuffer.add)(
         ReplayBuffer.create(FEATURES, ACTIONS, FILLED), lived(FILLED)
     )
-    held = [state, buffer]
+    held = [state, (buffer, None)]
     new = lived(TOGETHER)
+    others = None, key, np.int32(TOGETHER), np.float32(0.0)
 
     def call() -> None:
-        held[:] = compiled.learn(*held, new, key, TOGETHER, np.float32(0.0))[:2]
+        held[:] = compiled.learn(*held, new, *others)[:2]
         jax.block_until_ready(held)
 
     return call

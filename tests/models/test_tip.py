@@ -24,8 +24,9 @@ FREE = {"damping_ratio": 0.0, "damping": 0.0, "friction": 0.0}
 
 
 def walled(directions, **values) -> Tip:
-    """Without dry friction of the arm, and walls without mass, unless some is given."""
-    return facing(directions, **{"arm_friction": 0.0, "wall_mass": 0.0} | values)
+    """Without friction of the arm, mass of a tool and of walls, unless some is given."""
+    nothing = {"arm_friction": 0.0, "tool_mass": 0.0, "wall_mass": 0.0}
+    return facing(directions, **nothing | values)
 
 
 def moving(position, velocity) -> TipState:
@@ -89,7 +90,7 @@ def test_friction_holds_what_pushes_less_than_it_and_lets_go_of_what_pushes_more
 
 
 def test_dry_friction_of_the_arm_slows_a_free_tip_straight_to_a_stop():
-    tip = walled([LEFT], mass=2.0, arm_friction=0.6, position=-9.0)
+    tip = walled([LEFT], mass=2.0, arm_friction=0.6, arm_creep=1e-5, position=-9.0)
     states = run(tip, moving([0.0, 0.0], [0.3, 0.4]), held([0.0, 0.0], [0.0, 0.0], 400))
     slowed_down = np.maximum(0.5 - 0.3 * tip.control_period * np.arange(1, 401), 0.0)
     expected = np.outer(slowed_down, [0.6, 0.8])
@@ -206,6 +207,21 @@ def test_derivatives_of_what_is_observed_are_those_of_finite_differences():
         step = jnp.zeros_like(flat).at[index].set(1e-6)
         up, down = evaluate(*unravel(flat + step)), evaluate(*unravel(flat - step))
         assert float(expected) == pytest.approx(float(up - down) / 2e-6, rel=2e-3, abs=1e-3), index
+
+
+def test_an_arm_creeps_at_less_than_its_dry_friction():
+    """Pulled by F: u = creep F / (friction - F), by its definition."""
+    tip = walled([LEFT], arm_friction=0.6, arm_creep=2e-3, position=-9.0)
+    tip = dataclasses.replace(tip, damping_ratio=jnp.asarray(0.0))
+    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([1e4, 0.0], [4e-5, 0.0], 200))
+    assert float(states.velocity[-1, 0]) == pytest.approx(2e-3 * 0.4 / 0.2, rel=1e-3)
+
+
+def test_the_sensor_at_the_wrist_feels_the_tool_resist():
+    """In free motion a constant pull shows the tool's share of it, against the acceleration."""
+    tip = walled([LEFT], mass=1.5, tool_mass=0.3, damping_ratio=0.0, position=-9.0)
+    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([1e4, 0.0], [3e-4, 0.0], 40))
+    np.testing.assert_allclose(states.force[-1], [-0.3 * 3.0 / 1.5, 0.0], rtol=1e-3, atol=1e-9)
 
 
 def test_the_sensor_shows_its_bias_and_a_start_knows_it():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.worlds.contact import plates as plates_module
 from palpate.worlds.contact.plates import DISTANCE, PlatesWorld
 from palpate.worlds.contact.touching import FORCE, POSITION, record_touches, touches
 
@@ -18,7 +19,8 @@ def pressed(world: PlatesWorld, setpoint, periods: int):
     return seen[-200:], world.truth()
 
 
-def test_a_pressed_plate_pushes_with_its_spring_and_with_the_impedance():
+def test_a_pressed_plate_pushes_with_its_spring_and_with_the_impedance(monkeypatch):
+    monkeypatch.setattr(plates_module, "WANDERING", 0.0)
     seen, truth = pressed(PlatesWorld(), (DISTANCE + 0.04, 0.0), 2000)
     plates = truth.plates
     normal = np.array([np.cos(plates.angle[0]), np.sin(plates.angle[0])])
@@ -35,14 +37,42 @@ def test_a_pressed_plate_pushes_with_its_spring_and_with_the_impedance():
 def test_what_slides_along_a_plate_feels_its_friction():
     world = PlatesWorld()
     _, truth = pressed(world, (DISTANCE + 0.04, 0.0), 1000)
+    forces = []
     for number in range(400):
         world.step(np.array([DISTANCE + 0.04, 1.5e-4 * number, 500.0, 500.0]))
-    angle, force = truth.plates.angle[0], world.truth().force
+        forces.append(world.truth().force)
+    # A mean: the light plate chatters, and for single steps of the simulation is not touched.
+    angle, force = truth.plates.angle[0], np.mean(forces[-100:], axis=0)
     normal = np.array([np.cos(angle), np.sin(angle)])
     along = np.array([np.sin(angle), -np.cos(angle)])
     assert world.truth().velocity[1] > 0.05
     ratio = -(along @ force) / (normal @ force)
     assert ratio == pytest.approx(truth.plates.friction[0], rel=0.02)
+
+
+def test_the_sensor_feels_the_tool_resist(monkeypatch):
+    """A free tip that is pulled shows the tool's share of its acceleration, against it."""
+    for noise in ("WANDERING", "FORCE_NOISE", "LOW_PASS"):
+        monkeypatch.setattr(plates_module, noise, 2e-4 if noise == "LOW_PASS" else 0.0)
+    world = PlatesWorld()
+    world.reset(SEED)
+    velocity = []
+    for _ in range(20):
+        seen = world.step(np.array([0.4, 0.0, 10.0, 0.0]))
+        velocity.append(world.truth().velocity[0])
+    plates = world.truth().plates
+    felt = -plates.tool_mass * (velocity[-1] - velocity[-2]) / world.control_period
+    assert felt < -0.2
+    assert seen.force[0] - plates.bias[0] == pytest.approx(felt, rel=1e-2)
+
+
+def test_the_noise_of_the_force_lasts():
+    world = PlatesWorld()
+    world.reset(SEED)
+    force = np.array([world.step(np.zeros(4)).force for _ in range(20_000)])
+    noise = force - world.truth().plates.bias
+    lasting = np.mean(noise[:-50] * noise[50:]) / plates_module.WANDERING**2
+    assert lasting == pytest.approx(np.exp(-0.05 / plates_module.CORRELATION), abs=0.15)
 
 
 def test_a_recording_touches_both_plates_and_is_the_same_again():

@@ -15,6 +15,7 @@ from palpate.worlds.contact.touching import NORMALS
 UNITS = {"position": "m", "force": "N", "setpoint": "m", "stiffness": "N/m"}
 COMMANDS = "setpoint", "stiffness"
 FEELS = 6.0  # deviations of the force's noise from which on a wall is felt
+PRESSES = 0.25  # of the great forces, from which on it is a wall and no tool that is accelerated
 FEWEST = 20  # frames of contact by which a wall can be placed
 WIDE = math.radians(50.0)  # from a wall's direction, within which a force is that wall's
 LARGEST = 5.0  # m: a tip that is farther from where it was is in another unit
@@ -139,10 +140,11 @@ def problems(aligned: Aligned) -> list[str]:
 
 
 def _threshold(forces: Float[np.ndarray, "frames 2"]) -> float:
-    """N: what no noise about a sensor's bias reaches, 0.5 at least."""
+    """N: what neither noise about a sensor's bias reaches nor a tool's inertia, 0.5 at least."""
     steps = np.diff(forces, axis=0)
     noise = float(np.median(np.abs(steps))) / 0.6745 / math.sqrt(2.0)
-    return max(0.5, FEELS * noise)
+    great = float(np.quantile(np.linalg.norm(forces, axis=1), 0.95))
+    return max(0.5, FEELS * noise, PRESSES * great)
 
 
 def _common(angles: np.ndarray) -> str:

@@ -32,11 +32,13 @@ class Surfaces(NamedTuple):
 class Impedance(NamedTuple):
     """What pulls the tip: mass in kg, set-point in m, stiffness in N/m, damping in N s/m.
 
-    `friction` is the dry friction of the arm itself, N.
+    `friction` is the dry friction of the arm itself, N, of half its size at the velocity `creep`,
+    m/s.
     """
 
     mass: Float[Array, "*batch 1"]
     friction: Float[Array, "*batch"]
+    creep: Float[Array, "*batch"]
     setpoint: Vector
     stiffness: Vector
     damping: Vector
@@ -52,7 +54,7 @@ def advance(
 ) -> tuple[Vector, Vector, Vector]:
     """Position, velocity, and the mean force of the walls on the tip in N, `time` seconds later.
 
-    `slip` (m/s) is the sliding velocity at which friction has half its size.
+    `slip` (m/s) is the sliding velocity at which a wall's friction has half its size.
     """
     normal, place, stiffness, damping, friction, plate = surfaces
     mass = impedance.mass
@@ -88,7 +90,8 @@ def advance(
     # then of one wall after the other, as in a corner each acts on the rest.
     sliding = 2.0 * mean - velocity
     speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=-1) + 1e-18)
-    mean, _ = _rubbed(mean, velocity, sliding / speed[..., None], impedance.friction, inverse, slip)
+    along = sliding / speed[..., None]
+    mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
     for wall in range(normal.shape[-2]):
         tangent = jnp.broadcast_to(_turned(normal[..., wall, :]), mean.shape)
         most = (friction * force)[..., wall]
@@ -98,7 +101,12 @@ def advance(
 
 
 def _rubbed(
-    mean: Array, velocity: Array, along: Array, most: Array, inverse: tuple[Array, ...], slip: float
+    mean: Array,
+    velocity: Array,
+    along: Array,
+    most: Array,
+    inverse: tuple[Array, ...],
+    slip: Array | float,
 ) -> tuple[Array, Array]:
     """The mean velocity with dry friction of at most `most` N `along` a direction, and its force.
 
@@ -112,7 +120,7 @@ def _rubbed(
 
 
 def slowed(
-    sliding: Float[Array, "*#batch"], most: Float[Array, "*#batch"], slip: float
+    sliding: Float[Array, "*#batch"], most: Float[Array, "*#batch"], slip: Array | float
 ) -> Float[Array, "*_"]:
     """The velocity u that dry friction leaves: u + `most` u / (|u| + `slip`) = `sliding`."""
     speed = jnp.abs(sliding)

@@ -22,7 +22,7 @@ Point = Float[Array, "*batch 2"]
 SUBSTEP = 2.5e-3  # s, of the integration, at most
 UNROLLED = 4  # so many of them in a control period are written out
 OF_WALLS = "position", "tilt", "stiffness", "damping", "friction", "wall_mass"
-SLIP = 1e-5  # m/s, the sliding velocity at which friction has half its size
+SLIP = 1e-5  # m/s, the sliding velocity at which a wall's friction has half its size
 
 
 def _data() -> Any:
@@ -42,7 +42,8 @@ class Tip(Model):
 
     The controller pulls the tip to a set-point x_d: m a = K (x_d - x) - D v + f, with the diagonal
     stiffness K that it commands and the damping D = 2 zeta sqrt(K m) by design (Albu-Schaeffer et
-    al., ICRA 2003, of one mass), and the arm rubs. An action is x_d and K for one control period.
+    al., ICRA 2003, of one mass), and the arm rubs: it creeps before it slides. An action is x_d and
+    K for one control period.
 
     Each wall is a plate on a spring: where the tip is pressed in by u, it pushes with
     f_n = max(0, k u + d u' + m_w u''), along its outward normal, and rubs with Coulomb's friction
@@ -52,8 +53,9 @@ class Tip(Model):
     How many walls there are, and the nominal `direction` (rad) of each outward normal, is data; a
     wall may be tilted about it. `position` is where the wall is along that direction, from the
     frame's origin, measured abreast of the point `centre`: so that a tilt does not move what is
-    near it. What is observed is the tip's position and the force on it as a sensor shows it: late,
-    by a low-pass of first order, and with a bias. Batch axes lead everywhere.
+    near it. What is observed is the tip's position and the force on it as a sensor at the wrist
+    shows it: less what the tool beyond the sensor takes to be accelerated, late, by a low-pass of
+    first order, and with a bias. Batch axes lead everywhere.
 
     Raises `PalpateError` for no wall, and where direction and parameters are of different numbers
     of walls.
@@ -68,11 +70,17 @@ class Tip(Model):
     arm_friction: Number = parameter(
         "N", prior=LogNormal(0.2, 1.0), spread=0.5, about="dry friction of the arm, at the tip"
     )
+    arm_creep: Number = parameter(
+        "m/s", prior=LogNormal(1e-3, 1.0), about="at which the arm's friction has half its size"
+    )
+    tool_mass: Number = parameter(
+        "kg", prior=LogNormal(0.1, 1.0), about="beyond the force sensor, which feels its inertia"
+    )
     position: Walls = parameter(
         "m", prior=Normal(None, 0.02), about="of each wall along its direction"
     )
     tilt: Walls = parameter(
-        "rad", prior=Normal(0.0, 0.05), about="of each wall's normal from its direction"
+        "rad", prior=Normal(0.0, 0.1), about="of each wall's normal from its direction"
     )
     stiffness: Walls = parameter("N/m", prior=LogNormal(1e3, 1.5), spread=0.3, about="of each wall")
     damping: Walls = parameter("N s/m", prior=LogNormal(10.0, 1.5), spread=0.5, about="of each")
@@ -147,18 +155,22 @@ class Tip(Model):
         count = max(1, math.ceil(self.control_period / SUBSTEP - 1e-9))
         time = self.control_period / count
         late = jnp.exp(-time / self.sensor_lag)[..., None]
+        tool = self.tool_mass[..., None] / time
 
         def step(state: TipState, action: Array) -> TipState:
             stiffness = action[..., 2:]
             # A floor below any stiffness that matters: the slope of a root is infinite at zero.
             root = jnp.sqrt(jnp.maximum(stiffness, 1e-6) * mass)
             damping = 2.0 * self.damping_ratio[..., None] * root
-            impedance = Impedance(mass, self.arm_friction, action[..., :2], stiffness, damping)
+            impedance = Impedance(
+                mass, self.arm_friction, self.arm_creep, action[..., :2], stiffness, damping
+            )
 
             def advanced(state: TipState, _: None) -> tuple[TipState, None]:
                 position, velocity, force = advance(
                     surfaces, impedance, state.position, state.velocity, time, self.slip
                 )
+                force -= tool * (velocity - state.velocity)
                 sensed = force + late * (state.force - force)
                 return TipState(position, velocity, sensed), None
 

@@ -1,8 +1,10 @@
 """Two plates on springs and a tip under impedance control, in MuJoCo.
 
-What is not told: where the plates are, how they are turned, their springs, and how they rub. What
-a model of springs does not have: the plates' own mass, an arm that creeps before it slides, a
-controller that holds its force for a millisecond, and a bias of the force sensor that drifts.
+What is not told: where the plates are, how they are turned, their springs, and how they yield and
+rub. The force sensor sits at a wrist: it feels the tool beyond it resist every acceleration, is
+tared badly, and its noise lasts (Ornstein-Uhlenbeck, as the maze's). What a model of springs and
+masses does not have: an arm that creeps before it slides, plates that come back more slowly than
+the tip leaves, and a controller that holds its force for a millisecond.
 """
 
 import dataclasses
@@ -21,14 +23,15 @@ STEPS = 5  # of MuJoCo in it
 RADIUS = 0.01  # m, of the tip
 NOMINAL = math.pi, -math.pi / 2  # rad, where the plates face: one behind larger x, one larger y
 DISTANCE, SPREAD = 0.06, 0.01  # m from the start to where a plate meets the tip, and more or less
-TURNED = 0.05  # rad, at most
+TURNED = 0.15  # rad, at most: nobody measured how they were mounted
 STIFFNESS, FRICTION = (400.0, 4000.0), (0.15, 0.7)  # N/m; log-uniform both
-MASS, DAMPING = (0.01, 0.03), (2.0, 15.0)  # kg and N s/m, of a plate
+MASS, DAMPING = (0.01, 0.03), (5.0, 40.0)  # kg and N s/m, of a plate
 TIP_MASS, DAMPING_RATIO = (0.7, 1.6), (0.7, 1.0)
+TOOL_MASS = 0.15, 0.5  # kg of it, beyond the force sensor
 ARM_FRICTION, STICKS = 0.3, 1e-3  # N, dry, and the velocity (m/s) from which it is about all there
 LOW_PASS = 3e-3  # s
-FORCE_NOISE, POSITION_NOISE = 0.15, 1e-4  # N and m, standard deviations
-BIAS, DRIFT = 0.3, 0.01  # N, and N after one second of a random walk
+FORCE_NOISE, POSITION_NOISE = 0.15, 1e-4  # N and m, standard deviations, white
+BIAS, WANDERING, CORRELATION = 0.3, 0.3, 0.1  # N, N, and s in which it is forgotten
 FASTEST = 20.0  # m/s, of a tip that is lost
 
 
@@ -46,6 +49,7 @@ class Plates:
     friction: Float[np.ndarray, "2"]
     mass: Float[np.ndarray, "2"]
     tip_mass: float
+    tool_mass: float
     damping_ratio: float
     bias: Float[np.ndarray, "2"]
 
@@ -96,8 +100,8 @@ class PlatesWorld(World):
             self._camera = None
         assert self._model is not None
         assert self._plates is not None
-        self._drifted = self._plates.bias.copy()
         self._random = np.random.default_rng([seed, 1, episode])
+        self._wandered = WANDERING * self._random.normal(size=2)
         self._data = mujoco.MjData(self._model)
         self._sensed = np.zeros(2)
         self._count = 0
@@ -120,11 +124,14 @@ class PlatesWorld(World):
             data.qfrc_applied[:2] = pull - dry * data.qvel[:2]
             mujoco.mj_step(model, data)
             share = model.opt.timestep / LOW_PASS
-            self._sensed = (1.0 - share) * self._sensed + share * data.qfrc_constraint[:2]
+            felt = data.qfrc_constraint[:2] - plates.tool_mass * data.qacc[:2]
+            self._sensed = (1.0 - share) * self._sensed + share * felt
         if not np.abs(data.qvel[:2]).max() < FASTEST:
             raise DivergedError("the tip is faster than 20 m/s: lower the stiffness or the way")
         self._count += 1
-        self._drifted += DRIFT * math.sqrt(CONTROL_PERIOD) * self._random.normal(size=2)
+        kept = math.exp(-CONTROL_PERIOD / CORRELATION)
+        kick = WANDERING * math.sqrt(1.0 - kept**2) * self._random.normal(size=2)
+        self._wandered = kept * self._wandered + kick
         return self._observed()
 
     def truth(self) -> PlatesTruth:
@@ -143,11 +150,12 @@ class PlatesWorld(World):
         return camera.picture(data, view)
 
     def _observed(self) -> PlatesObservation:
-        _, data, _ = self._now()
+        _, data, plates = self._now()
+        force = self._sensed + plates.bias + self._wandered
         return PlatesObservation(
             self._count * CONTROL_PERIOD,
             data.qpos[:2] + POSITION_NOISE * self._random.normal(size=2),
-            self._sensed + self._drifted + FORCE_NOISE * self._random.normal(size=2),
+            force + FORCE_NOISE * self._random.normal(size=2),
         )
 
     def _now(self) -> tuple[mujoco.MjModel, mujoco.MjData, Plates]:
@@ -174,6 +182,7 @@ def plates_of(seed: int) -> Plates:
         friction=between(FRICTION),
         mass=between(MASS),
         tip_mass=float(between(TIP_MASS, None)),
+        tool_mass=float(between(TOOL_MASS, None)),
         damping_ratio=float(between(DAMPING_RATIO, None)),
         bias=random.normal(0.0, BIAS, 2),
     )

@@ -6,26 +6,41 @@ import pytest
 from palpate.experiments.contact import contact_model
 from palpate.runs import Figure, Result
 from palpate.runs.storage import write_json
+from palpate.worlds.contact import plates
 from palpate.worlds.contact.plates import PlatesWorld, plates_of
 from palpate.worlds.contact.touching import record_touches
 
 SEED = 7  # of no plates that are reproduced
 
 
-def test_a_straight_line_finds_plates_to_a_rough_size():
-    """The rival is no straw man: without noise it is near, and it is no better than that."""
+def off(rival) -> dict:
     recording = record_touches(PlatesWorld(), SEED, 8, 1.25)
     truth = contact_model.truth_of(plates_of(SEED), np.zeros(2))
-    off = contact_model.errors(contact_model.straight_line(recording), truth)
-    assert np.all(off["position"] < 5.0)
-    assert np.all(off["stiffness"] < 0.6)
-    assert np.all(off["friction"] < 0.6)
+    return contact_model.errors(rival(recording), truth)
+
+
+def test_a_straight_line_finds_plates_that_face_as_they_were_meant_to_a_rough_size(monkeypatch):
+    """No straw man: what it lacks is only how the plates are turned, which makes it worse."""
+    turned = off(contact_model.straight_line)
+    monkeypatch.setattr(plates, "TURNED", 0.0)
+    straight = off(contact_model.straight_line)
+    assert np.all(straight["position"] < 5.0)
+    assert np.all(straight["stiffness"] < 0.6)
+    assert np.all(straight["friction"] < 0.6)
+    assert straight["position"].max() < turned["position"].max()
+
+
+def test_a_plane_finds_turned_plates_to_a_rough_size():
+    found = off(contact_model.plane)
+    assert np.all(found["position"] < 5.0)
+    assert np.all(found["stiffness"] < 0.4)
+    assert np.all(found["friction"] < 0.4)
 
 
 def test_positions_are_those_of_the_turned_plate_abreast_of_a_point():
-    plates = plates_of(SEED)
-    here, there = (contact_model.truth_of(plates, np.full(2, at))["position"] for at in (0.0, 0.1))
-    tilt = plates.angle - np.array(contact_model.NOMINAL)
+    hidden = plates_of(SEED)
+    here, there = (contact_model.truth_of(hidden, np.full(2, at))["position"] for at in (0.0, 0.1))
+    tilt = hidden.angle - np.array(contact_model.NOMINAL)
     # Walls that face against x and y: their lefts are against y and along x.
     np.testing.assert_allclose(there - here, np.array([1.0, -1.0]) * 0.1 * np.tan(tilt), atol=1e-12)
 

@@ -1,4 +1,7 @@
-"""The tip against MuJoCo: a plate on a spring that a mass is driven against and along."""
+"""The tip against MuJoCo: a plate on a spring that a mass is driven against and along.
+
+The force is sensed at a wrist, which feels the tool beyond it resist every acceleration.
+"""
 
 import math
 
@@ -11,6 +14,7 @@ from palpate.models.contact import TipState, facing
 from palpate.models.model import rollout
 
 LAG = 2e-3  # s
+TOOL = 0.2  # kg
 STEPS = 50  # of MuJoCo in a control period
 SCENE = """<mujoco><option timestep="1e-4" gravity="0 0 0" cone="elliptic" impratio="100"/>
 <default><geom solref="0.001 1" solimp="0.99 0.999 1e-4" friction="0.35 0 0"/></default>
@@ -24,7 +28,7 @@ def test_pressing_and_sliding_along_a_plate_on_a_spring_is_as_in_mujoco():
     """Set-point and stiffness change, and the plate is met at speed, rubbed along, and left."""
     tip = facing([math.pi], position=-0.04, mass=1.2, damping_ratio=0.7, stiffness=1500.0,
                  damping=6.0, friction=0.35, wall_mass=0.05, arm_friction=0.0,
-                 sensor_lag=LAG)  # fmt: skip
+                 tool_mass=TOOL, sensor_lag=LAG)  # fmt: skip
     time = tip.control_period * np.arange(400)
     way = np.stack([0.05 * np.sin(4.0 * time), 0.08 * np.sin(2.3 * time)], axis=1)
     stiffness = np.where(time[:, None] < 1.2, [400.0, 600.0], [800.0, 300.0])
@@ -40,7 +44,8 @@ def test_pressing_and_sliding_along_a_plate_on_a_spring_is_as_in_mujoco():
             pull = action[2:] * (action[:2] - data.qpos[:2]) - damping * data.qvel[:2]
             data.qfrc_applied[:2] = pull
             mujoco.mj_step(model, data)
-            shown += (1.0 - np.exp(-1e-4 / LAG)) * (data.qfrc_constraint[:2] - shown)
+            felt = data.qfrc_constraint[:2] - TOOL * data.qacc[:2]
+            shown += (1.0 - np.exp(-1e-4 / LAG)) * (felt - shown)
         theirs.append([*data.qpos[:2], *shown])
     theirs = np.array(theirs)
     off = np.abs(np.asarray(ours) - theirs)

@@ -5,7 +5,8 @@ everything of (`palpate record contact`), and identified from that file by `palp
 contact`, once as a fit and once as draws. Four of the trials are not fitted. Beside the methods
 stand what is known without touching, the priors' medians; and what a textbook does: a straight line
 through force over position while in contact, and the ratio of tangential to normal force while
-sliding, in the directions that the plates were meant to face.
+sliding, in the directions that the plates were meant to face; and the same where a plane through
+force over both coordinates says that they face.
 """
 
 import dataclasses
@@ -68,7 +69,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     experiment.announce({of: minutes * count for of, minutes in MINUTES.items()})
     first = experiment.uses(FIRST, count)
     found: dict[str, list[Outcome]] = {name: [] for name in METHODS}
-    rivals: dict[str, list[Outcome]] = {"prior": [], "straight line": []}
+    rivals: dict[str, list[Outcome]] = {name: [] for name in RIVALS}
     for plates in range(first, first + count):
         file = out / f"plates-{plates}" / "R.npz"
         record.run(RecordContact(seed=plates, out=file))
@@ -79,9 +80,9 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             result = read_result(identify.run(asked) / RESULT)
             experiment.seconds += result.wall_time_s
             found[name].append(judged(result, hidden, centre_of(asked)))
-        guesses = prior_of(recording), straight_line(recording)
-        for outcomes, guess in zip(rivals.values(), guesses, strict=True):
-            outcomes.append(Outcome(errors(guess, truth_of(hidden, np.zeros(2))), {}))
+        for name, guess in RIVALS.items():
+            off = errors(guess(recording), truth_of(hidden, np.zeros(2)))
+            rivals[name].append(Outcome(off, {}))
     settings = {
         "methods": METHODS,
         "enough": ENOUGH,
@@ -141,31 +142,71 @@ def prior_of(recording: Recording) -> Walls:
 
 
 def straight_line(recording: Recording) -> Walls:
-    """Least squares of normal force over position in contact, and the median ratio of forces."""
-    position, force, velocity = (
-        np.concatenate(parts)
-        for parts in zip(*(_states(trial) for trial in recording.trials), strict=True)
-    )
-    found: dict[str, list[float]] = {of: [] for of in FOUND}
+    """Least squares of normal force over position in contact, and the median ratio of forces.
+
+    In the directions that the plates were meant to face.
+    """
+    states = _states(recording)
+    return _listed([_line(angle, *states) for angle in NOMINAL])
+
+
+def plane(recording: Recording) -> Walls:
+    """The same in the direction in which a plane through the force over both coordinates climbs."""
+    position, force, velocity = _states(recording)
+    found = []
     for angle in NOMINAL:
-        normal = unit(np.array(angle))
-        across = np.array([-normal[1], normal[0]])
-        pressed, rubbed = force @ normal, force @ across
-        touching = (pressed > TOUCHED) & (np.abs(rubbed) < STEEP * pressed)
-        slope, height = np.polyfit(position[touching] @ normal, pressed[touching], 1)
-        sliding = touching & (np.abs(velocity @ across) > SLIDING)
-        ratio = -rubbed[sliding] * np.sign(velocity[sliding] @ across) / pressed[sliding]
-        for of, number in zip(FOUND, (-height / slope, -slope, np.median(ratio)), strict=True):
-            found[of].append(float(number))
-    return {of: np.array(numbers) for of, numbers in found.items()}
+        along, across = unit(np.array(angle)), unit(np.array(angle + np.pi / 2.0))
+        touching = _touching(force, along, across)
+        columns = position[touching] @ np.stack([along, across], axis=1)
+        columns = np.concatenate([columns, np.ones((len(columns), 1))], axis=1)
+        climbs = np.linalg.lstsq(columns, force[touching] @ along)[0]
+        tilt = np.arctan(climbs[1] / climbs[0])
+        place, *others = _line(angle + tilt, position, force, velocity)
+        found.append((place / np.cos(tilt), *others))
+    return _listed(found)
 
 
-def _states(trial: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position, force without its mean of the first tenth of a second, and velocity."""
-    position, force = trial["position"].values, trial["force"].values
-    steady = force - force[:20].mean(axis=0)
-    smooth = np.stack([np.convolve(axis, np.ones(5) / 5.0, "same") for axis in position.T], axis=1)
-    return position, steady, np.gradient(smooth, trial["position"].nominal_period, axis=0)
+def _line(
+    angle: float,
+    position: Float[np.ndarray, "frames 2"],
+    force: Float[np.ndarray, "frames 2"],
+    velocity: Float[np.ndarray, "frames 2"],
+) -> tuple[float, float, float]:
+    """Place (m), stiffness (N/m) and friction of the plate whose normal has this angle."""
+    normal, across = unit(np.array(angle)), unit(np.array(angle + np.pi / 2.0))
+    touching = _touching(force, normal, across)
+    pressed, rubbed = force @ normal, force @ across
+    slope, height = np.polyfit(position[touching] @ normal, pressed[touching], 1)
+    sliding = touching & (np.abs(velocity @ across) > SLIDING)
+    ratio = -rubbed[sliding] * np.sign(velocity[sliding] @ across) / pressed[sliding]
+    return -height / slope, -slope, float(np.median(ratio))
+
+
+def _touching(
+    force: Float[np.ndarray, "frames 2"],
+    normal: Float[np.ndarray, "2"],
+    across: Float[np.ndarray, "2"],
+) -> Bool[np.ndarray, " frames"]:
+    pressed = force @ normal
+    return (pressed > TOUCHED) & (np.abs(force @ across) < STEEP * pressed)
+
+
+def _listed(found: list[tuple[float, ...]]) -> Walls:
+    """By what is found, of all plates."""
+    return dict(zip(FOUND, np.transpose(found), strict=True))
+
+
+def _states(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, force without its mean of the first tenth of a second, and velocity; all trials."""
+    parts = []
+    for trial in recording.trials:
+        position, force = trial["position"].values, trial["force"].values
+        steady = force - force[:20].mean(axis=0)
+        smooth = [np.convolve(axis, np.ones(5) / 5.0, "same") for axis in position.T]
+        period = trial["position"].nominal_period
+        parts.append((position, steady, np.gradient(np.stack(smooth, axis=1), period, axis=0)))
+    position, force, velocity = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return position, force, velocity
 
 
 def unit(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 2"]:
@@ -203,3 +244,6 @@ def figures(found: dict[str, list[Outcome]], rivals: dict[str, list[Outcome]]) -
             figure = f"rival.{name.replace(' ', '_')}.{of}"
             listed.append(Figure(figure, median(outcomes, of), unit_of))
     return listed
+
+
+RIVALS = {"prior": prior_of, "straight line": straight_line, "plane": plane}

@@ -16,6 +16,7 @@ UNITS = {"position": "m", "force": "N", "setpoint": "m", "stiffness": "N/m"}
 COMMANDS = "setpoint", "stiffness"
 FEELS = 6.0  # deviations of the force's noise from which on a wall is felt
 PRESSES = 0.25  # of the great forces, from which on it is a wall and no tool that is accelerated
+PLACES = 200  # tried for a wall, from the deepest frame to the farthest
 FEWEST = 20  # frames of contact by which a wall can be placed
 WIDE = math.radians(50.0)  # from a wall's direction, within which a force is that wall's
 LARGEST = 5.0  # m: a tip that is farther from where it was is in another unit
@@ -90,7 +91,7 @@ def directions_of(recording: Recording, told: Sequence[float]) -> Float[np.ndarr
 
 
 def starting_tip(aligned: Aligned, directions: Float[np.ndarray, " walls"]) -> Tip:
-    """A tip between walls that are where the force along them sets in.
+    """A tip between walls that are where the force along them begins to grow with depth.
 
     Raises `PalpateError` for a wall that is hardly ever felt.
     """
@@ -109,8 +110,9 @@ def starting_tip(aligned: Aligned, directions: Float[np.ndarray, " walls"]) -> T
                 f"{_threshold(forces):.2g} N point to {_common(towards[felt])} degrees: is the "
                 "sign that of the force on the tip?"
             )
-        along = places[own] @ [math.cos(angle), math.sin(angle)]
-        found.append(float(np.quantile(along, 0.9)))
+        # Not of the other walls, whose friction is as great as what a wall of its own pushes.
+        alone, normal = own | ~felt, [math.cos(angle), math.sin(angle)]
+        found.append(_onset(places[alone] @ normal, forces[alone] @ normal))
     return facing(
         directions.tolist(),
         position=found,
@@ -137,6 +139,19 @@ def problems(aligned: Aligned) -> list[str]:
             "in the same frame, in m"
         )
     return said
+
+
+def _onset(along: Float[np.ndarray, " frames"], force: Float[np.ndarray, " frames"]) -> float:
+    """Where a force that is none, and then grows with depth, begins: least squares, m.
+
+    A tool that is accelerated pushes a sensor as a wall does, but wherever it is.
+    """
+    places = np.linspace(along.min(), along.max(), PLACES + 1)[1:]
+    left = []
+    for place in places:
+        columns = np.stack([np.ones_like(along), np.maximum(0.0, place - along)], axis=1)
+        left.append(np.sum(np.square(force - columns @ np.linalg.lstsq(columns, force)[0])))
+    return float(places[np.argmin(left)])
 
 
 def _threshold(forces: Float[np.ndarray, "frames 2"]) -> float:

@@ -14,7 +14,7 @@ STIFF = 300.0, 900.0  # N/m, of the impedance, log-uniform, along each axis for 
 BEHIND = 0.01, 0.045  # m behind a plate's nominal place, where a set-point presses
 BEFORE = 0.02, 0.04  # m in front of it, where the tip is free
 SLIDES = 0.04  # m to either side of the middle
-LASTS = 0.2, 0.6  # s, of one move
+LASTS = 0.1, 0.3  # s, of one move: brisk, so that the tool resists and dampers tell
 POSITION, FORCE, SETPOINT, STIFFNESS = "position", "force", "setpoint", "stiffness"
 NORMALS = "wall normals"  # a fact: nominal directions of the outward normals, rad
 

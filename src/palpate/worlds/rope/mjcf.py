@@ -8,14 +8,12 @@ change about the cable is refused.
 import math
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import ParseError
 
 import mujoco
 import numpy as np
-from defusedxml import DefusedXmlException
-from defusedxml.ElementTree import fromstring
 
 from palpate.errors import PalpateError
+from palpate.worlds.mjcf import compiled, read_mjcf
 
 CABLE = "mujoco.elasticity.cable"
 EVEN = 0.01  # relative: by which the spacing of a cable's bodies may vary
@@ -29,7 +27,7 @@ def read_cable(path: str | Path) -> dict[str, Any]:
     body is a point at the tip. Raises `PalpateError` for a file that MuJoCo cannot read, and for a
     cable that is not one straight chain of equally long round bodies on ball joints.
     """
-    model = _compiled(Path(path))
+    model = compiled(path, read_mjcf(path, CABLE))
     chain = np.flatnonzero(model.body_plugin >= 0)
     if len(chain) < 3 or len(set(model.body_plugin[chain])) > 1:
         count = len(set(model.body_plugin[chain]))
@@ -88,29 +86,6 @@ def read_cable(path: str | Path) -> dict[str, Any]:
         "air_viscosity": float(model.opt.viscosity),
         "gravity": float(-gravity[2]),
     }
-
-
-def _compiled(path: Path) -> mujoco.MjModel:
-    try:
-        text = path.read_text(encoding="utf-8")
-        root = fromstring(text, forbid_dtd=True)
-    except (OSError, UnicodeDecodeError) as error:
-        raise PalpateError(f"cannot read {path}: expected an MJCF file ({error})") from error
-    except (ParseError, DefusedXmlException) as error:
-        raise PalpateError(f"{path} is not plain XML: expected an MJCF file ({error})") from error
-    if root.tag != "mujoco":
-        raise PalpateError(f"{path} holds <{root.tag}>: expected MJCF, which begins with <mujoco>")
-    others = {plugin.get("plugin") for plugin in root.iter("plugin")} - {None, CABLE}
-    foreign = [node.tag for node in root.iter() if node.tag == "include" or node.get("file")]
-    if others or foreign:
-        found = ", ".join(sorted(map(str, others))) or f"<{foreign[0]}> of another file"
-        raise PalpateError(
-            f"{path} uses {found}: expected one file by itself, with no plugin but {CABLE}"
-        )
-    try:
-        return mujoco.MjSpec.from_string(text).compile()
-    except ValueError as error:
-        raise PalpateError(f"MuJoCo cannot use {path}: {' '.join(str(error).split())}") from error
 
 
 def _attributes(model: mujoco.MjModel, start: int) -> list[str]:

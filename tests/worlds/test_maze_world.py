@@ -12,16 +12,18 @@ from palpate.worlds.maze.layout import BLOCK_HALF_SIZES, TIP_RADIUS, named_layou
 from palpate.worlds.maze.maze import (
     DISPLACEMENT_LIMIT,
     FORCE_LIMIT,
-    FORCE_NOISE,
     OBSTACLE_FRICTION,
-    POSITION_CORRELATION,
-    POSITION_NOISE,
     STIFFNESS_RANGE,
     SWAY,
-    WRENCH_CORRELATION,
     BlindMaze,
 )
 from palpate.worlds.maze.scene import CONTACT_STIFFNESS, REFERENCE_HEIGHT, TIP_MASS
+from palpate.worlds.maze.tip import (
+    FORCE_NOISE,
+    POSITION_CORRELATION,
+    POSITION_NOISE,
+    WRENCH_CORRELATION,
+)
 from palpate.worlds.world import DivergedError
 
 HOME = named_layout("home")

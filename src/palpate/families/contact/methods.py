@@ -30,7 +30,7 @@ from palpate.networks.guarded import ActorPolicy, GuardedPolicy
 from palpate.tasks.maze import maze, navigation
 from palpate.worlds.maze import maze as maze_world
 from palpate.worlds.maze import navigation as navigation_world
-from palpate.worlds.maze import scene
+from palpate.worlds.maze import scene, tip
 
 WRENCH = (0, 1, 2, 3, 4, 5)  # of the features: SRL-VIC's critic and recovery see no position
 DISCOUNT, TARGET_ENTROPY = 0.98, -1.0  # of the task's agent
@@ -156,7 +156,7 @@ MAZE = Skill(
     (Channel("displacement", (2,)), Channel("stiffness", (2,))),
     DECISION_PERIOD,
     METHODS,
-    (("task", maze), ("world", maze_world), ("world", scene)),
+    (("task", maze), ("world", maze_world), ("world", tip), ("world", scene)),
 )
 NAVIGATION = Skill(
     (Channel("position", (2,)),),

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from scipy.signal import lfilter
 
 from palpate.errors import PalpateError
 from palpate.worlds.maze.layout import TIP_RADIUS, Layout, named_layout
@@ -16,14 +15,13 @@ from palpate.worlds.maze.scene import (
     BASE_MASS,
     BLOCK,
     FEELER,
-    REFERENCE_HEIGHT,
     TIME_STEP,
     TIP,
     TIP_MASS,
     contact_solref,
     maze_scene,
 )
-from palpate.worlds.world import DivergedError, OffscreenCamera, World
+from palpate.worlds.maze.tip import TipObservation, TipWorld, not_negative
 
 # What the robot may do. With 300 N/m a spring stretched by the displacement limit pulls 9 N, less
 # than any obstacle resists; with 1000 N/m 30 N, more than the force limit.
@@ -38,25 +36,6 @@ CONTACT_FRICTION = (0.2, 0.4)  # coefficient, of the tip on walls and block
 SWAY = 0.04  # m, amplitude of the base's sideways motion: a mobile base on soft tyres
 SWAY_FREQUENCY = (0.9, 1.1)  # Hz
 SERVO = 100.0  # rad/s, of the base that follows the sway, critically damped
-
-DRIVE_LIMIT = 100.0  # N: the drives give no more, whatever is commanded
-FASTEST = 20.0  # m/s: a tip that is faster has left physics
-
-# Ornstein-Uhlenbeck noise: standard deviation and correlation time, s, of each channel.
-FORCE_NOISE, TORQUE_NOISE, WRENCH_CORRELATION = 0.3, 0.01, 0.1  # N, N m
-POSITION_NOISE, POSITION_CORRELATION = 1e-3, 1.0  # m
-BLOCK_OF_NOISE = 1000  # steps that are drawn at once
-
-
-class TipObservation(NamedTuple):
-    """What the robot's sensors show, in axes parallel to the world's."""
-
-    time: float  # s since reset
-    # (6,) N, N m with noise: net contact force on the tip, and its torque about the point
-    # `REFERENCE_HEIGHT` above the contact.
-    wrench: np.ndarray
-    position: np.ndarray  # (3,) m with noise, of the tip relative to the robot's base
-    velocity: np.ndarray  # (3,) m/s relative to the robot's base, of encoders: exact
 
 
 class TipTruth(NamedTuple):
@@ -76,21 +55,17 @@ class TipTruth(NamedTuple):
     contact_friction: float
 
 
-class BlindMaze(World):
+class BlindMaze(TipWorld):
     """A tip of 1 kg in a maze, driven by a force (3,) N that acts between it and the robot's base.
 
     The base sways sideways like a mobile one on soft tyres, with an amplitude of `sway` m, a
     frequency about 1 Hz and a random phase; position and velocity are seen relative to it. The tip
     keeps its height by itself and gravity is compensated. `layouts` names mazes, one of which is
-    drawn at each reset; `noise` scales the sensors' Ornstein-Uhlenbeck noise, 0 switches it off;
-    `scattered` lets episodes begin all along the way to the goal, half of them with the block
-    pushed already, so that all can be found out;
-    `control_period` is a whole number of milliseconds, in s.
+    drawn at each reset; `scattered` lets episodes begin all along the way to the goal, half of them
+    with the block pushed already, so that all can be found out; `control_period` is a whole number
+    of milliseconds, in s. All else is as `TipWorld` has it.
 
-    A command that is not finite is a fault of who commands: the drives give no force in that
-    period. No more than `DRIVE_LIMIT` is ever given.
-
-    Raises `PalpateError` for an unknown maze, values outside their range, and a malformed command.
+    Raises `PalpateError` for an unknown maze, and as `TipWorld`.
     """
 
     def __init__(
@@ -105,24 +80,13 @@ class BlindMaze(World):
         self._layouts = tuple(map(_layout, layouts))
         if not self._layouts:
             raise PalpateError("a maze world needs at least one layout")
-        for name, value in (("sway", sway), ("noise", noise)):
-            if not 0 <= value < math.inf:
-                raise PalpateError(f"the {name} is 0 or greater and finite, not {value}")
-        substeps = control_period / TIME_STEP
-        if not (0.5 < substeps < 1e4 and abs(substeps - round(substeps)) < 1e-6):
-            raise PalpateError(
-                f"the control period is a whole number of {TIME_STEP:g} s, not {control_period}"
-            )
-        self._substeps = round(substeps)
-        self._sway_amplitude, self._noise_scale = float(sway), float(noise)
-        self._scattered = scattered
+        super().__init__(noise, control_period, TIME_STEP)
+        self._sway_amplitude, self._scattered = not_negative("sway", sway), scattered
         self._models: dict[Layout, tuple[mujoco.MjModel, mujoco.MjData]] = {}
-        self._camera: OffscreenCamera | None = None
-        self._ready = False
 
     @property
-    def control_period(self) -> float:
-        return self._substeps * TIME_STEP
+    def effective_mass(self) -> float:
+        return TIP_MASS
 
     def reset(
         self,
@@ -138,10 +102,7 @@ class BlindMaze(World):
         What is None is drawn by the seed: the maze among those of the world, the block's dry
         friction (N) and the tip's coefficient of friction; the block's mass is always drawn.
         """
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-            raise PalpateError(f"a seed is a whole number, 0 or greater, not {seed!r}")
-        self._ready = False
-        random = self._random = np.random.default_rng(seed)
+        random = self._begin(seed)
         drawn = self._layouts[random.integers(len(self._layouts))]
         place = random.uniform(-1, 1, 2)
         friction, touch = random.uniform(*OBSTACLE_FRICTION), random.uniform(*CONTACT_FRICTION)
@@ -164,16 +125,14 @@ class BlindMaze(World):
                     f"'{drawn.name}', not at {start}"
                 )
         self._layout = drawn
-        self._obstacle_friction = _positive("obstacle's friction", obstacle_friction, friction)
-        self._contact_friction = _positive("contact's friction", contact_friction, touch)
+        self._obstacle_friction = not_negative(
+            "obstacle's friction", friction if obstacle_friction is None else obstacle_friction
+        )
+        self._contact_friction = not_negative(
+            "contact's friction", touch if contact_friction is None else contact_friction
+        )
         self._place(place, pushed)
-        self._noise = np.zeros(9)
-        self._drawn = BLOCK_OF_NOISE  # none are left
-        if self._noise_scale:
-            self._noise = random.standard_normal(9)
-        self._count, self._peak, self._fault = 0, 0.0, False
-        self._ready = True
-        return self._observe()
+        return self._start()
 
     def _place(self, place: np.ndarray, pushed: float) -> None:
         """A maze's engine with the constants of this episode, the tip at rest on its base."""
@@ -200,7 +159,6 @@ class BlindMaze(World):
     # --- what another carrier of the tip does in a way of its own -----------------------------
 
     _carried = TIP_MASS  # kg on the base
-    # Of the camera: what it looks at (m), how far away it is (m), azimuth and elevation (degrees).
     _view = (0.0, 0.0, 0.0), 0.75, 90.0, -80.0
 
     def _compiled(self, layout: Layout) -> mujoco.MjModel:
@@ -211,8 +169,6 @@ class BlindMaze(World):
         self._position[1:3] = x, y
 
     def _advance(self, x: float, y: float, z: float) -> float:
-        """Drive the tip by a force in N for a control period; the greatest horizontal contact
-        force, squared."""
         model, data, constraint = self._model, self._data, self._constraint
         self._applied[1:4] = x, y, z
         peak = 0.0
@@ -223,26 +179,11 @@ class BlindMaze(World):
         return peak
 
     def _motion(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) m and velocity (3,) m/s of the tip relative to the base."""
         return self._position[1:4].copy(), self._velocity[1:4].copy()
 
     def _force(self) -> np.ndarray:
         """(3,) N: net contact force on the tip, in world axes."""
         return self._constraint[1:4].copy()
-
-    def _wrench(self) -> np.ndarray:
-        """(6,) N, N m, as `TipObservation` has it, without noise."""
-        wrench = np.zeros(6)
-        if self._data.ncon:
-            # The sensor tells what the tip does, and the point that all contacts act at together.
-            fx, fy, fz, tx, ty, tz, *point = self._felt.tolist()
-            x, y, z = (a - b for a, b in zip(point, self._tip_place.tolist(), strict=True))
-            z -= REFERENCE_HEIGHT
-            wrench[:] = (
-                -fx, -fy, -fz,
-                z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz,
-            )  # fmt: skip
-        return wrench
 
     # -------------------------------------------------------------------------------------------
 
@@ -262,63 +203,11 @@ class BlindMaze(World):
             + SERVO * SERVO * (offset - self._position.item(0))
         )
 
-    def step(self, action: np.ndarray) -> TipObservation:
-        """Drive the tip with the force `action` (3,) N for one control period."""
-        if not self._ready:
-            raise PalpateError("a maze world runs after reset(seed), not before")
-        try:
-            x, y, z = np.asarray(action, float).tolist()
-            size = math.sqrt(x * x + y * y + z * z)
-        except (TypeError, ValueError) as error:
-            raise PalpateError(
-                f"a maze world takes a force (x, y, z) in N, not {action}"
-            ) from error
-        self._fault = not size < math.inf
-        if self._fault:
-            x = y = z = 0.0
-        elif size > DRIVE_LIMIT:
-            x, y, z = (value * DRIVE_LIMIT / size for value in (x, y, z))
-        self._peak = math.sqrt(self._advance(x, y, z))
-        self._count += 1
-        if not float(self._velocity @ self._velocity) < FASTEST**2:
-            self._ready = False
-            raise DivergedError(
-                f"the maze's simulation diverged at {self._data.time:.3f} s; gentler forces would "
-                "work"
-            )
-        return self._observe()
-
-    def _observe(self) -> TipObservation:
-        wrench, (position, velocity) = self._wrench(), self._motion()
-        if self._noise_scale:
-            noise = self._next_noise()
-            wrench += noise[:6]
-            position += noise[6:]
-        return TipObservation(self._count * self.control_period, wrench, position, velocity)
-
-    def _next_noise(self) -> np.ndarray:
-        """(9,) of the Ornstein-Uhlenbeck processes, sampled exactly at the control period."""
-        if self._drawn == BLOCK_OF_NOISE:
-            kicks = self._random.standard_normal((BLOCK_OF_NOISE, 9))
-            self._block = np.empty_like(kicks)
-            for part, correlation in (
-                (slice(0, 6), WRENCH_CORRELATION),
-                (slice(6, 9), POSITION_CORRELATION),
-            ):
-                keep = math.exp(-self.control_period / correlation)
-                self._block[:, part] = lfilter(
-                    [math.sqrt(1 - keep**2)], [1, -keep], kicks[:, part], axis=0,
-                    zi=keep * self._noise[None, part],
-                )[0]  # fmt: skip
-            self._noise = self._block[-1].copy()
-            self._block *= self._noise_scale * NOISE
-            self._drawn = 0
-        self._drawn += 1
-        return self._block[self._drawn - 1]
+    def _speed(self) -> float:
+        return float(self._velocity @ self._velocity)
 
     def truth(self) -> TipTruth:
-        if not self._ready:
-            raise PalpateError("a maze world has a truth after reset(seed), not before")
+        self._check_ready("has a truth")
         sway, obstacle = self._position.item(0), self._position.item(-1)
         position, velocity = self._motion()
         position[1] += sway
@@ -329,28 +218,6 @@ class BlindMaze(World):
             self._layout, self._obstacle_friction, self._obstacle_mass, self._contact_friction,
         )  # fmt: skip
 
-    def render(self, width: int = 640, height: int = 480) -> np.ndarray:
-        if not self._ready:
-            raise PalpateError("a maze world is drawn after reset(seed), not before")
-        camera = self._camera
-        if camera is None or (camera.model, camera.width, camera.height) != (
-            self._model, width, height,
-        ):  # fmt: skip
-            self._camera = camera = OffscreenCamera(self._model, width, height)
-        view = mujoco.MjvCamera()
-        view.lookat, view.distance, view.azimuth, view.elevation = self._view
-        return camera.picture(self._data, view)
-
-
-NOISE = np.array([FORCE_NOISE] * 3 + [TORQUE_NOISE] * 3 + [POSITION_NOISE] * 3)
-
 
 def _layout(given: str | Layout) -> Layout:
     return given if isinstance(given, Layout) else named_layout(given)
-
-
-def _positive(what: str, given: float | None, drawn: float) -> float:
-    value = drawn if given is None else float(given)
-    if not 0 <= value < math.inf:
-        raise PalpateError(f"the {what} is 0 or greater and finite, not {given}")
-    return value

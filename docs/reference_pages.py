@@ -71,7 +71,8 @@ STAGES = {
         *("worlds.furniture.pieces", "worlds.furniture.furniture", "worlds.furniture.robot"),
         *("worlds.furniture.handling", "worlds.gymnasium", "worlds.motions"),
         *("families.contact.environments", "families.gymnasium.environments", "worlds.velocity"),
-        *("worlds.maze.maze", "worlds.maze.layout", "worlds.maze.navigation"),
+        *("worlds.maze.tip", "worlds.maze.maze", "worlds.maze.mjcf", "worlds.maze.layout"),
+        *("worlds.maze.navigation", "worlds.mjcf"),
         *("worlds.arm.maze", "worlds.arm.panda", "worlds.arm.control"),
         *("worlds.contact.plates", "worlds.contact.touching"),
         *(

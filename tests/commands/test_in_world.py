@@ -1,6 +1,7 @@
 """`palpate train` and `palpate evaluate` of what learns in a world, on a tiny budget."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from palpate.runs.run import RESULT
 from palpate.safety.reflex import Reflex
 from palpate.tasks.maze.maze import MazeTask
 from palpate.tasks.maze.navigation import NavigationTask
+from palpate.worlds.maze.maze import BlindMaze
+from palpate.worlds.maze.mjcf import MjcfWorld
 
 
 @pytest.fixture
@@ -59,6 +62,40 @@ def test_a_policy_is_trained_kept_tried_and_evaluated_again(short, tmp_path, cap
     assert "held still" in said
     values = {f.name: f.value for f in read_result(tmp_path / "evaluated" / RESULT).figures}
     assert values["success_rate.held_still"] == 0
+
+
+def test_a_world_of_ones_own_and_its_limit_go_with_the_policy(short, tmp_path, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "contact.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```xml\n(.*?)```", page, re.DOTALL)
+    world = tmp_path / "mine.xml"
+    world.write_text(example)
+    given = {"world": world, "steps": 12, "environments": 2, "method": "no-recovery"}
+    with pytest.raises(PalpateError, match="needs --force-limit N"):
+        TrainMaze(**given)
+    with pytest.raises(PalpateError, match="expected one of the two"):
+        TrainMaze(**given, force_limit=20.0, mazes=("unseen-1",))
+    folder = train.run(TrainMaze(**given, force_limit=20.0, out=tmp_path / "trained"))
+    figures = {figure.name for figure in read_result(folder / RESULT).figures}
+    assert {"success_rate.tried", "violation_rate.tried", "greatest_force_n.tried"} <= figures
+    assert "progress.tried" not in figures
+    assert (folder / "path.png").exists()
+    _, manifest = load_actor(folder / "policy.safetensors")
+    assert manifest["constants"]["task.force_limit"] == 20
+    assert manifest["constants"]["world.effective_mass"] == [[1, 0], [0, 1]]
+    asked = EvaluateMaze(policy=folder, episodes=1, out=tmp_path / "evaluated")
+    made = asked.make(1, manifest, None).lockstep
+    assert (type(made.worlds[0]), made.task.force_limit) == (MjcfWorld, 20)
+    evaluate.run(asked)
+    assert f"tried in the world {world}, 20 N allowed" in capsys.readouterr().out
+    in_maze = EvaluateMaze(policy=folder, mazes=("home",)).make(1, manifest, None).lockstep
+    assert (type(in_maze.worlds[0]), in_maze.task.force_limit) == (BlindMaze, 20)
+    world.rename(tmp_path / "moved.xml")
+    with pytest.raises(PalpateError, match=r"which the policy was trained in: --world names it"):
+        evaluate.run(EvaluateMaze(policy=folder, out=tmp_path / "again"))
+    moved = EvaluateMaze(policy=folder, world=str(tmp_path / "moved.xml"))
+    assert moved.inputs(manifest) == {"world": tmp_path / "moved.xml"}
+    with pytest.raises(PalpateError, match=r"unknown world 'arn'; there are: tip, arm, and"):
+        EvaluateMaze(policy=folder, world="arn")
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,8 @@ import numpy as np
 from palpate.deployment.messages import CommandMessage, decode_state, encode_command
 from palpate.families.contact import robot
 from palpate.networks import Channel
+from palpate.tasks.maze.maze import MazeTask
+from palpate.worlds.maze.maze import BlindMaze
 
 SENSORS = Channel("wrench", (6,)), Channel("position", (3,))
 
@@ -35,7 +37,7 @@ class Loop:
 
 def test_it_goes_where_it_is_told_and_brakes_when_nobody_speaks(monkeypatch):
     loop = Loop(monkeypatch)
-    tip = robot.TipRobot(loop, ["home"], seed=0, period=0.1)
+    tip = robot.TipRobot(loop, BlindMaze(), MazeTask(), seed=0, period=0.1)
     loop.command = (0.01, 0.0, 400.0, 400.0)
     for _ in range(3):
         tip.advance()

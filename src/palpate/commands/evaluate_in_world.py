@@ -30,7 +30,7 @@ def evaluate_in_world(options: EvaluateInWorld) -> Path:
             f"{file} was trained for '{manifest.get('task')}', not for {options.task}"
         )
     words = f"evaluate {options.task}"
-    with folders.begin(options, words, {"policy": file}) as run:
+    with folders.begin(options, words, {"policy": file, **options.inputs(manifest)}) as run:
         if not run.finished:
             who = {
                 "policy": (at_its_best(policy), options.episodes),

@@ -26,7 +26,7 @@ def train_in_world(options: TrainInWorld) -> Path:
     """
     words = f"train {options.task}"
     decided = {"training": dataclasses.asdict(options.training()), "constants": options.constants()}
-    with folders.begin(options, words, {}, folders.POLICY, **decided) as run:
+    with folders.begin(options, words, options.inputs(), folders.POLICY, **decided) as run:
         if not run.finished:
             policy, figures = trained_in_world(options, run)
             make = functools.partial(options.make, policy=policy)

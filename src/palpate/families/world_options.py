@@ -50,6 +50,10 @@ class TrainInWorld(Options, ABC):
         """How many episodes of the trained policy there are: fewer after a short training."""
         return max(1, min(self.most_tried, self.steps // 1000))
 
+    def inputs(self) -> dict[str, Path]:
+        """Files, by name, that decide the outcome."""
+        return {}
+
     @abstractmethod
     def make(self, count: int, policy: ActorPolicy | None = None) -> VectorEnv:
         """So many environments side by side, to be trained in or, of a policy, to try it in."""
@@ -101,6 +105,10 @@ class EvaluateInWorld(Options, ABC):
         super().__post_init__()
         if self.episodes < 1:
             raise PalpateError(f"--episodes is 1 or greater, not {self.episodes}")
+
+    def inputs(self, manifest: Mapping[str, Any]) -> dict[str, Path]:
+        """Files, by name, that decide the outcome beside the policy of the manifest."""
+        return {}
 
     @abstractmethod
     def make(

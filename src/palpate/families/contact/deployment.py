@@ -91,10 +91,13 @@ class MazeDeployment(_SkillDeployment):
 
     def simulated_robot(self, endpoint: str, seconds: float, seed: int) -> list[str]:
         """See `Deployment.simulated_robot`: `palpate.families.contact.robot`, where it learnt."""
-        mazes = self.manifest["options"]["mazes"]
+        trained = self.manifest["options"]
+        world = trained.get("world")
+        where = ["--mazes", *trained["mazes"]] if world is None else ["--world", world]
         return [
             *(robot.__name__, "--connect", endpoint, "--seconds", f"{seconds}"),
-            *("--seed", f"{seed}", "--period", f"{self.period}", "--mazes", *mazes),
+            *("--seed", f"{seed}", "--period", f"{self.period}", *where),
+            *("--force-limit", f"{self.constant('task.force_limit')}"),
         ]
 
     def outcome(self, printed: str) -> list[Figure]:

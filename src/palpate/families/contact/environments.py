@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 
 from palpate.networks.guarded import ActorPolicy, GuardedPolicy
 from palpate.safety.impedance import ImpedanceLaw
@@ -26,9 +28,11 @@ from palpate.worlds import velocity
 from palpate.worlds.arm.maze import ArmMaze
 from palpate.worlds.gymnasium import GymnasiumWorld, GymnasiumWorlds, WorldTask, features_of
 from palpate.worlds.maze.layout import Layout
-from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE, BlindMaze
+from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, FORCE_LIMIT, STIFFNESS_RANGE, BlindMaze
+from palpate.worlds.maze.mjcf import MjcfWorld
 from palpate.worlds.maze.navigation import PERIODS, Navigation
 from palpate.worlds.maze.scene import TIP_MASS
+from palpate.worlds.maze.tip import TipWorld
 from palpate.worlds.world import ControlLaw
 
 DECISION_PERIOD = 0.1  # s, in the maze
@@ -37,16 +41,18 @@ TUNING = {"resting": 250.0, "contact_force": 5.0, "gain": 6e4}  # N/m, N, N/m pe
 REFLEX_PACE = 10, 1  # control periods in the maze and between obstacles: tenths of a decision
 
 
-def maze_law(stiffness: float | str | None = None) -> ImpedanceLaw:
-    """The tip's impedance, with the limits of the maze.
+def maze_law(
+    stiffness: float | str | None = None, mass: float | np.ndarray = TIP_MASS
+) -> ImpedanceLaw:
+    """The impedance of a tip of a `mass` (kg, or (2, 2) kg), with the limits of the maze.
 
     `stiffness` is a constant in N/m, `SELF_TUNING`, or None where the policy chooses it.
     """
     limits = DISPLACEMENT_LIMIT, STIFFNESS_RANGE
     if stiffness == SELF_TUNING:
-        return SelfTuningLaw(*limits, mass=TIP_MASS, **TUNING)
+        return SelfTuningLaw(*limits, mass=mass, **TUNING)
     constant = None if stiffness is None else float(stiffness)
-    return ImpedanceLaw(*limits, mass=TIP_MASS, constant_stiffness=constant)
+    return ImpedanceLaw(*limits, mass=mass, constant_stiffness=constant)
 
 
 def _with_reflex(
@@ -70,21 +76,24 @@ def _maze_parts(
     reflex: bool | ActorPolicy = False,
     horizon: int | None = None,
     count: int = 1,
+    file: str | Path | None = None,
+    force_limit: float | None = None,
     world: type[BlindMaze] = BlindMaze,
-) -> tuple[list[BlindMaze], MazeTask, ControlLaw | None, int]:
-    worlds = [
-        world(layouts, noise=noise, scattered=number < scattered * count) for number in range(count)
-    ]
+) -> tuple[Sequence[TipWorld], MazeTask, ControlLaw | None, int]:
+    make = functools.partial(world, layouts) if file is None else functools.partial(MjcfWorld, file)
+    worlds = [make(noise=noise, scattered=number < scattered * count) for number in range(count)]
     every = max(1, round(decision_period / worlds[0].control_period))
-    task, law = MazeTask(horizon=horizon), maze_law(stiffness)
+    task = MazeTask(FORCE_LIMIT if force_limit is None else force_limit, horizon)
+    law = maze_law(stiffness, worlds[0].effective_mass)
     return worlds, task, _with_reflex(law, task, REFLEX_PACE[0], reflex), every
 
 
 def blind_maze(render_mode: str | None = None, **options: Any) -> GymnasiumWorld:
     """One blind maze. `options`: `layouts` and `noise` as `BlindMaze` has them, `scattered`, the
     share of the worlds side by side that begin anywhere, `stiffness` as `maze_law`,
-    `decision_period` in s, `horizon` as `MazeTask`, and `reflex`: a policy whose guard is to
-    interrupt motions (`Reflex`), or whether something is to learn that."""
+    `decision_period` in s, `horizon` and `force_limit` as `MazeTask`, and `reflex`: a policy whose
+    guard is to interrupt motions (`Reflex`), or whether something is to learn that. A `file` takes
+    the place of the maze by a world of your own (`MjcfWorld`)."""
     worlds, task, law, every = _maze_parts(**options)
     return GymnasiumWorld(worlds[0], task, law, every, render_mode)
 

@@ -27,10 +27,11 @@ def figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure
         found.append(
             Figure(f"{name}{suffix}", number / count, "", better=better, spread=(high - low) / 2)
         )
-    arrived = episodes["length"][end == GOAL]
+    arrived, progress = episodes["length"][end == GOAL], float(episodes["progress"].mean())
+    if np.isfinite(progress):  # somebody knows the way
+        found.append(Figure(f"progress{suffix}", progress, "", better="higher"))
     return [
         *found,
-        Figure(f"progress{suffix}", float(episodes["progress"].mean()), "", better="higher"),
         Figure(f"decisions_to_goal{suffix}", float(arrived.mean()) if len(arrived) else None, ""),
         Figure(f"greatest_force_n{suffix}", float(np.median(episodes["force"])), "N"),
     ]

@@ -1,8 +1,9 @@
-"""What the commands need to know of the maze that is felt through."""
+"""What the commands need to know of the maze that is felt through, and of worlds of your own."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import arg
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from palpate.worlds.gymnasium import GymnasiumWorlds
 
 Mazes = Annotated[tuple[str, ...], arg(metavar="NAME ...")]
+HOME, CARRIERS = ("home",), ("tip", "arm")
+MJCF = ".xml"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +35,8 @@ class TrainMaze(TrainSkill):
     2. The same without recovery:               palpate train maze --method no-recovery
     3. Motions that are interrupted (Bresa):    palpate train maze --method bresa
     4. At a constant stiffness:                 palpate train maze --method k300
+    5. In a world of your own:                  palpate train maze --world mine.xml
+                                                    --force-limit 20
     """
 
     task: ClassVar[str] = "maze"
@@ -46,15 +51,49 @@ class TrainMaze(TrainSkill):
     position-critic: it is told positions too; k...: srl-vic at that stiffness (N/m);
     self-tuning: at one that rises while something resists; no-recovery: nothing overrules it;
     lagrangian, penalty: violations as a constraint, or at a price."""
-    mazes: Mazes = ("home",)
+    mazes: Mazes = HOME
     """To train in, one drawn for each episode."""
+    world: Annotated[
+        Path | None, arg(metavar="FILE.xml", help_behavior_hint="(default: the mazes)")
+    ] = None
+    """To train in instead: an MJCF file with a body `tip` and a site `goal`, see the docs."""
+    force_limit: Annotated[
+        float | None, arg(metavar="NEWTON", help_behavior_hint="(default: 26, in the mazes)")
+    ] = None
+    """Of contact on the tip; more is a violation, which ends the episode."""
     noise: float = 1.0
     """Of the sensors, as a multiple of what the world has; 0: none."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        limit = self.force_limit
+        if limit is not None and not 0 < limit < float("inf"):
+            raise PalpateError(f"--force-limit is a positive number of newton, not {limit}")
+        if self.world is not None:
+            _check_no_mazes(self.world, () if self.mazes == HOME else self.mazes)
+            if limit is None:
+                raise PalpateError(
+                    f"--world {self.world} needs --force-limit N: more contact force on its tip is "
+                    "a violation; that of the mazes is 26"
+                )
 
     def skill(self) -> Skill:
         from palpate.families.contact.methods import MAZE
 
         return MAZE
+
+    def inputs(self) -> dict[str, Path]:
+        return {} if self.world is None else {"world": self.world}
+
+    def constants(self) -> dict[str, Any]:
+        from palpate.worlds.maze.mjcf import MjcfWorld
+
+        found = super().constants()
+        if self.force_limit is not None:  # which features are a share of
+            found["task.force_limit"] = self.force_limit
+        if self.world is not None:
+            found["world.effective_mass"] = MjcfWorld(self.world).effective_mass.tolist()
+        return found
 
     def make(
         self, count: int, policy: ActorPolicy | None = None, scattered: float = 0.0
@@ -66,6 +105,8 @@ class TrainMaze(TrainSkill):
         return blind_mazes(
             count,
             layouts=self.mazes,
+            file=self.world,
+            force_limit=self.force_limit,
             noise=self.noise,
             scattered=scattered,
             horizon=TRAINING_HORIZON if scattered else None,
@@ -87,6 +128,7 @@ class EvaluateMaze(EvaluateSkill):
     2. In mazes kept for testing:               palpate evaluate maze --policy P
                                                     --mazes unseen-1 unseen-2
     3. By a seven-axis arm, not trained anew:   palpate evaluate maze --policy P --world arm
+    4. In another world of your own:            palpate evaluate maze --policy P --world other.xml
     """
 
     task: ClassVar[str] = "maze"
@@ -95,8 +137,11 @@ class EvaluateMaze(EvaluateSkill):
         tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="(default: as trained)")
     ] = ()
     """To try it in, one drawn for each episode."""
-    world: Literal["tip", "arm"] = "tip"
-    """What feels its way: a tip of its own, or the peg in the gripper of an arm."""
+    world: Annotated[
+        str | None, arg(metavar="{tip,arm,FILE.xml}", help_behavior_hint="(default: as trained)")
+    ] = None
+    """What feels its way: a tip of its own in the mazes, the peg in the gripper of an arm, or the
+    tip of your own MJCF file."""
     noise: float = 1.0
     """Of the sensors, as a multiple of what the world has; 0: none."""
     decision_period: Annotated[
@@ -110,6 +155,29 @@ class EvaluateMaze(EvaluateSkill):
             raise PalpateError(
                 f"--decision-period is from 0.001 to 10 s, not {self.decision_period}"
             )
+        if self.world is not None and self.world not in CARRIERS:
+            if not self.world.endswith(MJCF):
+                raise PalpateError(
+                    f"unknown world '{self.world}'; there are: {', '.join(CARRIERS)}, and MJCF "
+                    f"files of your own, which end in {MJCF}"
+                )
+            _check_no_mazes(self.world, self.mazes)
+
+    def _file(self, manifest: Mapping[str, Any]) -> Path | None:
+        """The world of the user's own that the policy is tried in; None in the mazes."""
+        if self.world in CARRIERS or (self.world is None and self.mazes):
+            return None
+        name = self.world or manifest["options"].get("world")
+        return None if name is None else Path(name)
+
+    def inputs(self, manifest: Mapping[str, Any]) -> dict[str, Path]:
+        file = self._file(manifest)
+        if file is None:
+            return {}
+        if not file.is_file():
+            where = "" if self.world else ", which the policy was trained in"
+            raise PalpateError(f"there is no world {file}{where}: --world names it where it is now")
+        return {"world": file}
 
     def make(
         self, count: int, manifest: Mapping[str, Any], policy: ActorPolicy | None
@@ -127,6 +195,8 @@ class EvaluateMaze(EvaluateSkill):
         return make(
             count,
             layouts=self.mazes or tuple(trained["mazes"]),
+            file=self._file(manifest),
+            force_limit=trained.get("force_limit"),
             noise=self.noise,
             stiffness=method.stiffness,
             decision_period=self.decision_period or DECISION_PERIOD,
@@ -143,14 +213,22 @@ class EvaluateMaze(EvaluateSkill):
             found = probes.probe(policy, environments, self.seed)
         finally:
             environments.close()
-        return probes.figures(found, guarded=method.guarded, free=method.stiffness is None)
+        free = method.stiffness is None and self._file(manifest) is None
+        return probes.figures(found, guarded=method.guarded, free=free)
 
     def about(self, manifest: Mapping[str, Any]) -> str:
-        mazes = self.mazes or manifest["options"]["mazes"]
-        noise = f"with {self.noise:g} times the sensors' noise"
-        return f"tried in the maze {', '.join(mazes)}, felt by the {self.world}, {noise}"
+        mazes, file = self.mazes or manifest["options"]["mazes"], self._file(manifest)
+        where = f"the maze {', '.join(mazes)}, felt by the {self.world or CARRIERS[0]}"
+        if file is not None:
+            where = f"the world {file}, {manifest['constants']['task.force_limit']:g} N allowed"
+        return f"tried in {where}, with {self.noise:g} times the sensors' noise"
 
     def show(self, run: Run, policy: ActorPolicy, manifest: Mapping[str, Any]) -> None:
         from palpate.families.contact.path_picture import show_path
 
         show_path(run.path, policy, self.make(1, manifest, policy), self.seed)
+
+
+def _check_no_mazes(world: str | Path, mazes: tuple[str, ...]) -> None:
+    if mazes:
+        raise PalpateError(f"--world {world} takes the place of --mazes: expected one of the two")

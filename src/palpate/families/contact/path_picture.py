@@ -1,5 +1,6 @@
 """One episode in a maze, to look at: way, stiffness and force along it, as picture and film."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from palpate.report.picture import canvas_of, save_animation, save_picture
 from palpate.safety.reflex import Reflex
 from palpate.worlds.gymnasium import GymnasiumWorlds
 from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
+from palpate.worlds.maze.mjcf import OpenLayout
 
 PICTURE, FILM = "path.png", "rendering.webp"
 LEAST_RISK = 1e-5  # that is drawn
@@ -24,6 +26,7 @@ _GOAL = "#007a59"
 _STIFFEST = 0.022  # m: how long an ellipse's half axis is drawn at the greatest stiffness
 _NEWTON = 0.0025  # m of an arrow for each N
 _EVERY = 4  # decisions from one ellipse to the next
+_PIXELS = 160  # of each side of a picture from above
 _WHOLE = {"shrinkA": 0, "shrinkB": 0}
 _SETTINGS: Any = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
 
@@ -32,12 +35,13 @@ _SETTINGS: Any = {"font.size": 8, "axes.spines.top": False, "axes.spines.right":
 class Episode:
     """What happened in one, at each of its decisions; positions in the world."""
 
-    layout: Layout
+    layout: Layout | OpenLayout
     period: float  # s, of a decision
     force_limit: float  # N
     end: str
     position: np.ndarray  # (decisions, 2) m, at the decision
-    block: np.ndarray  # (decisions,) m by which the obstacle has been pushed
+    # (decisions,) m by which the obstacle has been pushed, or (decisions, y, x) m: heights.
+    scene: np.ndarray
     stiffness: np.ndarray  # (decisions, 2, 2) N/m
     force: np.ndarray  # (decisions, 2) N, at the decision
     greatest: np.ndarray  # (decisions,) N, within it
@@ -62,15 +66,16 @@ def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Epi
 
     while not end:
         truth = world.truth()
+        scene = _scene_of(world, truth)
         risk, action = (np.asarray(one) for one in decide(jnp.asarray(observation)))
         observation, _, _, _, infos = environment.step(action)
         end = infos["end"][0]
         felt = infos["force"][0]
-        before = truth.position[:2], truth.obstacle, truth.force[:2]
+        before = truth.position[:2], scene, truth.force[:2]
         rows.append((*before, impedance.stiffness[0].copy(), felt, float(risk[0])))
-    position, block, force, stiffness, greatest, risk = map(np.array, zip(*rows, strict=True))
+    position, scene, force, stiffness, greatest, risk = map(np.array, zip(*rows, strict=True))
     period = inside.every * world.control_period
-    seen = layout, period, task.force_limit, end, position, block, stiffness, force, greatest
+    seen = layout, period, task.force_limit, end, position, scene, stiffness, force, greatest
     if isinstance(policy, GuardedPolicy):
         return Episode(*seen, risk, policy.threshold)
     return Episode(*seen, None)
@@ -90,7 +95,7 @@ def path_picture(out: Path, episode: Episode) -> None:
     with matplotlib.rc_context(_SETTINGS):
         canvas = canvas_of(9.0, 3.9)
         panels = canvas.subplot_mosaic([["way", "force"], ["way", "last"]], width_ratios=[1.35, 1])
-        _draw_maze(panels["way"], episode.layout, episode.block[-1])
+        _draw_place(panels["way"], episode.layout, episode.scene[-1])
         _draw_way(panels["way"], episode, len(time))
         force, last = panels["force"], panels["last"]
         force.plot(time, episode.greatest, color=_FORCE, lw=1)
@@ -128,7 +133,7 @@ def film(out: Path, episode: Episode) -> None:
         for count in [*range(1, len(episode.position), 2), len(episode.position)]:
             canvas = canvas_of(5.2, 4.3, dpi=80)
             axis = canvas.subplots()
-            _draw_maze(axis, episode.layout, episode.block[count - 1])
+            _draw_place(axis, episode.layout, episode.scene[count - 1])
             _draw_way(axis, episode, count, last=True)
             pictures.append(_image(canvas, Image))
     save_animation(out, pictures, round(2000 * episode.period), quality=70)
@@ -148,6 +153,30 @@ def _image(canvas: Any, image: Any) -> Any:
     return image.fromarray(np.asarray(drawn.buffer_rgba())[..., :3].copy())
 
 
+def _area(layout: OpenLayout) -> tuple[float, float, float, float]:
+    """Least and greatest x, then y: a square with start and goal in its middle."""
+    (x, y), half = np.add(layout.start, layout.goal) / 2, math.dist(layout.start, layout.goal)
+    return x - 0.8 * half, x + 0.8 * half, y - 0.8 * half, y + 0.8 * half
+
+
+def _scene_of(world: Any, truth: Any) -> Any:
+    if isinstance(truth.layout, Layout):
+        return truth.obstacle
+    west, east, south, north = _area(truth.layout)
+    return world.heights(np.linspace(west, east, _PIXELS), np.linspace(south, north, _PIXELS))
+
+
+def _draw_place(axis: Any, layout: Layout | OpenLayout, scene: Any) -> None:
+    if isinstance(layout, Layout):
+        _draw_maze(axis, layout, scene)
+    else:
+        shade = {"cmap": "Greys", "alpha": 0.6, "interpolation": "nearest"}
+        axis.imshow(scene, origin="lower", extent=_area(layout), **shade)
+    axis.add_patch(Circle(layout.goal, layout.goal_radius, fc="none", ec=_GOAL, lw=1.5))
+    axis.annotate("goal", layout.goal, ha="center", va="center", color=_GOAL)
+    axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+
+
 def _draw_maze(axis: Any, layout: Layout, pushed: float) -> None:
     boxes = [(wall.position, wall.half_sizes, wall.yaw, _WALL) for wall in layout.walls]
     x, y = layout.obstacle.position
@@ -156,11 +185,8 @@ def _draw_maze(axis: Any, layout: Layout, pushed: float) -> None:
         box = Rectangle((-width, -height), 2 * width, 2 * height, fc=colour, ec="none")
         box.set_transform(Affine2D().rotate(yaw).translate(x, y) + axis.transData)
         axis.add_patch(box)
-    axis.add_patch(Circle(layout.goal, layout.goal_radius, fc="none", ec=_GOAL, lw=1.5))
-    axis.annotate("goal", layout.goal, ha="center", va="center", color=_GOAL)
     width, height = ARENA
     axis.set(xlim=(-width - 0.02, width + 0.02), ylim=(-height - 0.02, height + 0.02))
-    axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
 
 
 def _draw_way(axis: Any, episode: Episode, count: int, last: bool = False) -> None:
@@ -169,15 +195,16 @@ def _draw_way(axis: Any, episode: Episode, count: int, last: bool = False) -> No
     axis.add_patch(Circle(tuple(way[-1]), TIP_RADIUS, fc=_WAY, ec="none", alpha=0.6))
     shown = [count - 1] if last else range(0, count, _EVERY)
     values, axes = np.linalg.eigh(episode.stiffness)
-    scale = 2 * _STIFFEST / np.sqrt(1000.0)
+    zoom = float(np.ptp(axis.get_xlim())) / (2 * ARENA[0] + 0.04)  # 1 in the mazes
+    scale = zoom * 2 * _STIFFEST / np.sqrt(1000.0)
     for number in shown:
         turn = np.degrees(np.arctan2(axes[number, 1, 1], axes[number, 0, 1]))
         softer, stiffer = scale * np.sqrt(np.maximum(values[number], 0.0))
         axis.add_patch(
             Ellipse(tuple(way[number]), stiffer, softer, angle=turn, fc="none", ec=_INK, lw=0.5)
         )
-        force = _NEWTON * episode.force[number]
-        if np.hypot(*force) > 1e-3:
+        force = zoom * _NEWTON * episode.force[number]
+        if np.hypot(*force) > zoom * 1e-3:
             axis.annotate(
                 "", way[number] + force, way[number],
                 arrowprops={"arrowstyle": "-|>", "color": _FORCE, "lw": 0.8} | _WHOLE,

@@ -3,7 +3,9 @@
 The risk is put to the test as it is meant: what happens next if nothing is done about it?
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -54,18 +56,22 @@ def probe(policy: ActorPolicy, environments: GymnasiumWorlds, seed: int) -> Prob
         proposed, executed, risky = map(np.asarray, decide(observation))
         now, ahead = when == step, (when <= step) & (step < when + AHEAD) & ~over
         risk[now], force[now] = risky[now], np.hypot(observation[now, 0], observation[now, 1])
-        before = np.array([world.truth().obstacle for world in worlds])
+        before = _pushed(worlds)
         action = np.where(ahead[:, None], proposed, executed)
         observation, _, terminated, truncated, told = environments.step(action)
         greatest[ahead] = np.maximum(greatest, told["force"])[ahead]
         ended = terminated | truncated
         over |= ended & ahead
-        after = np.array([world.truth().obstacle for world in worlds])
-        pushing = (step < when) & ~ended & (after - before > PUSHED)
+        pushing = (step < when) & ~ended & (_pushed(worlds) - before > PUSHED)
         pushes.append(executed[pushing, 2:4])
     low, high = STIFFNESS_RANGE
     along, across = (low + (high - low) * (np.concatenate(pushes) + 1) / 2).T
     return Probes(risk, force, greatest, along, across)
+
+
+def _pushed(worlds: Sequence[Any]) -> Float[np.ndarray, " worlds"]:
+    """m by which each world's obstacle has been; 0 where none is known."""
+    return np.array([getattr(world.truth(), "obstacle", 0.0) for world in worlds])
 
 
 def figures(found: Probes, *, guarded: bool, free: bool) -> list[Figure]:

@@ -7,10 +7,10 @@ comes.
 
 import argparse
 import json
+import math
 import secrets
 import signal
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ from palpate.families.contact.environments import maze_law
 from palpate.tasks.maze.maze import MazeTask
 from palpate.worlds.gymnasium import VIOLATION
 from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE, BlindMaze
+from palpate.worlds.maze.mjcf import MjcfWorld
+from palpate.worlds.maze.tip import TipWorld
 from palpate.worlds.world import side_by_side
 
 LISTENS = 0.005  # s, from one look for commands to the next
@@ -34,14 +36,16 @@ class TipRobot:
 
     Args:
         link: to the loop.
-        mazes: one of which it is in.
+        world: that it is in.
+        task: what ends an episode there.
         seed: of the world.
         period: seconds between states, a whole number of `LISTENS`.
     """
 
-    def __init__(self, link: Link, mazes: Sequence[str], seed: int, period: float):
+    def __init__(self, link: Link, world: TipWorld, task: MazeTask, seed: int, period: float):
         self._link, self.period = link, period
-        self._world, self._law, self._task = BlindMaze(mazes), maze_law(), MazeTask()
+        self._world, self._task = world, task
+        self._law = maze_law(mass=world.effective_mass)
         self._seen = self._world.reset(seed)
         self._first = self._world.truth()
         self._session, self._sequence = secrets.randbits(64), 0
@@ -50,9 +54,10 @@ class TipRobot:
         self.force, self.end = 0.0, ""
 
     @property
-    def progress(self) -> float:
-        """The share of the way to the goal that is behind it."""
-        return self._task.progress(self._first, self._world.truth())
+    def progress(self) -> float | None:
+        """The share of the way to the goal that is behind it; None where nobody knows the way."""
+        share = self._task.progress(self._first, self._world.truth())
+        return share if math.isfinite(share) else None
 
     def advance(self) -> None:
         """One period of real time; `end` then says whether, and how, the episode is over."""
@@ -96,7 +101,9 @@ def main() -> None:
     """Run for some seconds, until the episode is over or SIGTERM; print what happened."""
     parser = argparse.ArgumentParser(description="a simulated tip in a maze")
     parser.add_argument("--connect", required=True, help="where the loop listens")
-    parser.add_argument("--mazes", nargs="+", required=True)
+    parser.add_argument("--mazes", nargs="+", default=("home",))
+    parser.add_argument("--world", help="an MJCF file in place of the mazes")
+    parser.add_argument("--force-limit", type=float, required=True)
     parser.add_argument("--period", type=float, required=True)
     parser.add_argument("--seconds", type=float, required=True)
     parser.add_argument("--seed", type=int, default=0)
@@ -106,7 +113,9 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's, which says when to end
     # Urgent, because it stands for a robot with a computer of its own.
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
-        robot = TipRobot(link, options.mazes, options.seed, options.period)
+        world = MjcfWorld(options.world) if options.world else BlindMaze(options.mazes)
+        task = MazeTask(options.force_limit)
+        robot = TipRobot(link, world, task, options.seed, options.period)
         ends = link.clock() + options.seconds
         while link.clock() < ends and not asked and not robot.end:
             robot.advance()

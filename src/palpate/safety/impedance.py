@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from palpate.errors import PalpateError
+from palpate.worlds.world import Spring
 
 Matrix = Float[Any, "*batch axes axes"]
 Mass = Float[Any, "*#batch axes axes"]
@@ -200,6 +201,15 @@ class ImpedanceLaw:
                 force[lost, :2] = -(self.damping[lost] @ velocity[lost, :, None])[..., 0]
                 force[~_finite(force)] = 0.0
         return force
+
+    def spring(self) -> Spring | None:
+        """See `palpate.worlds.world.SpringLaw`: None where a rate is limited, or a decision was not
+        finite."""
+        if min(self._most) < math.inf or not self._sound.all():
+            return None
+        if self._moving:
+            self._move()
+        return Spring(self.target, self.stiffness, self.damping)
 
     def _move(self) -> None:
         """Set-point and stiffness of the next period, until they are those of the decision."""

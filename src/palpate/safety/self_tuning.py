@@ -60,6 +60,9 @@ class SelfTuningLaw(ImpedanceLaw):
             self._along = np.full(len(step), self._resting)
         self._along[fresh] = self._resting
 
+    def spring(self) -> None:
+        """None: the stiffness changes within a decision."""
+
     def command(self, observation: Any) -> Float[np.ndarray, "worlds 3"]:
         """See `ImpedanceLaw.command`."""
         with np.errstate(invalid="ignore", over="ignore"):  # a sensor that fails stiffens nothing

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -18,6 +19,7 @@ from palpate.worlds.world import (
     ControlLaw,
     DivergedError,
     InterruptingLaw,
+    SpringLaw,
     World,
     side_by_side,
     whole_periods,
@@ -75,7 +77,9 @@ def features_of(task: WorldTask, observation: Any) -> np.ndarray:
 class Lockstep:
     """Worlds side by side at the control rate, whose decisions are taken together.
 
-    Where the law can interrupt, `motions` are the pieces of the last decision of all.
+    Where the law can interrupt, `motions` are the pieces of the last decision of all. Worlds that
+    can be rolled out are, while the law is a spring (`SpringLaw`) and a contact force above the
+    task's `force_limit` is what violates.
     """
 
     def __init__(
@@ -94,6 +98,10 @@ class Lockstep:
         self.motions: Motions | None = None
         if isinstance(law, InterruptingLaw):
             self.motions = Motions(law, self.features, self.every)
+        self._force_limit: float = getattr(task, "force_limit", math.inf)
+        self._rollout = None
+        if isinstance(law, SpringLaw) and hasattr(task, "force_limit"):
+            self._rollout = self.worlds[0].rollout(self.worlds)
         one = np.ones(task.features, np.float32) * FEATURE_LIMIT
         self.observation_space = Box(-one, one)
         self.action_space = Box(-1.0, 1.0, (task.actions,), np.float32)
@@ -114,15 +122,49 @@ class Lockstep:
 
         A world whose episode ends within the decision stands still until the others are done.
         """
-        worlds, task, law, observations = self.worlds, self.task, self.law, self.observations
-        motions = self.motions
+        task, law, observations, motions = self.task, self.law, self.observations, self.motions
         if observations[0] is None:
             raise PalpateError("an environment takes a step after reset(), not before")
         before, truths = list(self._truths), self._truths
-        end = np.full(len(worlds), "", object)
-        force, running = [0.0] * len(worlds), list(range(len(worlds)))
         if law is not None:
             law.begin(side_by_side(observations), actions, self.fresh.copy())
+        force, end = self._held() or self._stepped(actions)
+        running = np.flatnonzero(end == "").tolist()
+        self.fresh[:] = False
+        self.decisions += 1
+        reward = np.array(
+            [float(task.reward(*each)) for each in zip(before, truths, actions, strict=True)]
+        )
+        for number in running:
+            end[number] = task.end(truths[number]) or (
+                HORIZON if self.decisions[number] >= task.horizon else ""
+            )
+        cut = (end == HORIZON) | (end == DIVERGED)
+        if motions is not None:
+            motions.finish(end == VIOLATION, (end != "") & ~cut, end != DIVERGED)
+        told = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
+        told["force"] = force
+        told["progress"] = np.array([*map(task.progress, self._first, truths)])
+        return reward, (end != "") & ~cut, cut, told
+
+    def _held(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """As `_stepped`, by a rollout; None where that cannot be."""
+        law = self.law
+        spring = law.spring() if self._rollout is not None and isinstance(law, SpringLaw) else None
+        if spring is None or self._rollout is None:
+            return None
+        held = self._rollout.hold(spring, self.every, self._force_limit)
+        self.observations[:], self._truths[:] = held.observations, held.truths
+        end = np.full(len(self.worlds), "", object)
+        end[held.violated], end[held.diverged] = VIOLATION, DIVERGED
+        return held.force, end
+
+    def _stepped(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The greatest force in each world in a decision, N, and how it ended ("": it did not)."""
+        worlds, task, law, observations = self.worlds, self.task, self.law, self.observations
+        motions, truths = self.motions, self._truths
+        end = np.full(len(worlds), "", object)
+        force, running = [0.0] * len(worlds), list(range(len(worlds)))
         for period in range(self.every):
             commands = actions if law is None else law.command(side_by_side(observations))
             if motions is not None:
@@ -140,22 +182,7 @@ class Lockstep:
                 if task.violates(truth):
                     end[number] = VIOLATION
                     running.remove(number)
-        self.fresh[:] = False
-        self.decisions += 1
-        reward = np.array(
-            [float(task.reward(*each)) for each in zip(before, truths, actions, strict=True)]
-        )
-        for number in running:
-            end[number] = task.end(truths[number]) or (
-                HORIZON if self.decisions[number] >= task.horizon else ""
-            )
-        cut = (end == HORIZON) | (end == DIVERGED)
-        if motions is not None:
-            motions.finish(end == VIOLATION, (end != "") & ~cut, end != DIVERGED)
-        told = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
-        told["force"] = np.array(force)
-        told["progress"] = np.array([*map(task.progress, self._first, truths)])
-        return reward, (end != "") & ~cut, cut, told
+        return np.array(force), end
 
 
 class GymnasiumWorlds(VectorEnv):

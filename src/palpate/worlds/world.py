@@ -8,7 +8,7 @@ import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -59,6 +59,11 @@ class World(ABC):
         Raises `PalpateError`, naming the packages to install, where the machine has no OpenGL.
         """
 
+    def rollout(self, worlds: Sequence[World]) -> Rollout | None:
+        """What advances this world and all beside it by whole decisions at once, where that is
+        faster than one control period after another; None: nothing does."""
+        return None
+
 
 @runtime_checkable
 class ControlLaw(Protocol):
@@ -89,6 +94,41 @@ class InterruptingLaw(ControlLaw, Protocol):
     pace: int
     executed: np.ndarray
     interrupted: np.ndarray
+
+
+class Spring(NamedTuple):
+    """What pulls the tips of worlds side by side to set-points: F = K (x_d - x) - D xdot."""
+
+    target: np.ndarray  # (worlds, 2) m, in the frame of the observed position
+    stiffness: np.ndarray  # (worlds, 2, 2) N/m, symmetric
+    damping: np.ndarray  # (worlds, 2, 2) N s/m, symmetric
+
+
+@runtime_checkable
+class SpringLaw(ControlLaw, Protocol):
+    """A control law that can be no more than a spring and a damper from decision to decision."""
+
+    def spring(self) -> Spring | None:
+        """What pulls until the next decision; None where it is not that alone."""
+        ...
+
+
+class Held(NamedTuple):
+    """What came of a spring that was held in worlds side by side."""
+
+    observations: list[Any]  # the last of each world
+    truths: list[Any]
+    force: np.ndarray  # (worlds,) N, the greatest contact force
+    violated: np.ndarray  # (worlds,) bool: it was above the limit, and the world has stopped there
+    diverged: np.ndarray  # (worlds,) bool: the simulation did, and the world is to begin anew
+
+
+class Rollout(Protocol):
+    """Worlds side by side that are advanced together, by many control periods in one call."""
+
+    def hold(self, spring: Spring, periods: int, force_limit: float) -> Held:
+        """As `periods` steps under the spring's force, until a contact force is above the limit."""
+        ...
 
 
 def side_by_side(observations: Sequence[Any]) -> Any:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.worlds.maze.layout import TIP_RADIUS, Layout, named_layout
+from palpate.worlds.maze.rollout import STATE, MazeRollout, Springs
 from palpate.worlds.maze.scene import (
     BASE_MASS,
     BLOCK,
@@ -21,7 +22,8 @@ from palpate.worlds.maze.scene import (
     contact_solref,
     maze_scene,
 )
-from palpate.worlds.maze.tip import TipObservation, TipWorld, not_negative
+from palpate.worlds.maze.tip import TipObservation, TipWorld, not_negative, wrench_of
+from palpate.worlds.world import Spring, World
 
 # What the robot may do. With 300 N/m a spring stretched by the displacement limit pulls 9 N, less
 # than any obstacle resists; with 1000 N/m 30 N, more than the force limit.
@@ -151,6 +153,8 @@ class BlindMaze(TipWorld):
         self._position, self._velocity = data.qpos, data.qvel
         self._applied, self._felt = data.qfrc_applied, data.sensor(FEELER).data
         self._constraint, self._tip_place = data.qfrc_constraint, data.xpos[tip]
+        if self._rolls_out:
+            self._springs = Springs(model)
         offset, data.qvel[0], _ = self._sway(0.0)
         data.qpos[0], data.qpos[-1] = offset, pushed
         self._seat(place[0], place[1] - offset)
@@ -187,12 +191,14 @@ class BlindMaze(TipWorld):
 
     # -------------------------------------------------------------------------------------------
 
-    def _sway(self, time: float) -> tuple[float, float, float]:
-        """Where the base should be, m, how fast, m/s, and its acceleration, m/s^2."""
+    def _sway(self, time: Any) -> tuple[Any, Any, Any]:
+        """Where the base should be, m, how fast, m/s, and its acceleration, m/s^2: at a time in s,
+        or at many."""
+        xp: Any = math if isinstance(time, float) else np
         amplitude, rate = self._sway_amplitude, self._rate
         angle = rate * time + self._phase
-        offset = amplitude * math.sin(angle)
-        return offset, amplitude * rate * math.cos(angle), -rate * rate * offset
+        offset = amplitude * xp.sin(angle)
+        return offset, amplitude * rate * xp.cos(angle), -rate * rate * offset
 
     def _swaying_force(self) -> float:
         """N: what the base's servo gives in the next millisecond."""
@@ -205,6 +211,65 @@ class BlindMaze(TipWorld):
 
     def _speed(self) -> float:
         return float(self._velocity @ self._velocity)
+
+    # --- how it is held by a spring for many control periods, see `MazeRollout` -----------------
+
+    _rolls_out = True
+
+    def rollout(self, worlds: Sequence[World]) -> MazeRollout | None:
+        """See `World.rollout`."""
+        mazes = [world for world in worlds if isinstance(world, BlindMaze)]
+        able = all(maze._rolls_out and maze._substeps == 1 for maze in mazes)
+        return MazeRollout(mazes) if able and len(mazes) == len(worlds) else None
+
+    def engine(self) -> mujoco.MjModel:
+        """See `RolledOut`."""
+        self._check_ready("has an engine")
+        return self._model
+
+    def full_state(self) -> np.ndarray:
+        """See `RolledOut`."""
+        state = np.empty(mujoco.mj_stateSize(self._model, STATE))
+        mujoco.mj_getState(self._model, self._data, state, STATE)
+        return state
+
+    def begin_hold(self, spring: Spring, periods: int) -> tuple[np.ndarray, np.ndarray]:
+        """See `RolledOut`."""
+        noise = self._following_noise(periods)
+        seen = np.concatenate([self._shown_noise[None], noise[:-1]])[:, 6:8]
+        weight = BASE_MASS + self._carried
+        servo = weight * SERVO * SERVO, weight * 2 * SERVO
+        self._springs.switch_on(spring.stiffness, spring.damping, servo)
+        forces = np.zeros((periods, self._model.nv))
+        times = self._data.time + TIME_STEP * np.arange(periods)
+        offset, speed, acceleration = self._sway(times)
+        forces[:, 0] = weight * acceleration + servo[0] * offset + servo[1] * speed
+        forces[:, 1:3] = (spring.target - seen) @ spring.stiffness
+        return forces, noise
+
+    def end_hold(self) -> None:
+        """See `RolledOut`."""
+        self._springs.switch_off()
+
+    def take(
+        self, periods: int, before: np.ndarray, state: np.ndarray, felt: np.ndarray, peak: float,
+        noise: np.ndarray,
+    ) -> TipObservation:  # fmt: skip
+        """See `RolledOut`."""
+        data = self._data
+        mujoco.mj_setState(self._model, data, state, STATE)
+        self._felt[:], self._constraint[1:4] = felt, -felt[:3]
+        base, x, y, z = before[1:5].tolist()
+        self._tip_place[:] = x, base + y, z
+        self._count, self._peak, self._fault = self._count + periods, peak, False
+        self._shown_noise = noise
+        wrench, position = wrench_of(self._felt, self._tip_place), self._position[1:4].copy()
+        return TipObservation(
+            self._count * self._period, wrench + noise[:6], position + noise[6:],
+            self._velocity[1:4].copy(),
+        )  # fmt: skip
+
+    # -------------------------------------------------------------------------------------------
 
     def truth(self) -> TipTruth:
         self._check_ready("has a truth")

@@ -27,6 +27,9 @@ HALF_HEIGHT = 0.03  # m, of walls
 REFERENCE_HEIGHT = 0.05  # m above the contact: the point that torques are felt about
 
 TIP, BLOCK, FEELER = "tip", "block", "feeler"
+# Springs and dampers that a rollout switches on: of the base's servo, and of the tip's impedance,
+# whose coupling of x and y acts on their sum.
+BASE_SERVO, SPRINGS = "base servo", ("spring x", "spring y", "spring x + y")
 
 
 def contact_solref(inverse_mass: float) -> tuple[float, float]:
@@ -48,7 +51,23 @@ def add_sliding_tip(spec: mujoco.MjSpec, base: mujoco.MjsBody) -> None:
         name="tip z", type=slide, axis=(0, 0, 1), stiffness=PLANE_STIFFNESS,
         damping=2 * math.sqrt(PLANE_STIFFNESS * TIP_MASS),
     )  # fmt: skip
+    both = spec.add_tendon(name=SPRINGS[2])
+    for name in ("tip x", "tip y"):
+        both.wrap_joint(name, 1.0)
+    of_joint, of_tendon = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_TENDON
+    for name, kind, on in zip(
+        SPRINGS, (of_joint, of_joint, of_tendon), ("tip x", "tip y", SPRINGS[2]), strict=True
+    ):
+        _add_spring(spec, name, kind, on)
     add_peg(tip)
+
+
+def _add_spring(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, on: str) -> None:
+    """An actuator that gives no force until its bias is told a stiffness and a damping."""
+    spec.add_actuator(
+        name=name, trntype=kind, target=on, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=[0.0] * 10, biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=[0.0] * 10,
+    )  # fmt: skip
 
 
 def add_peg(tip: mujoco.MjsBody, up: float = 1.0) -> None:
@@ -105,6 +124,7 @@ def maze_scene(
     base = world.add_body(name="base", mass=BASE_MASS, inertia=(1, 1, 1))
     base.explicitinertial = True
     base.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 1, 0))
+    _add_spring(spec, BASE_SERVO, mujoco.mjtTrn.mjTRN_JOINT, "base")
     add_tip(spec, base)
     block = world.add_body(name=BLOCK, pos=(*layout.obstacle.position, 0))
     block.add_joint(

@@ -85,7 +85,7 @@ class TipWorld(World):
 
     def _start(self) -> TipObservation:
         """The first observation of an episode, whose tip is in its place."""
-        self._noise = np.zeros(9)
+        self._noise = self._shown_noise = np.zeros(9)
         self._drawn = BLOCK_OF_NOISE  # none are left
         if self._noise_scale:
             self._noise = self._random.standard_normal(9)
@@ -110,17 +110,7 @@ class TipWorld(World):
 
     def _wrench(self) -> np.ndarray:
         """(6,) N, N m, as `TipObservation` has it, without noise."""
-        wrench = np.zeros(6)
-        if self._data.ncon:
-            # The sensor tells what the tip does, and the point that all contacts act at together.
-            fx, fy, fz, tx, ty, tz, *point = self._felt.tolist()
-            x, y, z = (a - b for a, b in zip(point, self._tip_place.tolist(), strict=True))
-            z -= REFERENCE_HEIGHT
-            wrench[:] = (
-                -fx, -fy, -fz,
-                z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz,
-            )  # fmt: skip
-        return wrench
+        return wrench_of(self._felt, self._tip_place) if self._data.ncon else np.zeros(6)
 
     # -------------------------------------------------------------------------------------------
 
@@ -153,7 +143,7 @@ class TipWorld(World):
     def _observe(self) -> TipObservation:
         wrench, (position, velocity) = self._wrench(), self._motion()
         if self._noise_scale:
-            noise = self._next_noise()
+            noise = self._shown_noise = self._next_noise()
             wrench += noise[:6]
             position += noise[6:]
         return TipObservation(self._count * self._period, wrench, position, velocity)
@@ -178,6 +168,20 @@ class TipWorld(World):
         self._drawn += 1
         return self._block[self._drawn - 1]
 
+    def _following_noise(self, count: int) -> np.ndarray:
+        """(count, 9) that the next observations will have."""
+        if not self._noise_scale:
+            return np.zeros((count, 9))
+        found = np.empty((count, 9))
+        done = 0
+        while done < count:
+            found[done] = self._next_noise()
+            some = min(count - done - 1, BLOCK_OF_NOISE - self._drawn)
+            found[done + 1 : done + 1 + some] = self._block[self._drawn : self._drawn + some]
+            self._drawn += some
+            done += 1 + some
+        return found
+
     def render(self, width: int = 640, height: int = 480) -> np.ndarray:
         self._check_ready("is drawn")
         camera = self._camera
@@ -188,6 +192,20 @@ class TipWorld(World):
         view = mujoco.MjvCamera()
         view.lookat, view.distance, view.azimuth, view.elevation = self._view
         return camera.picture(self._data, view)
+
+
+def wrench_of(felt: np.ndarray, tip_place: np.ndarray) -> np.ndarray:
+    """(6,) N, N m on the tip, about the point `REFERENCE_HEIGHT` above it, `tip_place` (3,) m.
+
+    The sensor `felt` (9,) tells the force, N, and the torque, N m, that the tip gives, and the
+    place, m, that all its contacts act at together.
+    """
+    fx, fy, fz, tx, ty, tz, *point = felt.tolist()
+    x, y, z = (a - b for a, b in zip(point, tip_place.tolist(), strict=True))
+    z -= REFERENCE_HEIGHT
+    return np.array(
+        (-fx, -fy, -fz, z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz)
+    )
 
 
 def not_negative(what: str, value: float) -> float:

@@ -8,6 +8,7 @@ from palpate.experiments.experiment import (
     Experiment,
     decision_figures,
     mean_of,
+    on_every_core,
     ratio,
     share_of,
     suffix,
@@ -98,3 +99,12 @@ def test_figures_say_how_far_to_trust_them():
         "decision_ms_median.mppi_10_ms",
         "decision_ms_p99.mppi_10_ms",
     ]
+
+
+def test_work_on_every_core_is_logged_and_its_errors_are_raised(tmp_path):
+    calls = {tmp_path / f"{n}.log": ("said", n) for n in range(3)}
+    on_every_core(print, calls, "saying")
+    assert [log.read_text() for log in calls] == [f"said {n}\n" for n in range(3)]
+    with pytest.raises(ValueError, match="invalid literal"):
+        on_every_core(int, {tmp_path / "broken.log": ("broken",)}, "breaking")
+    on_every_core(print, {}, "nothing")

@@ -13,7 +13,9 @@ from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE
 
 AROUND = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 CIRCLE = 0.013 * np.stack([np.cos(AROUND), np.sin(AROUND)], -1)
-SOFT, SOFTEST, STIFFEST = -0.83, -1.0, 1.0
+SOFT, SOFTEST = -0.83, -1.0
+LOW, HIGH = STIFFNESS_RANGE
+PUSHING = 2 * (18.0 / DISPLACEMENT_LIMIT - LOW) / (HIGH - LOW) - 1  # 18 N, as far as it may go
 
 
 def decision(truth):
@@ -23,8 +25,7 @@ def decision(truth):
     abreast, stopped = abs(place[1] - y), truth.obstacle > layout.obstacle.travel - 2e-3
     if abreast < 8e-3 and -0.085 < place[0] < face and not stopped:
         if face - TIP_RADIUS - place[0] < 4e-3:
-            push = 18.0 / STIFFNESS_RANGE[1] / DISPLACEMENT_LIMIT
-            return np.array([push, 0, STIFFEST, SOFTEST], np.float32)
+            return np.array([1.0, 0, PUSHING, SOFTEST], np.float32)
         return np.array([0.35, 0, SOFT, SOFTEST], np.float32)
     if abreast < 0.035 and 0.07 < place[0] < face:
         way = np.array([-0.15, 1.0])  # past the block, where it has come to its end
@@ -40,7 +41,7 @@ def lived(layout, stiffness=None, most=250, make=blind_maze):
     (world,) = environment.lockstep.worlds
     for _ in range(most):
         action = decision(world.truth())
-        if stiffness and action[2] == STIFFEST:
+        if stiffness and action[2] == np.float32(PUSHING):
             action[0] = 1.0  # as far as it may
         *_, terminated, _, info = environment.step(action)
         if terminated:
@@ -61,5 +62,5 @@ def test_who_sees_everything_reaches_it_with_an_arm_too(layout):
 def test_one_stiffness_for_all_is_stuck_or_breaks_the_limit():
     end, pushed = lived("home", 300.0, most=120)
     assert end == ""
-    assert pushed < 1e-3
+    assert pushed < 5e-3  # of 15 cm, and that by the base's rocking
     assert lived("home", 1000.0)[0] == "violation"

@@ -17,7 +17,13 @@ from palpate.worlds.maze.maze import (
     SWAY,
     BlindMaze,
 )
-from palpate.worlds.maze.scene import CONTACT_STIFFNESS, REFERENCE_HEIGHT, TIP_MASS
+from palpate.worlds.maze.scene import (
+    CONTACT_STIFFNESS,
+    REFERENCE_HEIGHT,
+    SHAFT_HEIGHT,
+    SWAY_AXIS,
+    TIP_MASS,
+)
 from palpate.worlds.maze.tip import (
     FORCE_NOISE,
     POSITION_CORRELATION,
@@ -59,6 +65,15 @@ def test_a_wall_gives_way_like_a_spring(force, direction):
     np.testing.assert_allclose(observation.wrench[3:5], level, atol=1e-4)
 
 
+def test_the_block_is_felt_at_the_shaft():
+    """The same force has another torque than a wall's, which tells the two from each other."""
+    world = still()
+    world.reset(0, start=AT_BLOCK, obstacle_friction=20.0)
+    observation = held(world, np.array([8.0, 0, 0]), 3000, damping=60.0)
+    np.testing.assert_allclose(observation.wrench[:3], [-8.0, 0, 0], atol=1e-3)
+    assert observation.wrench[4] == pytest.approx(8.0 * (REFERENCE_HEIGHT - SHAFT_HEIGHT), rel=1e-3)
+
+
 def test_friction_is_felt_as_a_torque_about_the_vertical():
     world = still()
     world.reset(0, start=(-0.1, -0.239), contact_friction=0.3)
@@ -90,7 +105,8 @@ def test_the_base_sways_and_what_rides_on_it_is_seen_at_rest():
         times.append(truth.time)
         places.append(truth.sway)
         # Nothing pulls it: it flies on in the world, while the base moves below it.
-        assert truth.position[1] == pytest.approx(observation.position[1] + truth.sway)
+        offset = truth.position - observation.position
+        np.testing.assert_allclose(offset[:2], np.multiply(truth.sway, SWAY_AXIS), atol=1e-12)
         if truth.force.any():
             break
     assert len(times) > 300

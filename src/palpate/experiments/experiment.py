@@ -11,8 +11,11 @@
 A stage is a run in a folder of its own: cut off, it resumes there; finished, it is only read.
 """
 
+import concurrent.futures
 import contextlib
 import dataclasses
+import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,6 +25,7 @@ import numpy as np
 
 from palpate.networks import Controller
 from palpate.runs import Figure, Result, Run
+from palpate.runs.progress import progress
 from palpate.runs.result import two_standard_errors
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json
@@ -150,6 +154,51 @@ class Experiment:
         seeds = list(dict.fromkeys(self.seeds if seeds is None else seeds))
         settings = {"quick": self.quick, **settings}
         return Result(self.name, figures, settings, seeds, split, self.seconds)
+
+
+# --- stages beside each other -----------------------------------------------------------------
+
+
+def on_every_core(
+    work: Callable[..., Any], calls: Mapping[Path, tuple[Any, ...]], doing: str
+) -> None:
+    """Call `work` with each of the arguments, in as many processes as there are cores.
+
+    Each computes on one core, and writes what it prints into the file that its call is named by.
+    `work` is a module's own function whose stages are runs: cut off, each goes on from where it
+    was. What it raises is raised here, when the others under way are done.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(
+        max(1, min(cores or 1, len(calls))), spawn, _take_one_core
+    ) as pool:
+        futures = [pool.submit(_into, log, work, *arguments) for log, arguments in calls.items()]
+        try:
+            done = concurrent.futures.as_completed(futures)
+            for _ in progress(range(len(futures)), doing):
+                next(done).result()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _take_one_core() -> None:
+    """Before JAX starts: two processes whose threads compete are slower than one."""
+    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
+
+
+def _into(log: Path, work: Callable[..., Any], *arguments: Any) -> None:
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        log.open("a", encoding="utf-8") as file,
+        contextlib.redirect_stdout(file),
+        contextlib.redirect_stderr(file),
+    ):
+        work(*arguments)
 
 
 # --- figures ----------------------------------------------------------------------------------

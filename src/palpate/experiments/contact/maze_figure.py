@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from palpate.report.picture import canvas_of, legend_of, save_picture
 from palpate.runs.run import read_metrics
@@ -11,15 +12,15 @@ from palpate.runs.run import read_metrics
 BINS = 30  # of a training, over each of which episodes are counted
 
 
-def draw(path: Path, trained: Mapping[str, Sequence[Path]]) -> None:
-    """A PNG of the trainings in these folders: shares of goals, and violations so far.
+def draw(path: Path, trained: Mapping[str, Sequence[ArrayLike]]) -> None:
+    """A PNG of trainings, of each its `curve_of`: shares of goals, and violations so far.
 
     Lines are means over a method's seeds, bands reach from the least to the most.
     """
     canvas = canvas_of(10, 4)
     goals, costs = canvas.subplots(1, 2)
-    for number, (name, folders) in enumerate(trained.items()):
-        curves = [curves_of(folder) for folder in folders]
+    for number, (name, told) in enumerate(trained.items()):
+        curves = [np.asarray(curve, float) for curve in told]
         steps, colour = curves[0][0], f"C{number % 10}"
         style = "-" if number < 10 else "--"
         for axis, of in ((goals, 1), (costs, 2)):
@@ -37,7 +38,7 @@ def draw(path: Path, trained: Mapping[str, Sequence[Path]]) -> None:
     save_picture(path, canvas)
 
 
-def curves_of(folder: Path) -> np.ndarray:
+def curve_of(folder: Path) -> np.ndarray:
     """(3, bins): decisions, the share of the bin's episodes that reached the goal, violations."""
     lines = read_metrics(folder)
     rows = []

@@ -3,17 +3,20 @@
 Every method of `palpate train maze` but the reflex is trained with three seeds, in the same
 environments, by the same number of decisions and updates, and its policy is tried in new episodes
 by `palpate evaluate maze`: where it was trained, in mazes that it has never felt, and with a
-noisier sensor. Policies that were trained before, in folders `maze-METHOD-SEED` below `out`, are
-taken as they are.
+noisier sensor. Trainings stand beside each other, one on each core. What is found of one is in a
+small folder `METHOD-SEED-found` below `out`, and is taken as it is; so are policies that were
+trained before, in folders `maze-METHOD-SEED`.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from palpate.commands import evaluate, train
-from palpate.experiments.contact.maze_figure import draw
-from palpate.experiments.experiment import Experiment, share_of
+from palpate.commands import evaluate, folders, train
+from palpate.experiments.contact.maze_figure import curve_of, draw
+from palpate.experiments.experiment import Experiment, on_every_core, share_of
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
 from palpate.families.contact.methods import METHODS
 from palpate.runs import Figure, Result
@@ -24,6 +27,7 @@ from palpate.worlds.maze.layout import UNSEEN
 NAME = "maze-safe"
 FIRST, TRIED = 1, 100_000  # seeds of the first training and, beyond it, of its episodes
 OWN, BARE, PLAIN = "srl-vic", "no-recovery", "srl-vic-without-noise"
+POSITION = "position-critic"
 REFLEX = "bresa"  # which `maze-reflex` holds against decisions
 CONSTANTS = tuple(name for name, make in METHODS.items() if make().stiffness is not None)
 MORE_VIOLATIONS = 1.5  # times ours: a rival with more is none
@@ -52,62 +56,83 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     Raises `PalpateError` when `out` holds other runs.
     """
     experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
-    names = [OWN, PLAIN, *(name for name in METHODS if name not in (OWN, REFLEX))]
-    experiment.announce({a: len(names) * size.seeds * time for a, time in MINUTES.items()})
-    first = experiment.uses(FIRST, size.seeds)
-    seeds = range(first, first + size.seeds)
-    trained = {
-        name: [policy_of(experiment, name, each, size.steps) for each in seeds] for name in names
-    }
-    home = {name: tried(experiment, folders, "home", size) for name, folders in trained.items()}
-    mazes = UNSEEN[: size.mazes]
-    away = {
-        name: tried(experiment, trained[name], "unseen", size, mazes=mazes)
-        for name in (OWN, "position-critic")
-    }
-    noisy = {
-        name: tried(experiment, trained[name], "noisy", size, noise=NOISY) for name in (OWN, PLAIN)
-    }
-    costs = {name: [figures_in(folder) for folder in folders] for name, folders in trained.items()}
-    draw(out / "learning-curves.png", trained)
-    return experiment.result(
-        figures(size.episodes, costs, home, away, noisy),
-        {"steps": size.steps, "episodes": size.episodes, "unseen": mazes, "noisy": NOISY},
-        {"trained": "by each seed", "tried": f"in episodes of seeds from {TRIED} on, used once"},
+    names = [OWN, BARE, *(name for name in METHODS if name not in (OWN, BARE, REFLEX)), PLAIN]
+    cores = 1 if quick else 2
+    experiment.announce(
+        {of: len(names) * size.seeds * each // cores for of, each in MINUTES.items()}
     )
+    first = experiment.uses(FIRST, size.seeds)
+    grid = [(name, each) for each in range(first, first + size.seeds) for name in names]
+    calls = {
+        out / f"{name}-{each}.log": (out, quick, seed, name, each)
+        for name, each in grid
+        if not (out / stage_of(name, each) / RESULT).exists()
+    }
+    on_every_core(find, calls, "trainings")
+    found = {name: [] for name in names}
+    for name, each in grid:
+        found[name].append(of_training(experiment, name, each))
+    draw(out / "learning-curves.png", {n: [one["curve"] for one in r] for n, r in found.items()})
+    return experiment.result(
+        figures(size.episodes, found),
+        {"steps": size.steps, "episodes": size.episodes, "unseen": UNSEEN[: size.mazes],
+         "noisy": NOISY, "training": found[OWN][0]["training"]},
+        {"trained": "by each seed", "tried": f"in episodes of seeds from {TRIED} on, used once"},
+    )  # fmt: skip
 
 
-def policy_of(experiment: Experiment, name: str, seed: int, steps: int) -> Path:
-    """The folder of a policy, trained unless it was."""
-    method, noise = (OWN, 0.0) if name == PLAIN else (name, 1.0)
-    folder = experiment.out / f"maze-{name}-{seed}"
-    train.run(TrainMaze(method=method, noise=noise, steps=steps, seed=seed, out=folder))  # type: ignore[arg-type]
-    experiment.seconds += read_result(folder / RESULT).wall_time_s
-    return folder
+def find(out: Path, quick: bool, seed: int, name: str, training_seed: int) -> None:
+    """One training and all its trials, in a process of its own."""
+    of_training(Experiment(NAME, out, quick, seed), name, training_seed)
 
 
-def tried(
-    experiment: Experiment,
-    policies: Sequence[Path],
-    where: str,
-    size: Size,
-    mazes: tuple[str, ...] = (),
-    noise: float = 1.0,
-) -> list[Values]:
-    """What `evaluate` finds of each policy."""
-    found = []
-    for policy in policies:
-        folder = policy.with_name(f"{policy.name}-{where}")
-        seed = TRIED + experiment.seed
-        evaluate.run(
-            EvaluateMaze(
-                policy=policy, episodes=size.episodes, mazes=mazes, noise=noise, seed=seed,
-                out=folder,
-            )
-        )  # fmt: skip
-        experiment.seconds += read_result(folder / RESULT).wall_time_s
-        found.append(figures_in(folder))
-    return found
+def stage_of(name: str, seed: int) -> str:
+    """The folder of what is found of one training: small, and all that the result is made of."""
+    return f"{name}-{seed}-found"
+
+
+def of_training(experiment: Experiment, name: str, seed: int) -> dict[str, Any]:
+    """What a training cost, and what its policy's episodes gave where it is tried.
+
+    The policy is in the folder `maze-NAME-SEED`, trained unless it was.
+    """
+    size = QUICK if experiment.quick else FULL
+    options = TrainMaze(
+        method=OWN if name == PLAIN else name, noise=0.0 if name == PLAIN else 1.0,  # type: ignore[arg-type]
+        steps=size.steps, seed=seed, out=experiment.out / f"maze-{name}-{seed}",
+    )  # fmt: skip
+    about = {
+        "options": folders.configuration_of(options, "train maze"),
+        "training": dataclasses.asdict(options.training()),
+        "constants": options.constants(),
+        "size": dataclasses.asdict(size),
+    }
+
+    def work() -> dict[str, Any]:
+        folder = train.run(options)
+        places: dict[str, dict[str, Any]] = {"home": {}}
+        if name in (OWN, POSITION):
+            places["away"] = {"mazes": UNSEEN[: size.mazes]}
+        if name in (OWN, PLAIN):
+            places["noisy"] = {"noise": NOISY}
+        found: dict[str, Any] = {
+            where: tried(folder, where, size.episodes, TRIED + experiment.seed, **asked)
+            for where, asked in places.items()
+        }
+        return found | {
+            "costs": figures_in(folder),
+            "curve": [[each if each == each else None for each in row] for row in curve_of(folder)],
+            "training": about["training"],
+        }
+
+    return experiment.found(stage_of(name, seed), about, work)
+
+
+def tried(policy: Path, where: str, episodes: int, seed: int, **asked: Any) -> Values:
+    """What `evaluate` finds of a policy."""
+    folder = policy.with_name(f"{policy.name}-{where}")
+    options = EvaluateMaze(policy=policy, episodes=episodes, seed=seed, out=folder, **asked)
+    return figures_in(evaluate.run(options))
 
 
 def figures_in(folder: Path) -> Values:
@@ -127,14 +152,14 @@ def total(runs: Sequence[Values], name: str) -> float:
     return sum(run[name] or 0.0 for run in runs)
 
 
-def figures(
-    episodes: int,
-    costs: Mapping[str, Sequence[Values]],
-    home: Mapping[str, Sequence[Values]],
-    away: Mapping[str, Sequence[Values]],
-    noisy: Mapping[str, Sequence[Values]],
-) -> list[Figure]:
-    """What counts, pooled over the seeds, and then every method's own."""
+def figures(episodes: int, found: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Figure]:
+    """What counts, pooled over the seeds, and then every method's own, by `of_training`."""
+
+    def all_of(where: str, *names: str) -> dict[str, list[Values]]:
+        return {name: [one[where] for one in found[name]] for name in names or found}
+
+    costs, home = all_of("costs"), all_of("home")
+    away, noisy = all_of("away", OWN, POSITION), all_of("noisy", OWN, PLAIN)
 
     def share(name: str, runs: Sequence[Values], of: str, **held: object) -> Figure:
         count = episodes * len(runs)
@@ -147,7 +172,7 @@ def figures(
     broken = {name: mean(runs, "violation_rate") or 0.0 for name, runs in home.items()}
     rivals = {n: success[n] for n in CONSTANTS if broken[n] <= MORE_VIOLATIONS * broken[OWN]}
     best = max(rivals, key=lambda name: rivals[name], default=None)
-    found = [
+    listed = [
         share("success_rate", home[OWN], "success_rate", bar=0.9,
               rival=f"{BARE} {success[BARE]:.3g}"),
         share("violation_rate", home[OWN], "violation_rate", better="lower"),
@@ -165,20 +190,20 @@ def figures(
         Figure("risk_gain_over_force", mean(home[OWN], "risk_gain_over_force"), "", 0.1,
                better="higher"),
         share("unseen_violation_rate", away[OWN], "violation_rate", bar=0.02, better="lower"),
-        share("unseen_violation_rate_with_position", away["position-critic"], "violation_rate",
+        share("unseen_violation_rate_with_position", away[POSITION], "violation_rate",
               better="lower"),
         Figure("unseen_progress", mean(away[OWN], "progress"), "", 0.3, better="higher",
                rival=f"held still {mean(away[OWN], 'progress.held_still') or 0.0:.3g}"),
         share("unseen_success_rate", away[OWN], "success_rate"),
     ]  # fmt: skip
     for name, runs in (("noise", noisy[OWN]), ("no_noise", noisy[PLAIN])):
-        found += [
+        listed += [
             share(f"{name}.success_rate", runs, "success_rate"),
             share(f"{name}.violation_rate", runs, "violation_rate", better="lower"),
         ]
     for name, runs in home.items():
         own = name.replace("-", "_")
-        found += [
+        listed += [
             share(f"detail.{own}.success_rate", runs, "success_rate"),
             share(f"detail.{own}.violation_rate", runs, "violation_rate", better="lower"),
             Figure(f"detail.{own}.training_violations", violations[name], ""),
@@ -186,4 +211,4 @@ def figures(
                    total(costs[name], "pretraining.violations"), ""),
             Figure(f"detail.{own}.progress", mean(runs, "progress"), "", better="higher"),
         ]  # fmt: skip
-    return found
+    return listed

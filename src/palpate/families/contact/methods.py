@@ -34,7 +34,7 @@ from palpate.worlds.maze import scene, tip
 
 WRENCH = (0, 1, 2, 3, 4, 5)  # of the features: SRL-VIC's critic and recovery see no position
 DISCOUNT, TARGET_ENTROPY = 0.98, -1.0  # of the task's agent
-WIDTH = 128  # of the two hidden layers of every network
+WIDTH, BATCH = 128, 128  # of the two hidden layers of every network; transitions of an update
 # A tenth a decision: one that is soft at once averts nearly every violation, and what later ones
 # risk would count against all actions alike. So a risk far below a percent can be told from more.
 RISK_DISCOUNT, RISK_THRESHOLD = 0.1, 0.003
@@ -44,6 +44,7 @@ COST_LIMIT = 0.02  # Lagrangian: violations an episode
 PRETRAINING_STEPS, PRETRAINING_UPDATES = 60_000, 12_000
 TRAINING_HORIZON = 150  # decisions: whoever is stuck begins anew sooner, somewhere else
 HELD = (3, 15)  # decisions for which a scripted collision keeps its direction
+AHEAD, ASTRAY = 0.5, 0.3  # share of them that go along x, as the block does; how far off, rad
 
 
 @dataclass(frozen=True)
@@ -171,12 +172,15 @@ def training_of(steps: int, method: Method) -> OffPolicyTraining:
     """So many decisions, and an update every second one, whatever the method."""
     updates = min(PRETRAINING_UPDATES, steps // 4) if method.guarded else 0
     return OffPolicyTraining(
-        steps=steps, ratio=0.5, warm_up=min(2_000, steps // 4), pretraining=updates
+        steps=steps, ratio=0.5, batch=BATCH, warm_up=min(2_000, steps // 4), pretraining=updates
     )
 
 
 class ScriptedCollisions:
-    """Pushes in random directions, of any length and stiffness, each held for a while.
+    """Pushes of any length and stiffness, each held for a while, in any direction or ahead.
+
+    Of pushes in any direction hardly one meets the block, and a critic that has not felt how it
+    gives way takes it for a wall, and never lets it be pushed.
 
     A `palpate.learning.off_policy.rollouts.Script`: from observations (worlds, features) and
     whether each episode has just begun, `actions` numbers for each in [-1, 1], of which the first
@@ -194,6 +198,8 @@ class ScriptedCollisions:
         if len(self._left) != count:
             self._action, self._left = np.zeros((count, 2 + others)), np.zeros(count, int)
         angle, length = random.uniform(0, 2 * np.pi, count), random.uniform(0.3, 1.0, count)
+        ahead = random.uniform(size=count) < AHEAD
+        angle[ahead] = random.normal(0.0, ASTRAY, count)[ahead]
         stiffness = random.uniform(-1, 1, (count, others))
         drawn = np.column_stack([length * np.cos(angle), length * np.sin(angle), stiffness])
         held = random.integers(*HELD, count)

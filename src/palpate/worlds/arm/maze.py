@@ -15,6 +15,7 @@ from palpate.worlds.maze.maze import BlindMaze
 from palpate.worlds.maze.scene import (
     REFERENCE_HEIGHT,
     SLIP_DAMPING,
+    SWAY_AXIS,
     TIME_STEP,
     TIP,
     TIP_MASS,
@@ -68,7 +69,10 @@ class ArmMaze(BlindMaze):
     def _seat(self, x: float, y: float) -> None:
         model, data = self._model, self._data
         self._control = control = OperationalSpace(model, data, TIP, POSTURE)
-        if control.reach(np.array([x, y + data.qpos[0], 0.0])) > 1e-6:
+        if (
+            control.reach(np.array([*np.add((x, y), np.multiply(data.qpos[0], SWAY_AXIS)), 0.0]))
+            > 1e-6
+        ):
             raise PalpateError(f"the arm does not reach ({x:.3f}, {y:.3f}) m")
         self._wrist = wrist(model, data)
         self._hand_axes = data.site_xmat[model.site(HAND).id].reshape(3, 3)
@@ -100,7 +104,7 @@ class ArmMaze(BlindMaze):
 
     def _motion(self) -> tuple[np.ndarray, np.ndarray]:
         position = self._control.place.copy()
-        position[1] -= self._position[0]
+        position[:2] -= np.multiply(self._position[0], SWAY_AXIS)
         return position, self._control.motion[:3].copy()
 
     def _force(self) -> np.ndarray:

@@ -44,6 +44,7 @@ START_X, START_HALF_SIZES = -0.245, (0.025, 0.02)  # m: the place where the tip 
 GOAL_X, GOAL_RADIUS = 0.25, 0.03  # m
 CELL = 0.005  # m, of the grid that distances are computed on
 SCATTER = 0.015  # m, standard deviation of places beside the way to the goal
+BEFORE_BLOCK = (0.015, 0.003)  # m: how far before the block, and off the channel's middle, at most
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,13 @@ class Layout:
                 and math.dist(drawn, self.goal) > 2 * self.goal_radius
             ):
                 return drawn
+
+    def place_before_block(self, random: np.random.Generator, pushed: float) -> np.ndarray:
+        """A place (2,) m in the channel, from which the block is reached at once; `pushed` in m."""
+        x, y = self.obstacle.position
+        before, aside = random.uniform((0, -1), 1) * BEFORE_BLOCK
+        touches = x + pushed - self.obstacle.half_sizes[0] - TIP_RADIUS
+        return np.array([touches - before, y + aside])
 
     def clearance(self, position: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, " *batch"]:
         """m from (x, y) to the nearest wall's surface, negative within one; no obstacle."""

@@ -16,6 +16,7 @@ from palpate.worlds.maze.scene import (
     BASE_MASS,
     BLOCK,
     FEELER,
+    SWAY_AXIS,
     TIME_STEP,
     TIP,
     TIP_MASS,
@@ -34,8 +35,9 @@ STIFFNESS_RANGE = (50.0, 1000.0)  # N/m
 OBSTACLE_FRICTION = (10.0, 14.0)  # N, dry: what it takes to move the block
 OBSTACLE_MASS = (0.5, 1.5)  # kg
 CONTACT_FRICTION = (0.2, 0.4)  # coefficient, of the tip on walls and block
+BEFORE_BLOCK = 0.4  # share of scattered episodes that begin there: hardly one would by chance
 
-SWAY = 0.04  # m, amplitude of the base's sideways motion: a mobile base on soft tyres
+SWAY = 0.043  # m, amplitude of the base's motion along `SWAY_AXIS`: 4 cm in y, 1.5 cm in x
 SWAY_FREQUENCY = (0.9, 1.1)  # Hz
 SERVO = 100.0  # rad/s, of the base that follows the sway, critically damped
 
@@ -48,7 +50,7 @@ class TipTruth(NamedTuple):
     velocity: np.ndarray  # (3,) m/s
     force: np.ndarray  # (3,) N, net contact force on the tip, at the end of the control period
     peak_force: float  # N, the greatest horizontal one in the last control period
-    sway: float  # m: where the base is in y
+    sway: float  # m: where the base is on `SWAY_AXIS`
     obstacle: float  # m by which the block has been pushed
     fault: bool  # whether the last command was not finite, and so no force was given
     layout: Layout
@@ -60,12 +62,12 @@ class TipTruth(NamedTuple):
 class BlindMaze(TipWorld):
     """A tip of 1 kg in a maze, driven by a force (3,) N that acts between it and the robot's base.
 
-    The base sways sideways like a mobile one on soft tyres, with an amplitude of `sway` m, a
+    The base sways askew like a mobile one on soft tyres, with an amplitude of `sway` m, a
     frequency about 1 Hz and a random phase; position and velocity are seen relative to it. The tip
     keeps its height by itself and gravity is compensated. `layouts` names mazes, one of which is
-    drawn at each reset; `scattered` lets episodes begin all along the way to the goal, half of them
-    with the block pushed already, so that all can be found out; `control_period` is a whole number
-    of milliseconds, in s. All else is as `TipWorld` has it.
+    drawn at each reset; `scattered` lets episodes begin all along the way to the goal, many of them
+    right before the block and half with the block pushed already, so that all can be found out;
+    `control_period` is a whole number of milliseconds, in s. All else is as `TipWorld` has it.
 
     Raises `PalpateError` for an unknown maze, and as `TipWorld`.
     """
@@ -116,7 +118,8 @@ class BlindMaze(TipWorld):
         pushed = 0.0
         if start is None and self._scattered:
             pushed = drawn.obstacle.travel * max(0.0, random.uniform(-1, 1))
-            place = drawn.drawn_place(random, pushed)
+            before = random.uniform() < BEFORE_BLOCK
+            place = (drawn.place_before_block if before else drawn.drawn_place)(random, pushed)
         elif start is None:
             place = drawn.start + place * drawn.start_half_sizes
         else:
@@ -157,7 +160,7 @@ class BlindMaze(TipWorld):
             self._springs = Springs(model)
         offset, data.qvel[0], _ = self._sway(0.0)
         data.qpos[0], data.qpos[-1] = offset, pushed
-        self._seat(place[0], place[1] - offset)
+        self._seat(*(place - np.multiply(offset, SWAY_AXIS)).tolist())
         mujoco.mj_forward(model, data)
 
     # --- what another carrier of the tip does in a way of its own -----------------------------
@@ -260,7 +263,7 @@ class BlindMaze(TipWorld):
         mujoco.mj_setState(self._model, data, state, STATE)
         self._felt[:], self._constraint[1:4] = felt, -felt[:3]
         base, x, y, z = before[1:5].tolist()
-        self._tip_place[:] = x, base + y, z
+        self._tip_place[:] = x + base * SWAY_AXIS[0], y + base * SWAY_AXIS[1], z
         self._count, self._peak, self._fault = self._count + periods, peak, False
         self._shown_noise = noise
         wrench, position = wrench_of(self._felt, self._tip_place), self._position[1:4].copy()
@@ -275,8 +278,8 @@ class BlindMaze(TipWorld):
         self._check_ready("has a truth")
         sway, obstacle = self._position.item(0), self._position.item(-1)
         position, velocity = self._motion()
-        position[1] += sway
-        velocity[1] += self._velocity[0]
+        position[:2] += np.multiply(sway, SWAY_AXIS)
+        velocity[:2] += np.multiply(self._velocity[0], SWAY_AXIS)
         return TipTruth(
             self._count * self.control_period, position, velocity, self._force(),
             self._peak, sway, obstacle, self._fault,

@@ -9,6 +9,8 @@ from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
 
 TIME_STEP = 1e-3  # s
 TIP_MASS = 1.0  # kg
+# Where the base sways: 20 degrees off y, so that it drives the tip across the channel and along it.
+SWAY_AXIS = (math.sin(math.radians(20)), math.cos(math.radians(20)))
 BASE_MASS = 1000.0  # kg: what the tip's force does to it is micrometres
 
 # The tip's rubber on any wall: a spring and a damper, a fifth of the critical one. A critical one
@@ -24,9 +26,11 @@ SLIP_DAMPING = 5.0  # N s/m
 FRICTION_RATIO = 1000  # by which friction is held harder than the normal direction
 PLANE_STIFFNESS = 1e4  # N/m, holds the tip at its height
 HALF_HEIGHT = 0.03  # m, of walls
+# The block stands higher than walls and meets the peg at its shaft: its torque tells it from one.
+SHAFT_HEIGHT, BLOCK_HALF_HEIGHT = 0.04, 0.02  # m, above the tip: where it meets it; of the block
 REFERENCE_HEIGHT = 0.05  # m above the contact: the point that torques are felt about
 
-TIP, BLOCK, FEELER = "tip", "block", "feeler"
+TIP, SHAFT, BLOCK, FEELER = "tip", "shaft", "block", "feeler"
 # Springs and dampers that a rollout switches on: of the base's servo, and of the tip's impedance,
 # whose coupling of x and y acts on their sum.
 BASE_SERVO, SPRINGS = "base servo", ("spring x", "spring y", "spring x + y")
@@ -73,13 +77,15 @@ def _add_spring(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, on: str) ->
 def add_peg(tip: mujoco.MjsBody, up: float = 1.0) -> None:
     """What touches: a vertical capsule whose lower end, a ball at the body's origin, is the tip.
 
-    A whole capsule would touch a wall at one or two points, and be twice as stiff at two. `up` is
-    1 or -1: where the body's z axis points.
+    Walls meet that, and the block meets a ball further up, on the shaft. A whole capsule would
+    touch a wall at one or two points, and be twice as stiff at two. `up` is 1 or -1: where the
+    body's z axis points.
     """
-    tip.add_geom(
-        name=TIP, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(TIP_RADIUS, 0, 0),
-        contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
-    )  # fmt: skip
+    for name, height in ((TIP, 0.0), (SHAFT, up * SHAFT_HEIGHT)):
+        tip.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(TIP_RADIUS, 0, 0),
+            pos=(0, 0, height), contype=0, conaffinity=0, rgba=(0.2, 0.3, 0.7, 1),
+        )  # fmt: skip
     tip.add_geom(
         type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(TIP_RADIUS, 0, 0),
         fromto=(0, 0, 0, 0, 0, up * 2 * REFERENCE_HEIGHT),
@@ -90,7 +96,7 @@ def add_peg(tip: mujoco.MjsBody, up: float = 1.0) -> None:
 def maze_scene(
     layout: Layout, add_tip: Callable[[mujoco.MjSpec, mujoco.MjsBody], None] = add_sliding_tip
 ) -> mujoco.MjSpec:
-    """The scene, uncompiled: joints of the base (y), of what carries the tip, of the block (x).
+    """The scene, uncompiled: joints of the base, of what carries the tip, of the block (x).
 
     `add_tip` puts what carries the tip on the base: a body and a geom called `TIP` (`add_peg`).
     """
@@ -123,7 +129,7 @@ def maze_scene(
         )  # fmt: skip
     base = world.add_body(name="base", mass=BASE_MASS, inertia=(1, 1, 1))
     base.explicitinertial = True
-    base.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 1, 0))
+    base.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(*SWAY_AXIS, 0))
     _add_spring(spec, BASE_SERVO, mujoco.mjtTrn.mjTRN_JOINT, "base")
     add_tip(spec, base)
     block = world.add_body(name=BLOCK, pos=(*layout.obstacle.position, 0))
@@ -135,19 +141,20 @@ def maze_scene(
         frictionloss=1.0,
     )  # fmt: skip
     block.add_geom(
-        name=BLOCK, type=box, size=(*layout.obstacle.half_sizes, HALF_HEIGHT), mass=1.0,
+        name=BLOCK, type=box, size=(*layout.obstacle.half_sizes, BLOCK_HALF_HEIGHT), mass=1.0,
+        pos=(0, 0, SHAFT_HEIGHT),
         contype=0, conaffinity=0, rgba=(0.85, 0.5, 0.2, 1),
     )  # fmt: skip
     for touched in (BLOCK, *(f"wall {number}" for number in range(len(layout.walls)))):
         spec.add_pair(
-            name=touched, geomname1=TIP, geomname2=touched, condim=3,
+            name=touched, geomname1=SHAFT if touched == BLOCK else TIP, geomname2=touched, condim=3,
             solref=contact_solref(1 / TIP_MASS), solreffriction=(-SLIP_DAMPING, -SLIP_DAMPING),
             solimp=(CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 0.01, 0.5, 2),
         )  # fmt: skip
     data = mujoco.mjtConDataField
     spec.add_sensor(
         name=FEELER, type=mujoco.mjtSensor.mjSENS_CONTACT,
-        objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=TIP,
+        objtype=mujoco.mjtObj.mjOBJ_BODY, objname=TIP,
         # Force, torque and place of all contacts together ("netforce"), in world axes.
         intprm=(
             sum(1 << int(f) for f in (

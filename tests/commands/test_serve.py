@@ -1,5 +1,6 @@
 """`palpate serve`: what is refused, and a short service with nobody there."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ import pytest
 from deployed import PERIOD, actor_file, impedance_policy, manifest, rope_policy
 from palpate.cli import main
 from palpate.commands.serve import free_endpoint, limits_of, stopped_by, supervisor_of
+from palpate.deployment.decision import ReflexDecision
 from palpate.deployment.deployment import deployment_of, load_network
 from palpate.deployment.loop import Record
 from palpate.deployment.messages import StateMessage, encode_state
@@ -117,7 +119,7 @@ def test_a_policy_of_no_family_is_served_by_its_declared_channels(tmp_path):
     assert order.reason == "6 features where 7 were agreed"
 
 
-def test_an_actor_is_served_in_the_robots_units_and_rests_without_eyes(capsys):
+def test_an_actor_is_served_in_the_robots_units_and_rests_without_eyes():
     policy = actor_file()
     deployment = deployment_of(*load_network("actor.safetensors"))
     supervisor = supervisor_of(deployment, limits_of(deployment, ["stiffness=600"], []))
@@ -140,9 +142,36 @@ def test_an_actor_is_served_in_the_robots_units_and_rests_without_eyes(capsys):
     order = supervisor.tick(3.0, [(3.0, _state(30, values))])
     assert (order.mode, order.reason) == (Mode.STOPPED, "the wrench has no value")
     np.testing.assert_array_equal(order.action, [0, 0, 50, 50])
-    actor_file("bresa")
-    assert main(["serve", "actor.safetensors"]) == 2
-    assert "trained under a reflex, which is not served yet" in capsys.readouterr().err
+
+
+def test_a_reflex_is_served_as_often_as_it_may_interrupt():
+    policy = actor_file("bresa")
+    deployment = deployment_of(*load_network("actor.safetensors"))
+    assert deployment.period == pytest.approx(0.01)
+    assert isinstance(deployment.decision(), ReflexDecision)
+    random, under_way = np.random.default_rng(0), np.zeros(4)
+    some = jnp.asarray(random.normal(size=(99, 9)), jnp.float32)
+    often = float(np.quantile(policy.risk(some, policy.propose(some)), 0.7))
+    policy = dataclasses.replace(policy, threshold=often)
+    decision, scale = ReflexDecision(policy, deployment.scaling, 10), deployment.scaling.scale
+    held = interrupted = 0
+    for step in range(200):
+        features = random.normal(size=9).astype(np.float32)
+        decision.see({"wrench": scale[:6] * features[:6], "position": scale[6:] * features[6:]})
+        seen = jnp.asarray(features)
+        if step % 10 == 0:
+            under_way = np.asarray(policy.propose(seen))
+        risky = float(policy.risk(seen, jnp.asarray(under_way))) > policy.threshold
+        if risky:
+            under_way = np.asarray(policy.guard.recover(seen))
+        given = decision.decide(np.zeros(4, np.float32))
+        expected = deployment.scaling.command(under_way)
+        np.testing.assert_allclose(given, expected, rtol=1e-3, atol=1e-4)
+        assert decision.holds == (step % 10 != 0 and not risky)
+        held, interrupted = held + decision.holds, interrupted + (risky and step % 10 != 0)
+    assert min(held, interrupted) > 10
+    decision.see({"wrench": np.full(6, np.nan), "position": np.zeros(3)})
+    assert not np.isfinite(decision.decide(np.zeros(4, np.float32))).any()
 
 
 def _state(step, values):

@@ -8,7 +8,6 @@ from palpate.experiments.experiment import (
     Experiment,
     decision_figures,
     mean_of,
-    on_every_core,
     ratio,
     share_of,
     suffix,
@@ -102,9 +101,10 @@ def test_figures_say_how_far_to_trust_them():
 
 
 def test_work_on_every_core_is_logged_and_its_errors_are_raised(tmp_path):
-    calls = {tmp_path / f"{n}.log": ("said", n) for n in range(3)}
-    on_every_core(print, calls, "saying")
-    assert [log.read_text() for log in calls] == [f"said {n}\n" for n in range(3)]
-    with pytest.raises(ValueError, match="invalid literal"):
-        on_every_core(int, {tmp_path / "broken.log": ("broken",)}, "breaking")
-    on_every_core(print, {}, "nothing")
+    experiment = Experiment("e", tmp_path, True, 4)
+    experiment.on_every_core(print, [("said", n) for n in range(3)], "saying")
+    told = [(tmp_path / f"said-{n}.log").read_text() for n in range(3)]
+    assert told == [f"{Experiment('e', tmp_path, True, 4)} said {n}\n" for n in range(3)]
+    with pytest.raises(TypeError, match="integer"):
+        experiment.on_every_core(int, [("broken",)], "breaking")
+    experiment.on_every_core(print, [], "nothing")

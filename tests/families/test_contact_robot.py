@@ -17,6 +17,7 @@ class Loop:
     def __init__(self, monkeypatch):
         self.now, self.states = 0.0, []
         self.command: tuple[float, ...] | None = None
+        self.decided_on: int | None = None  # None: every command on the newest state
         monkeypatch.setattr(robot.time, "sleep", self.sleep)
 
     def clock(self):
@@ -31,13 +32,15 @@ class Loop:
     def arrivals(self):
         if self.command is None:
             return []
-        command = CommandMessage(1, len(self.states), 1, 0, np.array(self.command))
+        newest = len(self.states)
+        state = newest if self.decided_on is None else self.decided_on
+        command = CommandMessage(1, newest, 1, state, np.array(self.command))
         return [(self.now, encode_command(command))]
 
 
 def test_it_goes_where_it_is_told_and_brakes_when_nobody_speaks(monkeypatch):
     loop = Loop(monkeypatch)
-    tip = robot.TipRobot(loop, BlindMaze(), MazeTask(), seed=0, period=0.1)
+    tip = robot.TipRobot(loop, BlindMaze(sway=0.0), MazeTask(), seed=0, period=0.1)
     loop.command = (0.01, 0.0, 400.0, 400.0)
     for _ in range(3):
         tip.advance()
@@ -49,6 +52,20 @@ def test_it_goes_where_it_is_told_and_brakes_when_nobody_speaks(monkeypatch):
     for _ in range(4):
         tip.advance()
     assert np.abs(tip._law.stiffness).max() == 0.0
-    assert abs(tip._seen.velocity[0]) < 0.01  # along y the base sways under it
+    assert np.abs(tip._seen.velocity).max() < 0.01
     assert tip.force >= 0.0
     assert tip.progress < 1.0
+
+
+def test_a_motion_goes_on_until_another_is_decided_on(monkeypatch):
+    loop = Loop(monkeypatch)
+    tip = robot.TipRobot(loop, BlindMaze(noise=0.0, sway=0.0), MazeTask(), seed=0, period=0.01)
+    loop.command, loop.decided_on = (0.01, 0.0, 400.0, 400.0), 1
+    for _ in range(60):
+        tip.advance()
+    first, last = (state.values["position"][0] for state in (loop.states[0], loop.states[-1]))
+    assert abs(last - first - 0.01) < 1e-4  # there, and no farther
+    loop.decided_on = 61
+    for _ in range(60):
+        tip.advance()
+    assert abs(loop.states[-1].values["position"][0] - first - 0.02) < 2e-4

@@ -100,15 +100,45 @@ class ActorDecision:
 
     def decide(self, command: np.ndarray) -> np.ndarray:
         """See `palpate.deployment.supervisor.Decision.decide`."""
-        return self._scaling.command(self._decided(self._scaling.features(self._measured[None])))[0]
+        features = self._scaling.features(self._measured[None])
+        return self._scaling.command(self._guarded(features, self._actor(features))[0])[0]
 
-    def _decided(self, features: np.ndarray) -> np.ndarray:
-        """The action (1, actions) in [-1, 1], or NaN."""
-        action = self._actor(features)
-        if self._guard is not None and not self._guard.risk(features, action) <= self._threshold:
-            action = self._guard.recover(features)
+    def _guarded(self, features: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        """The action (1, actions) in [-1, 1], the recovery's where it is risky, NaN where something
+        is not finite; and whether it is another than the one given."""
+        guard = self._guard
+        risky = guard is not None and not guard.risk(features, action) <= self._threshold
+        if guard is not None and risky:
+            action = guard.recover(features)
         lost = not (np.isfinite(features).all() and np.isfinite(action).all())
-        return np.full_like(action, np.nan) if lost else action
+        return (np.full_like(action, np.nan), True) if lost else (action, risky)
+
+
+class ReflexDecision(ActorDecision):
+    """An actor that decides at every `every`th state; at each its guard may interrupt the motion.
+
+    As `palpate.safety.reflex.Reflex` asked as often as it may interrupt. `holds`: whether the last
+    command is that of the motion that was under way.
+    """
+
+    def __init__(self, policy: ActorPolicy, scaling: Scaling, every: int):
+        super().__init__(policy, scaling)
+        self._every, self.holds = every, False
+        self.forget()
+
+    def forget(self) -> None:
+        """See `palpate.deployment.supervisor.Decision.forget`: the next state is decided on."""
+        self._left = 0
+
+    def decide(self, command: np.ndarray) -> np.ndarray:
+        """See `palpate.deployment.supervisor.Decision.decide`."""
+        features, begins = self._scaling.features(self._measured[None]), self._left == 0
+        if begins:
+            self._left, self._under_way = self._every, self._actor(features)
+        self._left -= 1
+        self._under_way, interrupted = self._guarded(features, self._under_way)
+        self.holds = not (begins or interrupted)
+        return self._scaling.command(self._under_way)[0]
 
 
 def _fill(flat: np.ndarray, values: Values) -> None:

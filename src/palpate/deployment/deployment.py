@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from palpate.deployment.decision import ActorDecision, ChannelDecision
+from palpate.deployment.decision import ActorDecision, ChannelDecision, ReflexDecision
 from palpate.deployment.plausibility import ChannelCheck, Check
 from palpate.deployment.scaling import Scaling
 from palpate.deployment.supervisor import Decision
@@ -30,7 +30,7 @@ class Deployment(Generic[Policy]):
     A family whose robots send something else, or whose sensors can be checked better, names a
     class derived from this one in its table, as `deployments`, by task. `sensors` are the channels
     that are sent, `actions` those that the robot is told; `period` is that of states and commands,
-    in s: a decision's, or a reflex's.
+    in s: a decision's, or that in which a reflex may interrupt again.
 
     Args:
         policy: to be served.
@@ -45,7 +45,7 @@ class Deployment(Generic[Policy]):
         self.policy: Policy = policy
         self.manifest = manifest
         self.pace = self.reflex_pace()
-        self.period = policy.period if self.pace is None else self.pace.period
+        self.period = policy.period if self.pace is None else self.pace.period * self.pace.count
         self.scaling = self.actor_scaling()
         self.sensors, self.actions = self.scaling.sensors, self.scaling.actions
         names = [channel.name for channel in self.sensors]
@@ -72,12 +72,10 @@ class Deployment(Generic[Policy]):
 
     def decision(self) -> Decision:
         """The policy, fed by `sensors`."""
-        if self.pace is not None:
-            raise PalpateError(
-                "the policy was trained under a reflex, which is not served yet: export it, and "
-                "ask both graphs in a loop of your own"
-            )
         if isinstance(self.policy, ActorPolicy):
+            if self.pace is not None:
+                every = round(self.policy.period / self.period)
+                return ReflexDecision(self.policy, self.scaling, every)
             return ActorDecision(self.policy, self.scaling)
         return ChannelDecision(self.policy)
 

@@ -100,7 +100,9 @@ def run_loop(
             sequence += 1
             link.send(
                 encode_command(
-                    CommandMessage(session, sequence, order.mode, supervisor.seen, order.action)
+                    CommandMessage(
+                        session, sequence, order.mode, supervisor.decided_on, order.action
+                    )
                 )
             )
             if arrivals:

@@ -4,8 +4,11 @@
              axis), session u64, sequence u64, time f64 (s, the sender's own monotonic clock), the
              declared sensor channels one after the other f32, CRC-32 u32 of everything before
     command: magic "PLPT", version u8, kind u8 = 2, mode u16, session u64, sequence u64,
-             state u64 (sequence of the newest state it rests on), the declared action channels
+             state u64 (sequence of the state that it was decided on), the declared action channels
              one after the other f32, CRC-32 u32
+
+Where an action is a motion from where the robot is, a command of the same state and action is that
+motion, which goes on; any other begins a new one.
 
 A session is a number that a sender draws when it starts, so that its successor has another.
 Nothing is unpickled: a message is numbers of declared size, or it is refused.

@@ -103,7 +103,10 @@ class Decision(Protocol):
         ...
 
     def decide(self, command: np.ndarray) -> np.ndarray:
-        """The next action, after the one in force; both flat."""
+        """The next action, after the one in force; both flat.
+
+        Where motions take longer than a period, `holds` then says whether it is the one under way.
+        """
         ...
 
 
@@ -123,6 +126,7 @@ class Supervisor:
         self._now: float | None = None
         self._good = 0  # states in a row
         self._ran = 0  # decisions since the start
+        self._decided_on = 0
         self._first: StateMessage | None = None  # when counting began
         self.mode = Mode.WAITING
         self.action = limits.rest
@@ -136,6 +140,11 @@ class Supervisor:
         """Sequence number of the newest good state, 0 without one."""
         newest = self._intake.newest
         return 0 if newest is None else newest.sequence
+
+    @property
+    def decided_on(self) -> int:
+        """Sequence number of the state that the motion under way was decided on."""
+        return self._decided_on if self.mode is Mode.RUNNING else self.seen
 
     @property
     def due(self) -> float:
@@ -209,6 +218,8 @@ class Supervisor:
         if not np.isfinite(wanted).all():
             self._start_over("the policy gave a command that is not finite")
             return
+        if not getattr(self._decision, "holds", False):
+            self._decided_on = self.seen
         self._ran += 1
         share = min(1.0, self._ran / self._soft)
         action = np.empty_like(self.action)

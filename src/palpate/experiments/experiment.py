@@ -136,6 +136,33 @@ class Experiment:
                 }
         return found, read_json(stage.path / RESULT)["decision_ms"]
 
+    def on_every_core(
+        self, work: Callable[..., Any], grid: Sequence[tuple[Any, ...]], doing: str
+    ) -> None:
+        """Call `work(experiment, *arguments)` for each of the arguments in as many processes as
+        there are cores, each on one.
+
+        `work` is a module's own function, whose stages are then read here. A process writes what it
+        prints into a file that its arguments name. What one raises is raised here, when those that
+        are under way are done.
+        """
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        spawn = multiprocessing.get_context("spawn")
+        processes = max(1, min(cores or 1, len(grid)))
+        alone = Experiment(self.name, self.out, self.quick, self.seed)
+        with concurrent.futures.ProcessPoolExecutor(processes, spawn, _take_one_core) as pool:
+            futures = []
+            for arguments in grid:
+                log = self.out / f"{'-'.join(map(str, arguments))}.log"
+                futures.append(pool.submit(_into, log, work, alone, *arguments))
+            try:
+                done = concurrent.futures.as_completed(futures)
+                for _ in progress(range(len(futures)), doing):
+                    next(done).result()
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+
     @contextlib.contextmanager
     def counted(self) -> Iterator[None]:
         """Count the seconds of work that is no stage and is done anew in every process."""
@@ -156,31 +183,7 @@ class Experiment:
         return Result(self.name, figures, settings, seeds, split, self.seconds)
 
 
-# --- stages beside each other -----------------------------------------------------------------
-
-
-def on_every_core(
-    work: Callable[..., Any], calls: Mapping[Path, tuple[Any, ...]], doing: str
-) -> None:
-    """Call `work` with each of the arguments, in as many processes as there are cores.
-
-    Each computes on one core, and writes what it prints into the file that its call is named by.
-    `work` is a module's own function whose stages are runs: cut off, each goes on from where it
-    was. What it raises is raised here, when the others under way are done.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    spawn = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(
-        max(1, min(cores or 1, len(calls))), spawn, _take_one_core
-    ) as pool:
-        futures = [pool.submit(_into, log, work, *arguments) for log, arguments in calls.items()]
-        try:
-            done = concurrent.futures.as_completed(futures)
-            for _ in progress(range(len(futures)), doing):
-                next(done).result()
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+# --- processes beside each other --------------------------------------------------------------
 
 
 def _take_one_core() -> None:

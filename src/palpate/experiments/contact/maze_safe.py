@@ -16,7 +16,7 @@ from typing import Any
 
 from palpate.commands import evaluate, folders, train
 from palpate.experiments.contact.maze_figure import curve_of, draw
-from palpate.experiments.experiment import Experiment, on_every_core, share_of
+from palpate.experiments.experiment import Experiment, share_of
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
 from palpate.families.contact.methods import METHODS
 from palpate.runs import Figure, Result
@@ -63,12 +63,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
     first = experiment.uses(FIRST, size.seeds)
     grid = [(name, each) for each in range(first, first + size.seeds) for name in names]
-    calls = {
-        out / f"{name}-{each}.log": (out, quick, seed, name, each)
-        for name, each in grid
-        if not (out / stage_of(name, each) / RESULT).exists()
-    }
-    on_every_core(find, calls, "trainings")
+    experiment.on_every_core(of_training, grid, "trainings")
     found = {name: [] for name in names}
     for name, each in grid:
         found[name].append(of_training(experiment, name, each))
@@ -81,20 +76,11 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )  # fmt: skip
 
 
-def find(out: Path, quick: bool, seed: int, name: str, training_seed: int) -> None:
-    """One training and all its trials, in a process of its own."""
-    of_training(Experiment(NAME, out, quick, seed), name, training_seed)
-
-
-def stage_of(name: str, seed: int) -> str:
-    """The folder of what is found of one training: small, and all that the result is made of."""
-    return f"{name}-{seed}-found"
-
-
 def of_training(experiment: Experiment, name: str, seed: int) -> dict[str, Any]:
     """What a training cost, and what its policy's episodes gave where it is tried.
 
-    The policy is in the folder `maze-NAME-SEED`, trained unless it was.
+    It stands in a folder of its own, which is small and all that the result is made of. The policy
+    is in the folder `maze-NAME-SEED`, trained unless it was.
     """
     size = QUICK if experiment.quick else FULL
     options = TrainMaze(
@@ -125,7 +111,7 @@ def of_training(experiment: Experiment, name: str, seed: int) -> dict[str, Any]:
             "training": about["training"],
         }
 
-    return experiment.found(stage_of(name, seed), about, work)
+    return experiment.found(f"{name}-{seed}-found", about, work)
 
 
 def tried(policy: Path, where: str, episodes: int, seed: int, **asked: Any) -> Values:

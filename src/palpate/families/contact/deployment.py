@@ -30,8 +30,8 @@ class _SkillDeployment(Deployment[ActorPolicy]):
     """A policy that was trained by a method of a skill."""
 
     skill: Skill
-    control_period: float  # s, that a reflex is asked at
-    pace_count: int
+    control_period: float  # s, that a reflex is asked at in training
+    pace_count: int  # of those, after which it may interrupt again: as often it is served
 
     @property
     def method(self) -> Method:

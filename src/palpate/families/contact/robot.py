@@ -32,7 +32,7 @@ LISTENS = 0.005  # s, from one look for commands to the next
 
 
 class TipRobot:
-    """A tip whose impedance moves it from where it is when a command comes.
+    """A tip whose impedance moves it from where it is when a motion begins.
 
     Args:
         link: to the loop.
@@ -50,6 +50,7 @@ class TipRobot:
         self._first = self._world.truth()
         self._session, self._sequence = secrets.randbits(64), 0
         self._deadline = self._heard_at = link.clock()
+        self._under_way: Any = None
         self._begin(np.full(4, np.nan), fresh=True)
         self.force, self.end = 0.0, ""
 
@@ -86,11 +87,16 @@ class TipRobot:
         arrivals = self._link.arrivals()
         if arrivals:
             self._heard_at, data = arrivals[-1]
-            told = decode_command(data, 4).action
+            message = decode_command(data, 4)
+            told, before = message.action, self._under_way
+            self._under_way = message.session, message.state, tuple(told.tolist())
+            if self._under_way == before:
+                return
             low, high = STIFFNESS_RANGE
             stiffness = 2 * (told[2:] - low) / (high - low) - 1
             self._begin(np.concatenate([told[:2] / DISPLACEMENT_LIMIT, stiffness]))
         elif self._link.clock() - self._heard_at > PAUSE * self.period:
+            self._under_way = None
             self._begin(np.full(4, np.nan))  # damping alone
 
     def _begin(self, action: np.ndarray, fresh: bool = False) -> None:

@@ -33,7 +33,7 @@ from palpate.worlds.maze import navigation as navigation_world
 from palpate.worlds.maze import scene, tip
 
 WRENCH = (0, 1, 2, 3, 4, 5)  # of the features: SRL-VIC's critic and recovery see no position
-DISCOUNT, TARGET_ENTROPY = 0.98, -1.0  # of the task's agent
+LEARNING_RATE, DISCOUNT, TARGET_ENTROPY = 1e-3, 0.98, -1.0  # of the task's agent
 WIDTH, BATCH = 128, 128  # of the two hidden layers of every network; transitions of an update
 # A tenth a decision: one that is soft at once averts nearly every violation, and what later ones
 # risk would count against all actions alike. So a risk far below a percent can be told from more.
@@ -66,7 +66,7 @@ class Method:
 
 
 def _agent() -> SoftActorCritic:
-    return SoftActorCritic(discount=DISCOUNT, target_entropy=TARGET_ENTROPY, width=WIDTH)
+    return SoftActorCritic(LEARNING_RATE, DISCOUNT, target_entropy=TARGET_ENTROPY, width=WIDTH)
 
 
 def _guarded(

@@ -20,6 +20,8 @@ from palpate.learning.off_policy import (
     evaluate,
     train_off_policy,
 )
+from palpate.learning.off_policy.agent import Batch
+from palpate.learning.off_policy.recovery import RecoveryState
 from palpate.runs import Run
 from small_environments import Cliff, side_by_side
 
@@ -82,6 +84,33 @@ def test_critic_sees_its_part_alone() -> None:
     np.testing.assert_array_equal(state.guard.recover(one), state.guard.recover(other))
     with pytest.raises(PalpateError, match=r"\(0, 3\) of 3: expected some in 0 ... 2"):
         dataclasses.replace(CRITIC, seen=(0, 3)).init(jax.random.key(0), 3, 1)
+
+
+class Forwards(SoftActorCritic):
+    """A task's agent that always proposes 1."""
+
+    def propose(self, state, observation, key):
+        return jnp.ones((len(observation), 1))
+
+
+def test_what_will_be_overruled_makes_nothing_before_it_risky() -> None:
+    """From a place to the edge: a step over it violates, one back does not."""
+    places, one = np.eye(2, dtype=np.float32), np.ones(3, np.float32)
+    done = np.array([[0.0], [1.0], [-1.0]], np.float32)
+    cost, ended = np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1.0])
+    lived = Transition(places[[0, 1, 1]], done, done, 0 * one, cost, places[[1, 1, 1]], ended)
+    batch = Batch(lived, lived, jnp.asarray(one), jnp.zeros(()))
+    batch = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), batch)
+    for threshold, expected in ((0.3, 0.0), (1.0, DISCOUNT)):  # overruled, and not
+        agent = RecoveryAgent(Forwards(), CRITIC, threshold)
+        state = RecoveryState(None, CRITIC.init(jax.random.key(0), 2, 1))
+
+        def update(_, state, agent=agent):
+            return agent.pretrain(state, batch, jax.random.key(0))[0]
+
+        state = jax.jit(lambda state: jax.lax.fori_loop(0, 1500, update, state))(state)
+        risk = state.safety.guard.risk(batch.risk.observation, batch.risk.executed)
+        np.testing.assert_allclose(risk, [expected, 1.0, 0.0], atol=0.05)
 
 
 def at_random(observation, fresh, random):

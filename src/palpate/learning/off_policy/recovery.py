@@ -63,10 +63,19 @@ class RecoveryAgent:
         state, found = self.pretrain(RecoveryState(task, state.safety), batch, for_safety)
         return state, figures | found
 
+    def acting(self, state: RecoveryState, observation: Array, key: PRNGKeyArray) -> Array:
+        """What is done next, of which later risks are learnt: the proposal under its guard.
+
+        Recovery RL learns those of the proposal alone. Where a task's policy is not yet good they
+        make every action before it look risky, so that none is done and it never becomes good.
+        """
+        proposed = self.task.propose(state.task, observation, key)
+        return state.safety.guard.overrule(observation, proposed, self.threshold)
+
     def pretrain(
         self, state: RecoveryState, batch: Batch, key: PRNGKeyArray
     ) -> tuple[RecoveryState, dict[str, Array]]:
         """Critic and recovery alone."""
-        following = self.task.propose(state.task, batch.risk.next_observation, key)
+        following = self.acting(state, batch.risk.next_observation, key)
         safety, figures = self.safety.update(state.safety, batch.risk, following, batch.risk_weight)
         return RecoveryState(state.task, safety), figures

@@ -18,7 +18,7 @@ class ReflexAgent(RecoveryAgent):
 
     Its environments hold the guard (`palpate.safety.reflex.Reflex`), which looks in every control
     period, the first one of a decision included. The critic learns from `Motion`s: its risk is
-    that of going on with an action until the decision's end, and then as the task's agent would;
+    that of going on with an action until the decision's end, and then as the agent acts;
     a violation counts discount^(time until then), in decisions.
     """
 
@@ -37,7 +37,7 @@ class ReflexAgent(RecoveryAgent):
         lived = batch.risk
         if not isinstance(lived, Motion):
             raise PalpateError("a reflex learns from pieces of decisions, not from whole ones")
-        decided = self.task.propose(state.task, lived.next_observation, key)
+        decided = self.acting(state, lived.next_observation, key)
         following = jnp.where(lived.holds[:, None] > 0, lived.executed, decided)
         weight = batch.risk_weight
         safety, figures = self.safety.update(state.safety, lived, following, weight, lived.duration)

@@ -34,7 +34,7 @@ class SafetyCritic:
         y = c + (1 - c) (1 - terminated) discount max_i Q_target_i(s', a')
 
     with c whether the decision violated a constraint: nothing counts beyond a violation. a' is
-    what the policy acting would do at s'. The critics' outputs are squashed into [0, 1] and follow
+    what would be done at s'. The critics' outputs are squashed into [0, 1] and follow
     y by its cross-entropy; the greater of the two is the risk. It has its minimum where least
     squares have theirs, which the papers take, but its gradient does not vanish where risks are
     small: on 150,000 decisions of a maze, of which 344 violate the limit, the tenth with the

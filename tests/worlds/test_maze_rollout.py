@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from palpate.errors import PalpateError
 from palpate.families.contact.environments import arm_maze, blind_mazes
 from palpate.worlds.gymnasium import VIOLATION
 from palpate.worlds.maze.maze import BlindMaze
@@ -61,6 +62,22 @@ def test_worlds_may_be_held_and_stepped_by_turns():
         for one, other in zip(*seen, strict=True):
             np.testing.assert_allclose(one, other, atol=1e-9)
         seen = [world.step(np.array([2.0, 1.0, 0.0])) for world in (held, stepped)]
+
+
+def test_a_picture_is_of_where_a_rollout_has_come_to():
+    world = BlindMaze(noise=0.0)
+    position = world.reset(3).position[:2]
+    rollout = world.rollout([world])
+    assert rollout is not None
+    spring = Spring(position[None] + 0.02, 400.0 * np.eye(2)[None], 40.0 * np.eye(2)[None])
+    rollout.hold(spring, 100, 1e3)
+    try:
+        world.render(64, 48)
+    except PalpateError as error:
+        if "needs OpenGL" not in str(error):
+            raise  # without it nothing is drawn, but all is in its place
+    shown = world._data.geom_xpos[world.engine().geom("tip").id]
+    np.testing.assert_allclose(shown, world.truth().position, atol=1e-12)
 
 
 def test_a_world_stops_where_its_force_is_above_the_limit():

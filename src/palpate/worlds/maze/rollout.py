@@ -62,7 +62,8 @@ class MazeRollout(Rollout):
     """The rollout of blind mazes whose control period is MuJoCo's time step.
 
     A world that is held here and stepped there goes through the same motion, to the solver's
-    tolerance: MuJoCo's first guess of the contact forces is another.
+    tolerance: MuJoCo's first guess of the contact forces is another. Springs are to be such that
+    they never pull by more than `DRIVE_LIMIT`, at which a step would cut them off.
     """
 
     def __init__(self, worlds: Sequence[RolledOut]):

@@ -184,6 +184,8 @@ class TipWorld(World):
 
     def render(self, width: int = 640, height: int = 480) -> np.ndarray:
         self._check_ready("is drawn")
+        mujoco.mj_kinematics(self._model, self._data)  # a step leaves the places before it
+        mujoco.mj_camlight(self._model, self._data)
         camera = self._camera
         if camera is None or (camera.model, camera.width, camera.height) != (
             self._model, width, height,

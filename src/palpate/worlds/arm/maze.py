@@ -69,10 +69,8 @@ class ArmMaze(BlindMaze):
     def _seat(self, x: float, y: float) -> None:
         model, data = self._model, self._data
         self._control = control = OperationalSpace(model, data, TIP, POSTURE)
-        if (
-            control.reach(np.array([*np.add((x, y), np.multiply(data.qpos[0], SWAY_AXIS)), 0.0]))
-            > 1e-6
-        ):
+        place = np.add((x, y), np.multiply(data.qpos[0], SWAY_AXIS))
+        if control.reach(np.array([*place, 0.0])) > 1e-6:
             raise PalpateError(f"the arm does not reach ({x:.3f}, {y:.3f}) m")
         self._wrist = wrist(model, data)
         self._hand_axes = data.site_xmat[model.site(HAND).id].reshape(3, 3)

@@ -68,7 +68,20 @@ def test_a_table_of_ones_own_gives_the_same_channels(recording, tmp_path):
     prepared = own.prepare(read_recording(table, **own.reading()))
     aligned = prepared.align(5e-3, own.observed, own.action(prepared))
     np.testing.assert_allclose(aligned.observations["force"][0, 3], trial["force"].values[3])
-    np.testing.assert_allclose(aligned.action[0, 7], [*setpoint[7], 400.0, 500.0])
+    np.testing.assert_allclose(aligned.action[0, 7], [*setpoint[7], 400.0, 500.0, 0.0, 0.0])
+
+
+def test_set_points_ordered_more_often_than_frames_move_within_them(recording):
+    """Means and velocities of the five orders of a frame say where they were."""
+    own = options()
+    prepared = own.prepare(recording)
+    aligned = prepared.align(5e-3, own.observed, own.action(prepared))
+    ordered = recording.trials[0]["setpoint"].values
+    for frame in (20, 60, 101):
+        mean, moves = aligned.action[0, frame, :2], aligned.action[0, frame, 4:]
+        at = ordered[5 * frame : 5 * frame + 5]
+        np.testing.assert_allclose(mean + np.outer((np.arange(5) - 2) * 1e-3, moves), at, atol=2e-5)
+    assert np.abs(aligned.actions["setpoint velocity"]).max() > 0.3
 
 
 def test_channels_that_do_not_fit_are_refused(recording):

@@ -24,8 +24,8 @@ FREE = {"damping_ratio": 0.0, "damping": 0.0, "friction": 0.0}
 
 
 def walled(directions, **values) -> Tip:
-    """Without friction of the arm, mass of a tool and of walls, unless some is given."""
-    nothing = {"arm_friction": 0.0, "tool_mass": 0.0, "wall_mass": 0.0}
+    """Without friction and delay of the arm, mass of a tool and of walls, unless some is given."""
+    nothing = {"arm_friction": 0.0, "tool_mass": 0.0, "wall_mass": 0.0, "control_delay": 0.0}
     return facing(directions, **nothing | values)
 
 
@@ -34,7 +34,7 @@ def moving(position, velocity) -> TipState:
 
 
 def held(setpoint, stiffness, steps: int):
-    return jnp.broadcast_to(jnp.array([*setpoint, *stiffness], float), (steps, 4))
+    return jnp.broadcast_to(jnp.array([*setpoint, *stiffness, 0.0, 0.0], float), (steps, 6))
 
 
 def test_it_keeps_the_contract_of_a_model():
@@ -54,6 +54,47 @@ def test_without_contact_the_impedance_swings_as_its_closed_form():
         expected = goal + np.exp(-decay * time) * shape
         np.testing.assert_allclose(states.position[:, axis], expected, atol=2e-5)
     assert float(jnp.abs(states.force).max()) == 0.0
+
+
+def test_a_set_point_that_moves_within_a_period_pulls_as_one_that_is_ordered_more_often():
+    """Behind a ramp a damped tip lags by D / K times its speed; held for a period, it jerks."""
+    tip = walled([LEFT], mass=1.2, damping_ratio=0.8, tool_mass=0.4, position=-9.0)
+    tip = dataclasses.replace(tip, control_period=2e-2)
+    middle = 0.3 * (tip.control_period * np.arange(100) + 0.5 * tip.control_period)
+    still = np.zeros_like(middle)
+    force, lag = {}, {}
+    for speed in (0.3, 0.0):
+        rows = [middle, still, still + 300.0, still + 300.0, still + speed, still]
+        states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), jnp.asarray(np.stack(rows, axis=1)))
+        force[speed] = float(jnp.abs(states.force[-1, 0]))
+        lag[speed] = 0.3 * tip.control_period * 100 - float(states.position[-1, 0])
+    damping = 2.0 * 0.8 * math.sqrt(300.0 * 1.2)
+    assert lag[0.3] == pytest.approx(0.3 * damping / 300.0, rel=1e-4)
+    assert force[0.3] < 1e-3
+    assert force[0.0] > 0.1
+
+
+def test_a_controller_that_holds_its_force_is_one_that_acts_late_by_half_as_long():
+    """Integrated finely with forces held for 2 ms, against steps of a whole period of 5 ms."""
+    hold, step = 2e-3, 1e-5
+    mass, stiffness, ratio = 1.0, 900.0, 0.7
+    damping = 2.0 * ratio * math.sqrt(stiffness * mass)
+    position, velocity, expected = 0.0, 0.0, []
+    for count in range(round(0.2 / step)):
+        if count % round(hold / step) == 0:
+            force = stiffness * (0.05 - position) - damping * velocity
+        velocity += step * force / mass
+        position += step * velocity
+        if (count + 1) % round(5e-3 / step) == 0:
+            expected.append(position)
+    off = {}
+    for delay in (0.0, 0.5 * hold):
+        tip = walled([LEFT], mass=mass, damping_ratio=ratio, control_delay=delay, position=-9.0)
+        actions = held([0.05, 0.0], [stiffness, stiffness], len(expected))
+        states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), actions)
+        off[delay] = np.abs(np.asarray(states.position)[:, 0] - expected).max()
+    assert off[0.0] > 5e-4
+    assert off[0.5 * hold] < 0.2 * off[0.0]
 
 
 @pytest.mark.parametrize("stiffness", [100.0, 1e4, 1e5])
@@ -131,7 +172,7 @@ def test_no_contact_creates_energy_however_stiff_the_wall_and_wherever_a_step_me
     start = np.zeros((len(stiffness), 2))
     start[:, 0] = -np.linspace(0.01, 0.0106, len(stiffness))
     velocity = np.broadcast_to([0.6, 0.2], start.shape)
-    rest = jnp.zeros((len(stiffness), 400, 4))
+    rest = jnp.zeros((len(stiffness), 400, 6))
     states = run(tip, TipState(jnp.asarray(start), jnp.asarray(velocity), jnp.zeros_like(start)),
                  rest)  # fmt: skip
     after = np.asarray(states.velocity[:, -1])
@@ -189,7 +230,8 @@ def test_derivatives_of_what_is_observed_are_those_of_finite_differences():
     tip = walled([LEFT, -math.pi / 2], position=[-0.03, -0.02], friction=0.3, tilt=[0.03, -0.02])
     time = tip.control_period * np.arange(160)
     way = 0.045 * np.stack([np.sin(5.0 * time), np.sin(7.0 * time + 1.0)], axis=1)
-    actions = jnp.asarray(np.concatenate([way, np.full((160, 2), 400.0)], axis=1))
+    moves = np.gradient(way, tip.control_period, axis=0)
+    actions = jnp.asarray(np.concatenate([way, np.full((160, 2), 400.0), moves], axis=1))
     coordinates = FreeParameters(tip)
     weight = jnp.asarray(np.random.default_rng(0).normal(size=(160, 4)) * [100.0, 100.0, 1.0, 1.0])
 

@@ -28,20 +28,20 @@ def test_pressing_and_sliding_along_a_plate_on_a_spring_is_as_in_mujoco():
     """Set-point and stiffness change, and the plate is met at speed, rubbed along, and left."""
     tip = facing([math.pi], position=-0.04, mass=1.2, damping_ratio=0.7, stiffness=1500.0,
                  damping=6.0, friction=0.35, wall_mass=0.05, arm_friction=0.0,
-                 tool_mass=TOOL, sensor_lag=LAG)  # fmt: skip
+                 tool_mass=TOOL, sensor_lag=LAG, control_delay=0.0)  # fmt: skip
     time = tip.control_period * np.arange(400)
     way = np.stack([0.05 * np.sin(4.0 * time), 0.08 * np.sin(2.3 * time)], axis=1)
     stiffness = np.where(time[:, None] < 1.2, [400.0, 600.0], [800.0, 300.0])
-    actions = np.concatenate([way, stiffness], axis=1)
+    actions = np.concatenate([way, stiffness, np.zeros_like(way)], axis=1)
     start = TipState(jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
     ours = tip.observe(jax.jit(rollout)(tip, start, jnp.asarray(actions, jnp.float32)))
     model = mujoco.MjModel.from_xml_string(SCENE)
     data = mujoco.MjData(model)
     theirs, shown = [], np.zeros(2)
     for action in actions:
-        damping = 2.0 * 0.7 * np.sqrt(action[2:] * 1.2)
+        damping = 2.0 * 0.7 * np.sqrt(action[2:4] * 1.2)
         for _ in range(STEPS):
-            pull = action[2:] * (action[:2] - data.qpos[:2]) - damping * data.qvel[:2]
+            pull = action[2:4] * (action[:2] - data.qpos[:2]) - damping * data.qvel[:2]
             data.qfrc_applied[:2] = pull
             mujoco.mj_step(model, data)
             felt = data.qfrc_constraint[:2] - TOOL * data.qacc[:2]

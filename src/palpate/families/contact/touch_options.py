@@ -109,7 +109,7 @@ class IdentifyContact(Identify):
 
     def action(self, recording: Recording) -> tuple[str, ...]:
         """What the impedance controller was told."""
-        return "setpoint", "stiffness"
+        return "setpoint", "stiffness", "setpoint velocity"
 
     def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Model:
         """Walls where the force sets in, every other parameter at its prior's centre."""

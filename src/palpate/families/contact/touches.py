@@ -14,6 +14,7 @@ from palpate.worlds.contact.touching import NORMALS
 
 UNITS = {"position": "m", "force": "N", "setpoint": "m", "stiffness": "N/m"}
 COMMANDS = "setpoint", "stiffness"
+MOVES = "setpoint velocity"  # m/s, of set-points that are ordered more often than a frame is seen
 FEELS = 6.0  # deviations of the force's noise from which on a wall is felt
 PRESSES = 0.25  # of the great forces, from which on it is a wall and no tool that is accelerated
 PLACES = 200  # tried for a wall, from the deepest frame to the farthest
@@ -25,13 +26,17 @@ LARGEST = 5.0  # m: a tip that is farther from where it was is in another unit
 def with_channels(recording: Recording, names: Mapping[str, Sequence[str]]) -> Recording:
     """The recording with channels of two numbers called as `UNITS`, of those that are named.
 
-    Raises `PalpateError` where one is missing, is not of two numbers, or is in another unit.
+    With a set-point comes how fast it moves, `MOVES`. Raises `PalpateError` where a channel is
+    missing, is not of two numbers, or is in another unit.
     """
     trials = []
     for trial in recording.trials:
         channels = dict(trial.channels)
         for name, given in names.items():
             channels[name] = _of_two_numbers(trial, name, given, channels.get("position"))
+        if "setpoint" in names and "position" in names:
+            period = channels["position"].nominal_period
+            channels[MOVES] = _moves(channels["setpoint"], period)
         trials.append(dataclasses.replace(trial, channels=channels))
     return dataclasses.replace(recording, trials=tuple(trials))
 
@@ -67,6 +72,18 @@ def _of_two_numbers(
             "expected none that is negative"
         )
     return dataclasses.replace(parts[0], name=name, role=role, values=values, unit=UNITS[name])
+
+
+def _moves(setpoint: Channel, period: float) -> Channel:
+    """How fast the set-point moves between frames of `period` s: of at least two orders in each.
+
+    A frame's mean of orders does not say that it moved; an order for a whole frame stands still.
+    """
+    time, values = setpoint.time, setpoint.values
+    moved = np.zeros_like(values)
+    if 2.0 * setpoint.nominal_period < period * (1.0 + 1e-3):
+        moved[:-1] = np.diff(values, axis=0) / np.diff(time)[:, None]
+    return dataclasses.replace(setpoint, name=MOVES, values=moved, unit="m/s")
 
 
 def directions_of(recording: Recording, told: Sequence[float]) -> Float[np.ndarray, " walls"]:

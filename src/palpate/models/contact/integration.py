@@ -32,11 +32,12 @@ class Surfaces(NamedTuple):
 class Impedance(NamedTuple):
     """What pulls the tip: mass in kg, set-point in m, stiffness in N/m, damping in N s/m.
 
-    `friction` is the dry friction of the arm itself, N, of half its size at the velocity `creep`,
-    m/s.
+    The controller acts on the position and velocity that the tip had `delay` s ago. `friction` is
+    the dry friction of the arm itself, N, of half its size at the velocity `creep`, m/s.
     """
 
     mass: Float[Array, "*batch 1"]
+    delay: Float[Array, "*batch 1"]
     friction: Float[Array, "*batch"]
     creep: Float[Array, "*batch"]
     setpoint: Vector
@@ -75,9 +76,12 @@ def advance(
     # N s/m of the mean velocity
     yielding = time * stiffness * implicit + damping * share + 2.0 * inertia
 
+    # Of first order, K x and D v of a moment ago are K (x - delay v) and D (v - delay a): less
+    # damping and less inertia, here in a form that stays positive.
+    lightened = mass / (1.0 + impedance.delay * impedance.damping / mass)
     # Mean velocity w: (2 m / h + D + K h / 2 + sum of n n' yielding) w = 2 m / h v + forces.
-    held = 2.0 * mass / time
-    diagonal = held + impedance.damping + 0.5 * time * impedance.stiffness
+    held = 2.0 * lightened / time
+    diagonal = held + impedance.damping + (0.5 * time - impedance.delay) * impedance.stiffness
     pull = impedance.stiffness * (impedance.setpoint - position)
     inverse = _inverse(diagonal, normal, yielding)
     push = spring + moved

@@ -42,8 +42,9 @@ class Tip(Model):
 
     The controller pulls the tip to a set-point x_d: m a = K (x_d - x) - D v + f, with the diagonal
     stiffness K that it commands and the damping D = 2 zeta sqrt(K m) by design (Albu-Schaeffer et
-    al., ICRA 2003, of one mass), and the arm rubs: it creeps before it slides. An action is x_d and
-    K for one control period.
+    al., ICRA 2003, of one mass), and the arm rubs: it creeps before it slides. x and v are those of
+    `control_delay` s ago: half a period of a controller that holds its force, and what it takes to
+    measure. An action is, for one control period, the mean x_d, K, and how fast x_d moves in it.
 
     Each wall is a plate on a spring: where the tip is pressed in by u, it pushes with
     f_n = max(0, k u + d u' + m_w u''), along its outward normal, and rubs with Coulomb's friction
@@ -66,6 +67,9 @@ class Tip(Model):
     )
     damping_ratio: Number = parameter(
         "", prior=LogNormal(1.0, 0.3), spread=0.2, about="of the impedance, one is critical"
+    )
+    control_delay: Number = parameter(
+        "s", prior=LogNormal(1e-3, 0.7), about="from what the controller measures to its force"
     )
     arm_friction: Number = parameter(
         "N", prior=LogNormal(0.2, 1.0), spread=0.5, about="dry friction of the arm, at the tip"
@@ -118,8 +122,8 @@ class Tip(Model):
 
     @property
     def action_shape(self) -> tuple[int]:
-        """(4,): set-point x and y (m), stiffness along x and y (N/m)."""
-        return (4,)
+        """(6,): set-point x and y (m), stiffness along x and y (N/m), the set-point's m/s."""
+        return (6,)
 
     @property
     def observation_shape(self) -> tuple[int]:
@@ -146,36 +150,38 @@ class Tip(Model):
         place = jnp.sum(normal * point, axis=-1)
         return Surfaces(normal, place, self.stiffness, self.damping, self.friction, self.wall_mass)
 
-    def step(self, state: TipState, action: Float[Array, "*batch 4"]) -> TipState:
-        """The state one control period later; the action is x and y of x_d (m) and of K (N/m)."""
+    def step(self, state: TipState, action: Float[Array, "*batch 6"]) -> TipState:
+        """One control period later; x and y of the mean x_d (m), of K (N/m), and of x_d' (m/s)."""
         return self.stepper()(state, action)
 
     def stepper(self) -> Callable[[TipState, Array], TipState]:
-        surfaces, mass = self.surfaces, self.mass[..., None]
+        surfaces, mass, delay = self.surfaces, self.mass[..., None], self.control_delay[..., None]
         count = max(1, math.ceil(self.control_period / SUBSTEP - 1e-9))
         time = self.control_period / count
         late = jnp.exp(-time / self.sensor_lag)[..., None]
         tool = self.tool_mass[..., None] / time
+        moments = time * (np.arange(count) + 0.5) - 0.5 * self.control_period
 
         def step(state: TipState, action: Array) -> TipState:
-            stiffness = action[..., 2:]
+            setpoint, stiffness, moves = action[..., :2], action[..., 2:4], action[..., 4:]
             # A floor below any stiffness that matters: the slope of a root is infinite at zero.
             root = jnp.sqrt(jnp.maximum(stiffness, 1e-6) * mass)
             damping = 2.0 * self.damping_ratio[..., None] * root
             impedance = Impedance(
-                mass, self.arm_friction, self.arm_creep, action[..., :2], stiffness, damping
+                mass, delay, self.arm_friction, self.arm_creep, setpoint, stiffness, damping
             )
 
-            def advanced(state: TipState, _: None) -> tuple[TipState, None]:
+            def advanced(state: TipState, moment: Array) -> tuple[TipState, None]:
+                here = impedance._replace(setpoint=setpoint + moment * moves)
                 position, velocity, force = advance(
-                    surfaces, impedance, state.position, state.velocity, time, self.slip
+                    surfaces, here, state.position, state.velocity, time, self.slip
                 )
                 force -= tool * (velocity - state.velocity)
                 sensed = force + late * (state.force - force)
                 return TipState(position, velocity, sensed), None
 
             unroll = count <= UNROLLED
-            return jax.lax.scan(advanced, state, length=count, unroll=unroll)[0]
+            return jax.lax.scan(advanced, state, as_floating(moments), unroll=unroll)[0]
 
         return step
 

@@ -5,6 +5,10 @@ by `palpate train` with the same agent, critic and recovery: once where the reco
 of risky decisions (`srl-vic`), and once where it interrupts what is under way (`bresa`). Violations
 are those of the training itself, the ones before it printed beside. Bresa (arXiv 2503.21989) prints
 that they "sharply decrease", and no number.
+
+Trainings stand beside each other, one on each core. What is found of one is in a small folder
+`TASK-METHOD-SEED-found` below `out`, and is taken as it is; so are trainings in folders
+`TASK-METHOD-SEED`, as `palpate reproduce maze-safe` leaves them.
 """
 
 import functools
@@ -16,6 +20,7 @@ import numpy as np
 
 from palpate.commands import folders, train
 from palpate.commands.episodes import at_its_best, played
+from palpate.experiments.contact.maze_safe import FIRST
 from palpate.experiments.experiment import Experiment, mean_of, ratio, share_of
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
 from palpate.families.contact.navigation_options import EvaluateNavigation, TrainNavigation
@@ -25,7 +30,7 @@ from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 
 NAME = "maze-reflex"
-FIRST, TRAININGS, QUICK_TRAININGS = 1, 3, 1  # seeds of the trainings
+TRAININGS, QUICK_TRAININGS = 3, 1  # seeds
 TRIED = 400_000  # added to a training's seed: that of the episodes its policy is tried in
 EPISODES, QUICK_EPISODES = 500, 4
 QUICK_STEPS, QUICK_ENVIRONMENTS = 200, 4
@@ -52,13 +57,15 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     experiment.announce({task: 2 if quick else each * count for task, each in MINUTES.items()})
     first = experiment.uses(FIRST, count)
     seeds = range(first, first + count)
+    grid = [(task, method, each) for each in seeds for task in TASKS for method in METHODS]
+    experiment.on_every_core(of_training, grid, "trainings")
     found = {
-        (task, method): [trained(experiment, task, method, seed) for seed in seeds]
+        (task, method): [of_training(experiment, task, method, each) for each in seeds]
         for task in TASKS
         for method in METHODS
     }
-    policy = out / f"maze-{INTERRUPTED}-{first}"
-    timed = experiment.found("decision", {"timed": TIMED}, lambda: decision(policy, first))
+    reflex = training_of(experiment, "maze", INTERRUPTED, first)
+    timed = experiment.found("decision", {"timed": TIMED}, lambda: decision(reflex))
     listed = [figure for task in TASKS for figure in figures_of(task, found)]
     listed.append(Figure("decision_p99_ms", timed["p99_ms"], "ms", FAST))
     listed.append(Figure("detail.decision_median_ms", timed["median_ms"], "ms"))
@@ -67,37 +74,53 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     return experiment.result(listed, settings, split)
 
 
-def trained(experiment: Experiment, task: str, method: str, seed: int) -> Found:
+def training_of(experiment: Experiment, task: str, method: str, seed: int) -> Any:
+    """Options of a training, which is small when the experiment is quick."""
+    small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS} if experiment.quick else {}
+    out = experiment.out / f"{task}-{method}-{seed}"
+    return TASKS[task][0](method=method, seed=seed, out=out, **small)
+
+
+def of_training(experiment: Experiment, task: str, method: str, seed: int) -> Found:
     """What a training cost, and what became of its policy's episodes, at every rate."""
-    training, evaluation = TASKS[task]
-    folder = experiment.out / f"{task}-{method}-{seed}"
-    small: dict[str, Any] = {}
-    if experiment.quick:
-        small = {"steps": QUICK_STEPS, "environments": QUICK_ENVIRONMENTS}
-    train.run(training(method=method, seed=seed, out=folder, **small))
-    result = read_result(folder / RESULT)
-    experiment.seconds += result.wall_time_s
-    found: Found = {figure.name: figure.value for figure in result.figures}
-    policy, manifest = load_actor(folder / folders.POLICY)
+    options = training_of(experiment, task, method, seed)
     episodes = QUICK_EPISODES if experiment.quick else EPISODES
-
-    def tried(**asked: Any) -> dict[str, Any]:
-        options = evaluation(policy=folder, seed=TRIED + seed, **asked)
-        make = functools.partial(options.make, manifest=manifest, policy=policy)
-        ended = played(make, at_its_best(policy), episodes, options.seed)
-        return {end: int(np.sum(ended["end"] == end)) for end in ("goal", "violation")}
-
-    about = {"episodes": episodes, "trained": manifest["command"]}
     rates = OTHER_RATES if task == "maze" else {}
-    for rate, asked in {0: {}, **{hz: {"decision_period": s} for hz, s in rates.items()}}.items():
-        stage = f"{folder.name}-tried{f'-at-{rate}-hz' * bool(rate)}"
-        work = functools.partial(tried, **asked)
-        found[f"tried-{rate}"] = experiment.found(stage, about | asked, work) | {"of": episodes}
-    return found
+    about = {
+        "options": folders.configuration_of(options, f"train {task}"),
+        "constants": options.constants(),
+        "episodes": episodes,
+        "rates": list(rates),
+    }
+
+    def work() -> Found:
+        folder = train.run(options)
+        policy, manifest = load_actor(folder / folders.POLICY)
+
+        def tried(**asked: Any) -> dict[str, int]:
+            trial = TASKS[task][1](policy=folder, seed=TRIED + seed, **asked)
+            make = functools.partial(trial.make, manifest=manifest, policy=policy)
+            ended = played(make, at_its_best(policy), episodes, trial.seed)
+            ends = {end: int(np.sum(ended["end"] == end)) for end in ("goal", "violation")}
+            return ends | {"of": episodes}
+
+        found: Found = {
+            figure.name: figure.value for figure in read_result(folder / RESULT).figures
+        }
+        found["tried-0"] = tried()
+        for rate, period in rates.items():
+            found[f"tried-{rate}"] = tried(decision_period=period)
+        return found
+
+    return experiment.found(f"{task}-{method}-{seed}-found", about, work)
 
 
-def decision(folder: Path, seed: int) -> dict[str, float]:
-    """How long the reflex takes in each control period of one world, less its impedance's force."""
+def decision(training: Any) -> dict[str, float]:
+    """How long the reflex takes in each control period of one world, less its impedance's force.
+
+    Of the policy of a training, which is done unless it was.
+    """
+    folder = train.run(training)
     policy, manifest = load_actor(folder / folders.POLICY)
     environments, act = EvaluateMaze(policy=folder).make(1, manifest, policy), at_its_best(policy)
     reflex: Any = environments.law
@@ -111,7 +134,7 @@ def decision(folder: Path, seed: int) -> dict[str, float]:
 
     for law in times:
         law.command = functools.partial(clocked, law, law.command)
-    seen, _ = environments.reset(seed=seed)
+    seen, _ = environments.reset(seed=training.seed)
     for _ in range(TIMED):
         seen = environments.step(act(seen))[0]
     own = np.subtract(times[reflex], times[reflex.law])

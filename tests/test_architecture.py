@@ -47,7 +47,7 @@ STRANGERS = {("models", "worlds"), ("worlds", "models")}
 ENGINE, ENGINE_FREE = "mujoco", {"models", "safety", "planning", "learning", "identification"}
 # Outside the worlds only judges read it, among them the runner for its task, and who is told it.
 TRUTH_FILES = {
-    "trials/trial.py",
+    *("trials/trial.py", "trials/audit.py"),
     "trials/rope/filming.py",  # what a tracker says beside what is
     "trials/furniture/cart_trials.py",  # the controller that is told
     "trials/furniture/namo_episode.py",  # the planner that is told

@@ -24,6 +24,13 @@ class DivergedError(PalpateError):
     """A simulation became too fast for its time step: this episode is lost, and no other."""
 
 
+class Meter(NamedTuple):
+    """Energy in J, as the simulator knows it: for those who audit a controller, and for tests."""
+
+    stored: float  # kinetic and potential, of all that moves; less what contacts store
+    work: float  # done from outside since the reset, by whatever is not the controller
+
+
 class World(ABC):
     """A piece of reality that is acted upon and observed once per control period.
 
@@ -58,6 +65,13 @@ class World(ABC):
 
         Raises `PalpateError`, naming the packages to install, where the machine has no OpenGL.
         """
+
+    def meter(self) -> Meter:
+        """What is stored, and what came from outside since the reset: judges and tests alone.
+
+        Raises `PalpateError` where nobody has told a world to count it.
+        """
+        raise PalpateError(f"{type(self).__name__} has no meter of energy")
 
     def rollout(self, worlds: Sequence[World]) -> Rollout | None:
         """What advances this world and all beside it by whole decisions at once, where that is

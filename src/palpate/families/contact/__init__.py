@@ -28,5 +28,6 @@ FAMILY = Family(
         "contact-model": "palpate.experiments.contact.contact_model:reproduce",
         "maze-arm": "palpate.experiments.contact.maze_arm:reproduce",
         "maze-reflex": "palpate.experiments.contact.maze_reflex:reproduce",
+        "energy-audit": "palpate.experiments.contact.energy_audit:reproduce",
     },
 )

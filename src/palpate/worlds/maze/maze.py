@@ -24,7 +24,7 @@ from palpate.worlds.maze.scene import (
     maze_scene,
 )
 from palpate.worlds.maze.tip import TipObservation, TipWorld, not_negative, wrench_of
-from palpate.worlds.world import Spring, World
+from palpate.worlds.world import Meter, Spring, World
 
 # What the robot may do. With 300 N/m a spring stretched by the displacement limit pulls 9 N, less
 # than any obstacle resists; with 1000 N/m 30 N, more than the force limit.
@@ -162,6 +162,7 @@ class BlindMaze(TipWorld):
         data.qpos[0], data.qpos[-1] = offset, pushed
         self._seat(*(place - np.multiply(offset, SWAY_AXIS)).tolist())
         mujoco.mj_forward(model, data)
+        self._work = 0.0
 
     # --- what another carrier of the tip does in a way of its own -----------------------------
 
@@ -180,8 +181,11 @@ class BlindMaze(TipWorld):
         self._applied[1:4] = x, y, z
         peak = 0.0
         for _ in range(self._substeps):
-            self._applied[0] = self._swaying_force()
+            self._applied[0] = sways = self._swaying_force()
+            before = self._velocity.item(0)
             mujoco.mj_step(model, data)
+            # By the mean of both velocities, as the engine's step gives it to the kinetic energy.
+            self._work += 0.5 * TIME_STEP * sways * (before + self._velocity.item(0))
             peak = max(peak, constraint.item(1) ** 2 + constraint.item(2) ** 2)
         return peak
 
@@ -267,12 +271,20 @@ class BlindMaze(TipWorld):
         self._count, self._peak, self._fault = self._count + periods, peak, False
         self._shown_noise = noise
         wrench, position = wrench_of(self._felt, self._tip_place), self._position[1:4].copy()
+        self._place_before = position
         return TipObservation(
             self._count * self._period, wrench + noise[:6], position + noise[6:],
-            self._velocity[1:4].copy(),
+            self._velocity[1:4].copy(), position - before[2:5],
         )  # fmt: skip
 
     # -------------------------------------------------------------------------------------------
+
+    def meter(self) -> Meter:
+        """See `World.meter`: of stepped worlds; outside is the servo that moves the base."""
+        self._check_ready("has a meter")
+        mujoco.mj_energyPos(self._model, self._data)
+        mujoco.mj_energyVel(self._model, self._data)
+        return Meter(float(self._data.energy.sum()), self._work)
 
     def truth(self) -> TipTruth:
         self._check_ready("has a truth")

@@ -33,6 +33,7 @@ class TipObservation(NamedTuple):
     wrench: np.ndarray
     position: np.ndarray  # (3,) m with noise, of the tip relative to the robot's base
     velocity: np.ndarray  # (3,) m/s relative to the robot's base, of encoders: exact
+    displacement: np.ndarray  # (3,) m since the observation before, like velocity
 
 
 class TipWorld(World):
@@ -91,6 +92,7 @@ class TipWorld(World):
             self._noise = self._random.standard_normal(9)
         self._count, self._peak, self._fault = 0, 0.0, False
         self._ready = True
+        self._place_before = self._motion()[0]
         return self._observe()
 
     # --- what a carrier of the tip does in a way of its own -----------------------------------
@@ -142,11 +144,14 @@ class TipWorld(World):
 
     def _observe(self) -> TipObservation:
         wrench, (position, velocity) = self._wrench(), self._motion()
+        displacement = position - self._place_before
+        self._place_before = position
         if self._noise_scale:
             noise = self._shown_noise = self._next_noise()
             wrench += noise[:6]
-            position += noise[6:]
-        return TipObservation(self._count * self._period, wrench, position, velocity)
+            position = position + noise[6:]
+        time = self._count * self._period
+        return TipObservation(time, wrench, position, velocity, displacement)
 
     def _next_noise(self) -> np.ndarray:
         """(9,) of the Ornstein-Uhlenbeck processes, sampled exactly at the control period."""

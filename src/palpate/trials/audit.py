@@ -1,0 +1,98 @@
+"""What energy a controller can be made to draw, as a meter in the simulator counts it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from palpate.errors import PalpateError
+from palpate.safety.filtered_law import FilteredLaw
+from palpate.worlds.world import World, side_by_side
+
+Actions = Float[np.ndarray, "worlds actions"]
+
+
+@runtime_checkable
+class Adversary(Protocol):
+    """Who decides what the controller is asked to do."""
+
+    def begin(self, worlds: int, random: np.random.Generator) -> None:
+        """An episode of so many worlds begins."""
+        ...
+
+    def decide(self, observation: Any) -> tuple[Actions, Bool[np.ndarray, " worlds"]]:
+        """Actions in [-1, 1] of this control period, and where they are new decisions."""
+        ...
+
+
+class Audit(NamedTuple):
+    """What was found in each world, over all its episodes; energies in J."""
+
+    rise: Float[np.ndarray, " worlds"]  # the greatest of what is stored and in the tank, above the
+    # beginning and less the work from outside
+    margin: Float[np.ndarray, " worlds"]  # the least level above the reserve; inf without a tank
+    drawn: Float[np.ndarray, " worlds"]  # the most that actions gave to the robot in an episode
+    braked: Float[np.ndarray, " worlds"]  # the least share of a braking force that passed
+    touching: Float[np.ndarray, " worlds"]  # the share of periods in contact
+    steps: int  # control periods, of all worlds together
+
+
+def audit(
+    worlds: Sequence[World],
+    law: FilteredLaw,
+    adversary: Adversary,
+    *,
+    periods: int,
+    episodes: int,
+    seed: int,
+    touches: Callable[[Any], bool],
+    reserve: float = 0.0,
+) -> Audit:
+    """Episodes of `periods` control periods in worlds side by side, which have a meter.
+
+    Energy and tank are read at the samples, when the filter has booked what the last force drew:
+    `World.meter` before the next is held. `touches` says of a truth whether the robot is in
+    contact. A force brakes that is against the motion and does not turn it round in one period.
+    Raises `PalpateError` for fewer than one episode or period, and for worlds without a meter.
+    """
+    if min(periods, episodes) < 1:
+        raise PalpateError("an audit takes at least one episode of one control period")
+    random = np.random.default_rng([seed, 7])
+    count = len(worlds)
+    rise, margin, most = np.full((3, count), -np.inf) * [[1], [-1], [1]]
+    braked, touching = np.ones(count), np.zeros(count)
+    for episode in range(episodes):
+        first = seed + count * episode
+        seen = [world.reset(first + number) for number, world in enumerate(worlds)]
+        adversary.begin(count, random)
+        begins, drawn = np.zeros(count), np.zeros(count)
+        for period in range(periods + 1):
+            observation = side_by_side(seen)
+            action, new = adversary.decide(observation)
+            if new.any():
+                law.begin(observation, action, np.full(count, period == 0))
+            force = law.command(observation)
+            meters = np.array([world.meter() for world in worlds])
+            held = meters[:, 0] - meters[:, 1]
+            if law.level is not None:
+                held = held + law.level
+                margin = np.minimum(margin, law.level - reserve)
+            if period == 0:
+                begins = held
+            rise = np.maximum(rise, held - begins)
+            if period == periods:
+                break
+            braked = np.minimum(braked, law.braked(observation))
+            before = np.array([world.truth().position[:2] for world in worlds])
+            for number, world in enumerate(worlds):
+                seen[number] = world.step(force[number])
+            truths = [world.truth() for world in worlds]
+            touching += [touches(truth) for truth in truths]
+            after = np.array([truth.position[:2] for truth in truths])
+            drawn += (law.applied * (after - before)).sum(axis=1)
+            most = np.maximum(most, drawn)
+    return Audit(rise, margin, most, braked, touching / (periods * episodes),
+                 count * periods * episodes)  # fmt: skip

@@ -73,11 +73,12 @@ STAGES = {
         *("families.contact.environments", "families.gymnasium.environments", "worlds.velocity"),
         *("worlds.maze.tip", "worlds.maze.maze", "worlds.maze.mjcf", "worlds.maze.layout"),
         *("worlds.maze.navigation", "worlds.mjcf"),
-        *("worlds.arm.maze", "worlds.arm.panda", "worlds.arm.control"),
+        *("worlds.arm.maze", "worlds.arm.panda", "worlds.arm.control", "worlds.arm.joints"),
         *("worlds.contact.plates", "worlds.contact.touching"),
         *(
             "safety.impedance",
             "safety.self_tuning",
+            "safety.joint_impedance",
             "safety.reflex",
             "safety.port",
             "safety.energy_tank",

@@ -20,6 +20,10 @@ def touches(truth) -> bool:
     return truth.peak_force > 0
 
 
+def sees(observation) -> np.ndarray:
+    return np.concatenate([observation.velocity[:, :2], observation.wrench[:, :2] / 20.0], axis=1)
+
+
 def worlds(period, count=4):
     return [BlindMaze(sway=0.0, scattered=True, control_period=period) for _ in range(count)]
 
@@ -72,7 +76,7 @@ def test_a_tip_behind_the_filter_creates_nothing_and_behind_a_valve_it_does(peri
 def test_a_search_finds_worse_than_chance():
     law = FilteredLaw(maze_law(), TextbookValve(tank=TANK), 1.0, 1e-2, 100.0)
     asked = {"periods": 100, "episodes": 1, "touches": touches}
-    searched, several = SearchedAdversary(4, 8, 0), worlds(1e-2, 8)
+    searched, several = SearchedAdversary(4, sees, 4, 8, 0), worlds(1e-2, 8)
     gains = []
     for generation in range(4):
         found = audit(several, law, searched, seed=20 + generation, **asked)

@@ -8,22 +8,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from palpate.safety.impedance import ImpedanceLaw
-from palpate.safety.port import Filter, Impedance, Numbers, Port, power, size
+from palpate.safety.port import Filter, Impedance, Matrices, Numbers, Port, power, size
 from palpate.worlds.world import ControlLaw
-
-AXES = 2  # in which power flows: the plane
 
 
 class FilteredLaw(ControlLaw):
-    """The law's forces in the plane, as much of them as the filter lets pass.
+    """The law's forces or torques, as much of them as the filter lets pass.
 
-    Observations have `time` (s), and of encoders `displacement` (worlds, 2 or more) m since the
-    last one and `velocity` (m/s). `mass` is what a force moves, kg or (2, 2) kg; `period` (s) that
-    of control. No force of more than `limit` N is asked for, as the robot's drives would cut it
-    off, and the filter has to know what was done.
+    Observations have `time` (s), and of encoders `displacement` (worlds, axes or more) in m or rad
+    since the last one and `velocity`. Power flows through the first `axes` of them and of a
+    command; the rest of a command passes. `mass` is what they move, kg or (axes, axes) kg; where it
+    is None, observations have it. `period` (s) is that of control. No more than `limit` is asked
+    for, of the vector or of each axis, as the robot's drives would cut it off, and the filter has
+    to know what was done.
 
-    `applied` (worlds, 2) N is what the filter let pass in the last control period, `wanted` what
+    `applied` (worlds, axes) is what the filter let pass in the last control period, `wanted` what
     the law asked for.
     """
 
@@ -31,19 +30,20 @@ class FilteredLaw(ControlLaw):
         self,
         law: ControlLaw,
         one: Filter,
-        mass: float | Float[np.ndarray, "2 2"],
+        mass: float | Float[np.ndarray, "axes axes"] | None,
         period: float,
-        limit: float = math.inf,
+        limit: float | Float[np.ndarray, " axes"] = math.inf,
+        axes: int = 2,
     ):
-        self.law, self.filter, self._period, self._limit = law, one, period, limit
-        self._mass = np.asarray(mass, float)
-        if self._mass.ndim == 0:
-            self._mass = self._mass * np.eye(AXES)
-        innermost = law
-        while (inner := getattr(innermost, "law", None)) is not None:
-            innermost = inner
-        self._impedance = innermost if isinstance(innermost, ImpedanceLaw) else None
-        self.wanted = self.applied = np.zeros((0, AXES))
+        self.law, self.filter, self.axes = law, one, axes
+        self._period, self._limit = period, np.asarray(limit, float)
+        self._mass = None if mass is None else np.asarray(mass, float)
+        if self._mass is not None and self._mass.ndim == 0:
+            self._mass = self._mass * np.eye(axes)
+        self._impedance: Any = law  # the innermost
+        while (inner := getattr(self._impedance, "law", None)) is not None:
+            self._impedance = inner
+        self.wanted = self.applied = np.zeros((0, axes))
 
     @property
     def level(self) -> Numbers | None:
@@ -59,32 +59,36 @@ class FilteredLaw(ControlLaw):
         """Take a decision for each world; see `ControlLaw.begin`."""
         if len(self.applied) != len(fresh) or fresh.all():
             self._state = self.filter.begin(len(fresh))
-            self.applied, self._time = np.zeros((len(fresh), AXES)), np.full(len(fresh), np.nan)
+            self.applied = np.zeros((len(fresh), self.axes))
+            self._time = np.full(len(fresh), np.nan)
         elif fresh.any():
             self._state = _anew(fresh, self.filter.begin(len(fresh)), self._state)
             self.applied[fresh], self._time[fresh] = 0.0, np.nan
         self.law.begin(observation, action, fresh)
 
-    def command(self, observation: Any) -> Float[np.ndarray, "worlds 3"]:
-        """Forces in N for the next control period."""
-        force = np.array(self.law.command(observation), float)
-        most = self._limit / np.maximum(size(force), 1e-300)
-        self.wanted = force[:, :AXES] * np.minimum(most, 1.0)[:, None]
-        time, count = np.asarray(observation.time, float), len(force)
+    def command(self, observation: Any) -> Float[np.ndarray, "worlds commands"]:
+        """What to do in the next control period."""
+        force, axes = np.array(self.law.command(observation), float), self.axes
+        if self._limit.ndim:
+            self.wanted = np.clip(force[:, :axes], -self._limit, self._limit)
+        else:
+            most = self._limit / np.maximum(size(force), 1e-300)
+            self.wanted = force[:, :axes] * np.minimum(most, 1.0)[:, None]
+        time = np.asarray(observation.time, float)
         begun = np.isnan(self._time)
-        displacement = np.asarray(observation.displacement, float)[:, :AXES]
+        displacement = np.asarray(observation.displacement, float)[:, :axes]
         port = Port(
             force=self.applied,
             displacement=np.where(begun[:, None], 0.0, displacement),
-            velocity=np.asarray(observation.velocity, float)[:, :AXES],
-            mass=np.broadcast_to(self._mass, (count, AXES, AXES)),
+            velocity=np.asarray(observation.velocity, float)[:, :axes],
+            mass=self._mass_of(observation),
             elapsed=np.where(begun, self._period, time - self._time),
             period=self._period,
             impedance=self._spring(observation),
         )
         self._time = time
         self._state, self.applied = self.filter(self._state, port, self.wanted)
-        force[:, :AXES] = self.applied
+        force[:, :axes] = self.applied
         return force
 
     def braked(self, observation: Any) -> Numbers:
@@ -92,8 +96,8 @@ class FilteredLaw(ControlLaw):
 
         That is a force against the motion that would not turn it round within a period.
         """
-        velocity = np.asarray(observation.velocity, float)[:, :AXES]
-        momentum = velocity @ self._mass
+        velocity = np.asarray(observation.velocity, float)[:, : self.axes]
+        momentum = (self._mass_of(observation) @ velocity[:, :, None])[:, :, 0]
         asked, passed = power(self.wanted, velocity), power(self.applied, velocity)
         against = -size(self.wanted) * size(velocity)
         brakes = (asked < 0.999 * against) & (self._period * size(self.wanted) <= size(momentum))
@@ -101,10 +105,15 @@ class FilteredLaw(ControlLaw):
 
     def _spring(self, observation: Any) -> Impedance | None:
         law = self._impedance
-        if law is None:
+        if not hasattr(law, "stiffness"):
             return None
-        position = np.asarray(observation.position, float)[:, :AXES]
+        position = np.asarray(observation.position, float)[:, : self.axes]
         return Impedance(law.target - position, law.stiffness, law.damping)
+
+    def _mass_of(self, observation: Any) -> Matrices:
+        if self._mass is None:
+            return np.asarray(observation.mass, float)
+        return np.broadcast_to(self._mass, (len(observation.velocity), self.axes, self.axes))
 
 
 def _anew(fresh: Bool[np.ndarray, " worlds"], new: Any, old: Any) -> Any:

@@ -33,8 +33,9 @@ class PassivityFilter:
     action that the tank can pay.
 
     Contact can make an action draw more than predicted: at most |F| times how far the robot gets in
-    a period, when it is not faster than `fastest` (m/s) or than it is now. No action is so great
-    that this would empty the tank below its reserve.
+    a period, when it is not faster than `fastest` (m/s, or rad/s of all joints together), than it
+    is now, or than predicted. No action is so great that this would empty the tank below its
+    reserve.
 
     It fails closed: an action that is not finite is replaced by braking, and where the velocity is
     not known either, by nothing. After a sample that was missing or late, or a clock that jumped,
@@ -82,11 +83,16 @@ class PassivityFilter:
         gain = period * power(action, velocity + 0.5 * period * moved)
         if (over := gain > budget).any():
             share = np.sqrt(np.maximum(now + budget, 0.0) / np.maximum(now + gain, TINY))
-            shorter = share[:, None] * action + (share[:, None] - 1.0) * momentum / period
+            shares = share[:, None]
+            shorter = shares * action + (shares - 1.0) * momentum / period
             action = np.where(over[:, None], shorter, action)
+            moved = np.where(
+                over[:, None], shares * moved + (shares - 1.0) * velocity / period, moved
+            )
         # Below its reserve there is what braking may cost.
         room = np.where(level > tank.reserve, level - tank.reserve, np.maximum(level, 0.0))
-        costs = np.maximum(size(velocity), self.fastest) * size(action) * period
+        speed = np.maximum(size(velocity), size(velocity + period * moved))
+        costs = np.maximum(speed, self.fastest) * size(action) * period
         if (costs > room).any():
             action = action * np.minimum(room / np.maximum(costs, TINY), 1.0)[:, None]
         return level, np.where(moving[:, None], action, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ New = Bool[np.ndarray, " worlds"]
 
 CORNERS = 0.5  # share of random numbers that are the greatest or the least
 TOUCH = 0.5  # N: a force from which on there is something to press on
-SPEED, FORCE = 0.3, 20.0  # m/s and N, which are about 1 to a searched adversary
 WAVES = 2.0, 9.0  # rad a decision, of what it may follow besides what it sees
 
 
@@ -38,11 +38,12 @@ class RandomAdversary:
             count, random = int(new.sum()), self._random
             drawn = random.uniform(-1.0, 1.0, (count, self.actions))
             drawn = np.where(random.uniform(size=drawn.shape) < CORNERS, np.sign(drawn), drawn)
-            force = np.asarray(observation.wrench)[new, :2]
-            size = np.linalg.norm(force, axis=1, keepdims=True)
-            presses = (size[:, 0] > TOUCH) & (random.uniform(size=count) < self.presses)
-            against = -force / np.maximum(size, TOUCH)
-            drawn[:, :2] = np.where(presses[:, None], against, drawn[:, :2])
+            if self.presses:
+                force = np.asarray(observation.wrench)[new, :2]
+                size = np.linalg.norm(force, axis=1, keepdims=True)
+                presses = (size[:, 0] > TOUCH) & (random.uniform(size=count) < self.presses)
+                against = -force / np.maximum(size, TOUCH)
+                drawn[:, :2] = np.where(presses[:, None], against, drawn[:, :2])
             self._action[new] = drawn
             self._left[new] = random.integers(1, self.hold + 1, count)
         self._left -= 1
@@ -52,14 +53,17 @@ class RandomAdversary:
 class SearchedAdversary:
     """Answers what it sees by weights of its own in each world, in every period.
 
-    It sees velocity, force, two waves and a constant; the greatest or the least of each number of
-    an action is asked for, as the weighted sum is positive or negative. `improve` makes the next
-    generation of weights of those that came out worst: the cross-entropy method.
+    It sees what `sees` makes of observations (worlds, numbers of about 1), two waves and a
+    constant; the greatest or the least of each number of an action is asked for, as the weighted
+    sum is positive or negative. `improve` makes the next generation of weights of those that came
+    out worst: the cross-entropy method.
     """
 
-    def __init__(self, actions: int, worlds: int, seed: int):
-        self._random = np.random.default_rng([seed, 11])
-        self._mean = np.zeros((actions, 5 + len(WAVES)))
+    def __init__(
+        self, actions: int, sees: Callable[[Any], np.ndarray], numbers: int, worlds: int, seed: int
+    ):
+        self._random, self._sees = np.random.default_rng([seed, 11]), sees
+        self._mean = np.zeros((actions, numbers + len(WAVES) + 1))
         self._spread = np.ones_like(self._mean)
         self._shape = worlds, *self._mean.shape
         self._draw()
@@ -76,14 +80,8 @@ class SearchedAdversary:
         """See `Adversary.decide`."""
         worlds = len(self.weights)
         waves = np.sin(np.multiply(WAVES, self._count))
-        seen = np.concatenate(
-            [
-                np.asarray(observation.velocity)[:, :2] / SPEED,
-                np.asarray(observation.wrench)[:, :2] / FORCE,
-                np.broadcast_to([*waves, 1.0], (worlds, len(WAVES) + 1)),
-            ],
-            axis=1,
-        )
+        own = np.broadcast_to([*waves, 1.0], (worlds, len(WAVES) + 1))
+        seen = np.concatenate([self._sees(observation), own], axis=1)
         self._count += 1
         answer = np.sign((self.weights @ seen[:, :, None])[:, :, 0])
         return np.where(np.isfinite(answer), answer, 0.0), np.ones(worlds, bool)

@@ -68,7 +68,7 @@ def audit(
         first = seed + count * episode
         seen = [world.reset(first + number) for number, world in enumerate(worlds)]
         adversary.begin(count, random)
-        begins, drawn = np.zeros(count), np.zeros(count)
+        begins, drawn = np.zeros((2, count))
         for period in range(periods + 1):
             observation = side_by_side(seen)
             action, new = adversary.decide(observation)
@@ -86,13 +86,11 @@ def audit(
             if period == periods:
                 break
             braked = np.minimum(braked, law.braked(observation))
-            before = np.array([world.truth().position[:2] for world in worlds])
             for number, world in enumerate(worlds):
                 seen[number] = world.step(force[number])
-            truths = [world.truth() for world in worlds]
-            touching += [touches(truth) for truth in truths]
-            after = np.array([truth.position[:2] for truth in truths])
-            drawn += (law.applied * (after - before)).sum(axis=1)
+            touching += [touches(world.truth()) for world in worlds]
+            went = np.array([one.displacement[: law.axes] for one in seen])
+            drawn += (law.applied * went).sum(axis=1)
             most = np.maximum(most, drawn)
     return Audit(rise, margin, most, braked, touching / (periods * episodes),
                  count * periods * episodes)  # fmt: skip

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.errors import PalpateError
-from palpate.safety.energy_tank import EnergyTank
+from palpate.safety.energy_tank import EnergyTank, TankMeter
 from palpate.safety.filters import FILTERS, filter_of, numbers_of
 from palpate.safety.kinetic_barrier import KineticBarrier
 from palpate.safety.passivity import PassivityFilter
@@ -184,6 +184,26 @@ def test_a_chain_keeps_what_each_of_its_filters_keeps():
     assert alone.level(alone.begin(1)) is None
     _, force = chain(chain.begin(1), port_of([0.65, 0.0]), np.array([[30.0, 0.0]]))
     assert force[0, 0] < 1.0  # 0.21 J already: the barrier's part
+
+
+def test_many_periods_are_booked_as_one_after_the_other():
+    """What is more than the tank holds is lost when it comes, and not in the end."""
+    tank, random = EnergyTank(initial=0.6, upper=0.8), np.random.default_rng(0)
+    drawn = random.normal(0.0, 0.1, (5, 40))
+    level, expected = np.linspace(-0.2, 0.8, 5), []
+    followed = tank.followed(level, drawn)
+    for period in range(40):
+        one = port_of([0.0, 0.0])._replace(
+            force=np.ones((5, 1)), displacement=drawn[:, period : period + 1], elapsed=np.ones(5)
+        )
+        level = tank.booked(level, one, 1.0)
+        expected.append(level)
+    np.testing.assert_allclose(followed, np.transpose(expected), atol=1e-12)
+    assert (followed == 0.8).any()
+    meter, push = TankMeter(tank=tank), np.array([[1e3, np.nan]])
+    level, action = meter(meter.begin(1), port_of([1.0, 0.0], 1.0, [9.0, 0.0], [1.0, 0.0]), push)
+    assert level[0] == pytest.approx(0.6 - 9.0)
+    assert action is push
 
 
 def test_filters_have_names_and_numbers():

@@ -60,5 +60,5 @@ def test_torques_are_cut_off_at_what_joints_give_and_nan_is_none(monkeypatch):
     with pytest.raises(PalpateError, match="after reset"):
         JointArm().step(np.zeros(7))
     monkeypatch.setattr(joints, "FASTEST", 1e-3)
-    with pytest.raises(DivergedError, match="faster than 0.001 rad/s"):
+    with pytest.raises(DivergedError, match="a joint is faster"):
         arm.step(TORQUE_LIMITS)

@@ -5,6 +5,8 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.families.contact.environments import arm_maze, blind_mazes
+from palpate.safety.energy_tank import EnergyTank, TankMeter
+from palpate.safety.passivity import PassivityFilter
 from palpate.worlds.gymnasium import VIOLATION
 from palpate.worlds.maze.maze import BlindMaze
 from palpate.worlds.world import Spring, SpringLaw
@@ -115,3 +117,27 @@ def test_what_follows_sensors_in_every_period_is_stepped():
     assert blind_mazes(1, reflex=True).lockstep._rollout is None
     assert arm_maze().lockstep._rollout is None
     assert BlindMaze(control_period=0.002).rollout([BlindMaze(control_period=0.002)]) is None
+
+
+def test_energy_that_is_drawn_within_a_held_decision_is_that_of_the_stepped_one():
+    """Stepped, what the last period drew is booked with the next decision."""
+    meter = TankMeter(tank=EnergyTank(initial=0.6, upper=0.6))
+    rolled, stepped = pair(noise=1.0, passes=meter, horizon=1000, force_limit=1e3)
+    rolled.reset(seed=3)
+    stepped.reset(seed=3)
+    random, totals, flows = np.random.default_rng(0), np.zeros((2, 6)), np.zeros((2, 6))
+    for _ in range(25):
+        action = random.uniform(-1, 1, (6, 4))
+        told = [one.step(action)[4] for one in (rolled, stepped)]
+        if (told[0]["end"] != "").any():
+            break
+        totals += [one["drawn"] for one in told]
+        flows = np.maximum(flows, [one["flow"] for one in told])
+        np.testing.assert_allclose(told[0]["level"], told[1]["level"], atol=0.01)
+    assert totals.min() > 0.1
+    np.testing.assert_allclose(totals[0], totals[1], atol=0.01)
+    np.testing.assert_allclose(flows[0], flows[1], rtol=1e-6)
+    behind = blind_mazes(6, passes=PassivityFilter(tank=meter.tank))
+    behind.reset(seed=3)
+    with pytest.raises(PalpateError, match="not rolled out"):
+        behind.lockstep.law.book(np.zeros((6, 100)))

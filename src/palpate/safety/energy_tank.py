@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from palpate.errors import PalpateError
-from palpate.safety.port import Numbers, Port, finite, power, size
+from palpate.safety.port import Numbers, Port, Vectors, finite, power, size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,3 +60,37 @@ class EnergyTank:
             worst = np.minimum(np.nan_to_num(worst, posinf=math.inf), level + self.upper)
             drawn = np.where(known, drawn, worst)
         return np.minimum(level - drawn, self.upper)
+
+    def followed(
+        self, level: Numbers, drawn: Float[np.ndarray, "robots periods"]
+    ) -> Float[np.ndarray, "robots periods"]:
+        """The level after each of many periods in which so much was drawn (J).
+
+        What is more than the tank holds is lost: reflection at the upper bound.
+        """
+        free = level[:, None] - np.cumsum(drawn, axis=1)
+        lost = np.maximum.accumulate(np.maximum(free - self.upper, 0.0), axis=1)
+        return free - lost
+
+
+@dataclass(frozen=True, kw_only=True)
+class TankMeter:
+    """A tank that is booked and blocks nothing: what a controller would have drawn from it.
+
+    The state is its level, (robots,) J, which may be below zero.
+    """
+
+    tank: EnergyTank
+    fastest: float = 1.0  # m/s, see `EnergyTank.booked`
+
+    def begin(self, robots: int) -> Numbers:
+        """See `Filter.begin`."""
+        return np.full(robots, self.tank.initial)
+
+    def level(self, state: Numbers) -> Numbers:
+        """See `Filter.level`."""
+        return state
+
+    def __call__(self, state: Numbers, port: Port, action: Vectors) -> tuple[Numbers, Vectors]:
+        """See `Filter.__call__`: every action passes."""
+        return self.tank.booked(state, port, self.fastest), action

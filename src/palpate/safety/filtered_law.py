@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from palpate.errors import PalpateError
+from palpate.safety.energy_tank import TankMeter
 from palpate.safety.port import Filter, Impedance, Matrices, Numbers, Port, power, size
-from palpate.worlds.world import ControlLaw
+from palpate.worlds.world import ControlLaw, Spring, SpringLaw, innermost
 
 
 class FilteredLaw(ControlLaw):
@@ -40,10 +42,9 @@ class FilteredLaw(ControlLaw):
         self._mass = None if mass is None else np.asarray(mass, float)
         if self._mass is not None and self._mass.ndim == 0:
             self._mass = self._mass * np.eye(axes)
-        self._impedance: Any = law  # the innermost
-        while (inner := getattr(self._impedance, "law", None)) is not None:
-            self._impedance = inner
+        self._impedance = innermost(law)
         self.wanted = self.applied = np.zeros((0, axes))
+        self.drawn = self.flow = np.zeros(0)
 
     @property
     def level(self) -> Numbers | None:
@@ -64,7 +65,29 @@ class FilteredLaw(ControlLaw):
         elif fresh.any():
             self._state = _anew(fresh, self.filter.begin(len(fresh)), self._state)
             self.applied[fresh], self._time[fresh] = 0.0, np.nan
+        self.drawn, self.flow = np.zeros((2, len(fresh)))
         self.law.begin(observation, action, fresh)
+
+    def spring(self) -> Spring | None:
+        """See `SpringLaw`: that of the law, where all of it passes."""
+        law = self.law
+        if isinstance(self.filter, TankMeter) and isinstance(law, SpringLaw):
+            return law.spring()
+        return None
+
+    def book(self, drawn: Float[np.ndarray, "worlds periods"]) -> None:
+        """See `MeteredLaw.book`."""
+        if not isinstance(self.filter, TankMeter):
+            raise PalpateError("what has to pass a filter in every period is not rolled out")
+        self._state = self.filter.tank.followed(self._state, drawn)[:, -1]
+        self._count(drawn)
+        # Of the last period everything is booked: the next command goes on from here.
+        self.applied, self._time = np.zeros_like(self.applied), np.full(len(drawn), np.nan)
+
+    def _count(self, drawn: Float[np.ndarray, "worlds periods"]) -> None:
+        drawn = np.nan_to_num(drawn, posinf=0.0, neginf=0.0)  # what nobody knows
+        self.drawn = self.drawn + np.maximum(drawn, 0.0).sum(axis=1)
+        self.flow = np.maximum(self.flow, drawn.max(axis=1) / self._period)
 
     def command(self, observation: Any) -> Float[np.ndarray, "worlds commands"]:
         """What to do in the next control period."""
@@ -87,6 +110,7 @@ class FilteredLaw(ControlLaw):
             impedance=self._spring(observation),
         )
         self._time = time
+        self._count(power(port.force, port.displacement)[:, None])
         self._state, self.applied = self.filter(self._state, port, self.wanted)
         force[:, :axes] = self.applied
         return force

@@ -7,21 +7,23 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from palpate.errors import PalpateError
-from palpate.safety.energy_tank import EnergyTank
+from palpate.safety.energy_tank import EnergyTank, TankMeter
 from palpate.safety.kinetic_barrier import KineticBarrier
 from palpate.safety.passivity import PassivityFilter
 from palpate.safety.port import Filter
 from palpate.safety.stiffness_rate import StiffnessRate
 from palpate.safety.valves import TextbookValve, schindlbeck
 
+NONE = "none"  # which blocks nothing, and counts
 FILTERS: dict[str, Callable[..., Filter]] = {
     "passivity": PassivityFilter,
     "textbook-valve": TextbookValve,
     "schindlbeck": schindlbeck,
     "stiffness-rate": StiffnessRate,
     "kinetic-barrier": KineticBarrier,
+    NONE: TankMeter,
 }
-WITH_TANK = "passivity", "textbook-valve", "schindlbeck"
+WITH_TANK = "passivity", "textbook-valve", "schindlbeck", NONE
 
 
 def filter_of(name: str, numbers: Mapping[str, Any]) -> Filter:

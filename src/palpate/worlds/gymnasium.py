@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -19,6 +19,7 @@ from palpate.worlds.world import (
     ControlLaw,
     DivergedError,
     InterruptingLaw,
+    MeteredLaw,
     SpringLaw,
     World,
     side_by_side,
@@ -74,18 +75,44 @@ def features_of(task: WorldTask, observation: Any) -> np.ndarray:
     return np.clip(seen, -FEATURE_LIMIT, FEATURE_LIMIT).astype(np.float32)
 
 
+class EnergyCosts(NamedTuple):
+    """What a decision costs by the energy that it draws, and what a policy sees of the tank.
+
+    Its level is seen as a share of `full` J. "eb" costs 1 where the level is at most `lower` J when
+    the decision ends, "ef" where more than `flow` W were drawn within it: the budget and the flow
+    of passivity-centric safe RL (arXiv 2503.00287), read as conditions of a violation.
+    """
+
+    costs: tuple[str, ...]  # "eb", "ef"
+    full: float  # J
+    lower: float  # J
+    flow: float  # W
+
+    def of(self, law: MeteredLaw) -> np.ndarray:
+        """(worlds,) of the decision that has ended."""
+        level = np.inf if law.level is None else law.level
+        broken = {"eb": level <= self.lower, "ef": law.flow > self.flow}
+        return np.sum([np.broadcast_to(broken[name], law.flow.shape) for name in self.costs], 0)
+
+
 class Lockstep:
     """Worlds side by side at the control rate, whose decisions are taken together.
 
     Where the law can interrupt, `motions` are the pieces of the last decision of all. Worlds that
     can be rolled out are, while the law is a spring (`SpringLaw`) and a contact force above the
-    task's `force_limit` is what violates.
+    task's `force_limit` is what violates. With `energy` decisions cost what they draw, in place of
+    violations; the law has to be a `MeteredLaw` then.
     """
 
     def __init__(
-        self, worlds: Sequence[World], task: WorldTask, law: ControlLaw | None, every: int
+        self,
+        worlds: Sequence[World],
+        task: WorldTask,
+        law: ControlLaw | None,
+        every: int,
+        energy: EnergyCosts | None = None,
     ):
-        self.worlds, self.task, self.law = tuple(worlds), task, law
+        self.worlds, self.task, self.law, self.energy = tuple(worlds), task, law, energy
         self.every = whole_periods(every)
         count = len(self.worlds)
         if not count:
@@ -102,7 +129,8 @@ class Lockstep:
         self._rollout = None
         if isinstance(law, SpringLaw) and hasattr(task, "force_limit"):
             self._rollout = self.worlds[0].rollout(self.worlds)
-        one = np.ones(task.features, np.float32) * FEATURE_LIMIT
+        numbers = task.features + (energy is not None)
+        one = np.ones(numbers, np.float32) * FEATURE_LIMIT
         self.observation_space = Box(-one, one)
         self.action_space = Box(-1.0, 1.0, (task.actions,), np.float32)
 
@@ -114,8 +142,14 @@ class Lockstep:
         self.fresh[number], self.decisions[number] = True, 0
 
     def features(self) -> np.ndarray:
-        """What the task sees of all worlds, (worlds, features) float32."""
-        return features_of(self.task, side_by_side(self.observations))
+        """What the task sees of all worlds, and of a tank its level, (worlds, features) float32."""
+        seen, energy = features_of(self.task, side_by_side(self.observations)), self.energy
+        if energy is None:
+            return seen
+        level: Any = None if self.fresh.all() else getattr(self.law, "level", None)
+        full = np.where(self.fresh, energy.full, energy.full if level is None else level)
+        share = np.clip(full / energy.full, -FEATURE_LIMIT, FEATURE_LIMIT)
+        return np.concatenate([seen, share[:, None].astype(np.float32)], axis=1)
 
     def decide(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
         """Rewards, who terminated, who was cut off, and what else is told, each (worlds,).
@@ -145,6 +179,12 @@ class Lockstep:
         told = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
         told["force"] = force
         told["progress"] = np.array([*map(task.progress, self._first, truths)])
+        if isinstance(law, MeteredLaw):
+            told |= {"drawn": law.drawn, "flow": law.flow}
+            if law.level is not None:
+                told["level"] = law.level
+            if self.energy is not None:
+                told["cost"] = self.energy.of(law).astype(np.float32)
         return reward, (end != "") & ~cut, cut, told
 
     def _held(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -154,6 +194,8 @@ class Lockstep:
         if spring is None or self._rollout is None:
             return None
         held = self._rollout.hold(spring, self.every, self._force_limit)
+        if isinstance(law, MeteredLaw):
+            law.book(held.drawn)
         self.observations[:], self._truths[:] = held.observations, held.truths
         end = np.full(len(self.worlds), "", object)
         end[held.violated], end[held.diverged] = VIOLATION, DIVERGED
@@ -196,7 +238,9 @@ class GymnasiumWorlds(VectorEnv):
     once, within the decision), "end" (str: "" while it goes on, else what the task says,
     "violation", "horizon" or "diverged"), "force" (N, the greatest in this decision) and "progress"
     (the share of the way that is behind it); "final_obs" where an episode ended; and where the law
-    can interrupt (`InterruptingLaw`) "motions", the pieces of this decision (`Motions.pieces`). An
+    can interrupt (`InterruptingLaw`) "motions", the pieces of this decision (`Motions.pieces`);
+    where it counts energy (`MeteredLaw`) "drawn" (J), "flow" (W) and "level" (J). With `energy`
+    "cost" is that of `EnergyCosts`, and the last feature the level of the tank. An
     episode that is cut off at the horizon, or whose simulation diverged, is truncated.
     """
 
@@ -211,8 +255,9 @@ class GymnasiumWorlds(VectorEnv):
         law: ControlLaw | None,
         every: int,
         render_mode: str | None = None,
+        energy: EnergyCosts | None = None,
     ):
-        self.lockstep = Lockstep(worlds, task, law, every)
+        self.lockstep = Lockstep(worlds, task, law, every, energy)
         self.num_envs, self.render_mode = len(worlds), render_mode
         self.single_observation_space = self.lockstep.observation_space
         self.single_action_space = self.lockstep.action_space
@@ -285,8 +330,9 @@ class GymnasiumWorld(gymnasium.Env):
         law: ControlLaw | None,
         every: int,
         render_mode: str | None = None,
+        energy: EnergyCosts | None = None,
     ):
-        self.lockstep = Lockstep([world], task, law, every)
+        self.lockstep = Lockstep([world], task, law, every, energy)
         self.observation_space = self.lockstep.observation_space
         self.action_space = self.lockstep.action_space
         self.render_mode = render_mode

@@ -96,6 +96,13 @@ class ControlLaw(Protocol):
         ...
 
 
+def innermost(law: Any) -> Any:
+    """What a law wraps in the end: the law that no reflex and no filter is."""
+    while (inner := getattr(law, "law", None)) is not None:
+        law = inner
+    return law
+
+
 @runtime_checkable
 class InterruptingLaw(ControlLaw, Protocol):
     """A control law that may put another action in the place of the one under way.
@@ -127,6 +134,28 @@ class SpringLaw(ControlLaw, Protocol):
         ...
 
 
+@runtime_checkable
+class MeteredLaw(ControlLaw, Protocol):
+    """A control law that knows what energy its commands draw, and what is left in a tank.
+
+    `level` (worlds,) J is that of the tank, None without one; `drawn` (worlds,) J what commands of
+    this decision have put into the robot, without what they took out; `flow` (worlds,) W the most
+    that they gave in a control period.
+    """
+
+    drawn: np.ndarray
+    flow: np.ndarray
+
+    @property
+    def level(self) -> np.ndarray | None:
+        """See the class."""
+        ...
+
+    def book(self, drawn: np.ndarray) -> None:
+        """Of a decision that was one spring (worlds, periods) J, period by period."""
+        ...
+
+
 class Held(NamedTuple):
     """What came of a spring that was held in worlds side by side."""
 
@@ -135,6 +164,7 @@ class Held(NamedTuple):
     force: np.ndarray  # (worlds,) N, the greatest contact force
     violated: np.ndarray  # (worlds,) bool: it was above the limit, and the world has stopped there
     diverged: np.ndarray  # (worlds,) bool: the simulation did, and the world is to begin anew
+    drawn: np.ndarray  # (worlds, periods) J that the spring's force did; 0 when it had stopped
 
 
 class Rollout(Protocol):

@@ -34,4 +34,25 @@ def figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure
         *found,
         Figure(f"decisions_to_goal{suffix}", float(arrived.mean()) if len(arrived) else None, ""),
         Figure(f"greatest_force_n{suffix}", float(np.median(episodes["force"])), "N"),
+        *energy_figures(episodes, suffix),
     ]
+
+
+def energy_figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
+    """What was put into the robot in episodes that reached the goal, and how low the tank came.
+
+    The energy is a median, without what was taken out again. Nothing where nobody counted.
+    """
+    nothing = np.full(len(episodes["end"]), np.nan)
+    drawn, level = (episodes.get(name, nothing) for name in ("drawn", "level"))
+    if not np.isfinite(drawn).any():
+        return []
+    arrived = drawn[episodes["end"] == GOAL]
+    found = [
+        Figure(f"energy_drawn_j{suffix}", float(np.median(arrived)) if len(arrived) else None, "J"),
+        Figure(f"greatest_power_w{suffix}", float(np.median(episodes["flow"])), "W"),
+    ]
+    if np.isfinite(level).any():
+        least = float(np.nanmin(level))
+        found.append(Figure(f"least_tank_level_j{suffix}", least, "J", better="higher"))
+    return found

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 Mazes = Annotated[tuple[str, ...], arg(metavar="NAME ...")]
 HOME, CARRIERS = ("home",), ("tip", "arm")
+NONE, LEAST_TANK = "none", 0.3  # J: above its lower bound
+Filters = Literal[
+    "none", "passivity", "textbook-valve", "schindlbeck", "stiffness-rate", "kinetic-barrier"
+]
 MJCF = ".xml"
 
 
@@ -44,13 +48,17 @@ class TrainMaze(TrainSkill):
 
     method: Literal[
         "srl-vic", "bresa", "no-recovery", "k300", "k500", "k600", "k1000", "self-tuning",
-        "lagrangian", "penalty", "position-critic",
+        "lagrangian", "penalty", "position-critic", "passive",
     ] = "srl-vic"  # fmt: skip
     """srl-vic: a critic of risks that feels forces alone overrules the policy by a recovery;
     bresa: it is asked a thousand times a second, and interrupts what is under way;
     position-critic: it is told positions too; k...: srl-vic at that stiffness (N/m);
     self-tuning: at one that rises while something resists; no-recovery: nothing overrules it;
-    lagrangian, penalty: violations as a constraint, or at a price."""
+    lagrangian, penalty: violations as a constraint, or at a price; passive: the energy that it
+    draws as a constraint, and what is left of it is seen."""
+    costs: tuple[Literal["eb", "ef"], ...] = ("eb", "ef")
+    """Of passive: eb: decisions that leave the tank at its lower bound; ef: those that draw more
+    than its flow at a time."""
     mazes: Mazes = HOME
     """To train in, one drawn for each episode."""
     world: Annotated[
@@ -91,6 +99,10 @@ class TrainMaze(TrainSkill):
         found = super().constants()
         if self.force_limit is not None:  # which features are a share of
             found["task.force_limit"] = self.force_limit
+        if self.skill().method(self.method).passive:
+            from palpate.families.contact.environments import TANK
+
+            found["energy"] = TANK
         if self.world is not None:
             found["world.effective_mass"] = MjcfWorld(self.world).effective_mass.tolist()
         return found
@@ -102,8 +114,12 @@ class TrainMaze(TrainSkill):
         from palpate.families.contact.methods import TRAINING_HORIZON
 
         method = self.skill().method(self.method)
+        metered: dict[str, Any] = {}
+        if method.passive:
+            metered = metered_by(NONE, None, self.costs)
         return blind_mazes(
             count,
+            **metered,
             layouts=self.mazes,
             file=self.world,
             force_limit=self.force_limit,
@@ -129,6 +145,7 @@ class EvaluateMaze(EvaluateSkill):
                                                     --mazes unseen-1 unseen-2
     3. By a seven-axis arm, not trained anew:   palpate evaluate maze --policy P --world arm
     4. In another world of your own:            palpate evaluate maze --policy P --world other.xml
+    5. Behind a filter of energy:               palpate evaluate maze --policy P --filter passivity
     """
 
     task: ClassVar[str] = "maze"
@@ -148,9 +165,16 @@ class EvaluateMaze(EvaluateSkill):
         float | None, arg(metavar="SECONDS", help_behavior_hint="(default: as trained)")
     ] = None
     """For which each decision holds."""
+    filter: Filters = NONE
+    """That forces have to pass: none only counts the energy; the others are passivity, and what
+    it is held against."""
+    tank: Annotated[float | None, arg(metavar="JOULE", help_behavior_hint="(default: 0.6)")] = None
+    """That the filter's tank holds in the beginning, and at most."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.tank is not None and not LEAST_TANK <= self.tank < float("inf"):
+            raise PalpateError(f"--tank is at least {LEAST_TANK} J, not {self.tank}")
         if self.decision_period is not None and not 1e-3 <= self.decision_period <= 10.0:
             raise PalpateError(
                 f"--decision-period is from 0.001 to 10 s, not {self.decision_period}"
@@ -192,8 +216,10 @@ class EvaluateMaze(EvaluateSkill):
         trained = manifest["options"]
         method = MAZE.method(trained["method"])
         make = arm_mazes if self.world == "arm" else blind_mazes
+        costs = tuple(trained["costs"]) if method.passive else None
         return make(
             count,
+            **metered_by(self.filter, self.tank, costs),
             layouts=self.mazes or tuple(trained["mazes"]),
             file=self._file(manifest),
             force_limit=trained.get("force_limit"),
@@ -219,6 +245,8 @@ class EvaluateMaze(EvaluateSkill):
     def about(self, manifest: Mapping[str, Any]) -> str:
         mazes, file = self.mazes or manifest["options"]["mazes"], self._file(manifest)
         where = f"the maze {', '.join(mazes)}, felt by the {self.world or CARRIERS[0]}"
+        if self.filter != NONE:
+            where += f", behind the filter {self.filter}"
         if file is not None:
             where = f"the world {file}, {manifest['constants']['task.force_limit']:g} N allowed"
         return f"tried in {where}, with {self.noise:g} times the sensors' noise"
@@ -227,6 +255,26 @@ class EvaluateMaze(EvaluateSkill):
         from palpate.families.contact.path_picture import show_path
 
         show_path(run.path, policy, self.make(1, manifest, policy), self.seed)
+
+
+def metered_by(name: str, tank: float | None, costs: tuple[str, ...] | None) -> dict[str, Any]:
+    """Options of environments whose energy is counted, behind the filter of that name.
+
+    The tank holds so many J (None: as it was designed). With `costs` decisions cost what they draw.
+    """
+    from palpate.families.contact.environments import TANK
+    from palpate.safety.energy_tank import EnergyTank
+    from palpate.safety.filters import WITH_TANK, filter_of
+    from palpate.worlds.gymnasium import EnergyCosts
+
+    numbers = TANK if tank is None else {**TANK, "initial": tank, "upper": tank}
+    asked: dict[str, Any] = {
+        "passes": filter_of(name, {"tank": numbers} if name in WITH_TANK else {})
+    }
+    if costs is not None:
+        known = EnergyTank(**numbers)
+        asked["energy"] = EnergyCosts(costs, known.initial, known.lower, known.flow)
+    return asked
 
 
 def _check_no_mazes(world: str | Path, mazes: tuple[str, ...]) -> None:

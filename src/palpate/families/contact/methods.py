@@ -41,6 +41,7 @@ RISK_DISCOUNT, RISK_THRESHOLD = 0.1, 0.0015
 NAVIGATION_DISCOUNT, NAVIGATION_THRESHOLD = 0.8, 0.3  # Recovery RL's
 VIOLATION_PRICE = 50.0  # of the penalty, in rewards: more than the whole way to the goal is worth
 COST_LIMIT = 0.02  # Lagrangian: violations an episode
+ENERGY_LIMIT = 0.5  # the same: decisions of an episode that break a bound of energy
 PRETRAINING_STEPS, PRETRAINING_UPDATES = 60_000, 12_000
 TRAINING_HORIZON = 150  # decisions: whoever is stuck begins anew sooner, somewhere else
 HELD = (3, 15)  # decisions for which a scripted collision keeps its direction
@@ -53,6 +54,7 @@ class Method:
 
     agent: Agent
     stiffness: float | str | None = None
+    passive: bool = False  # whether energy is what it pays for, and it sees the tank's level
 
     @property
     def guarded(self) -> bool:
@@ -93,6 +95,10 @@ METHODS: dict[str, Callable[[], Method]] = {
         Lagrangian(_agent(), COST_LIMIT, discount=DISCOUNT, multiplier_rate=1e-3, width=WIDTH)
     ),
     "penalty": lambda: Method(Penalty(_agent(), VIOLATION_PRICE)),
+    "passive": lambda: Method(
+        Lagrangian(_agent(), ENERGY_LIMIT, discount=DISCOUNT, multiplier_rate=1e-3, width=WIDTH),
+        passive=True,
+    ),
 }
 
 
@@ -124,10 +130,13 @@ class Skill:
         """The method of that name; raises `PalpateError` that lists all."""
         return self.methods[check_name("method", name, self.methods)]()
 
-    def policy(self, agent: Agent, state: Any) -> ActorPolicy:
+    def policy(self, method: Method, state: Any) -> ActorPolicy:
         """The controller of an agent's state: its actor, under the guard where it has one."""
+        agent, observations = method.agent, self.observations
+        if method.passive:
+            observations = *observations, Channel("tank", (1,))
         declared: dict[str, Any] = {
-            "observations": self.observations,
+            "observations": observations,
             "actions": self.actions,
             "period": self.period,
         }

@@ -14,10 +14,10 @@ from matplotlib.transforms import Affine2D
 
 from palpate.networks.guarded import ActorPolicy, GuardedPolicy
 from palpate.report.picture import canvas_of, save_animation, save_picture
-from palpate.safety.reflex import Reflex
 from palpate.worlds.gymnasium import GymnasiumWorlds
 from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
 from palpate.worlds.maze.mjcf import OpenLayout
+from palpate.worlds.world import innermost
 
 PICTURE, FILM = "path.png", "rendering.webp"
 LEAST_RISK = 1e-5  # that is drawn
@@ -54,7 +54,7 @@ def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Epi
     observation, _ = environment.reset(seed=seed)
     inside: Any = environment.lockstep
     (world,), task, law = inside.worlds, inside.task, inside.law
-    impedance: Any = law.law if isinstance(law, Reflex) else law
+    impedance = innermost(law)
     layout, end, rows = world.truth().layout, "", []
 
     @jax.jit

@@ -65,7 +65,7 @@ class TrainSkill(TrainInWorld, ABC):
             environments.close()
 
     def policy(self, state: Any) -> ActorPolicy:
-        return self.skill().policy(self.agent(), state)
+        return self.skill().policy(self.skill().method(self.method), state)
 
     def constants(self) -> dict[str, Any]:
         return self.skill().constants(self.skill().method(self.method))

@@ -10,6 +10,10 @@ from palpate.errors import PalpateError
 from palpate.learning.off_policy.buffer import Motion, Transition
 from palpate.safety.reflex import Reflex
 
+# The greatest force in the step, N; the share of the way behind it; energy put into the robot in
+# the step, J; the most of it at a time, W; and the level of a tank after it, J.
+TOLD = "force", "progress", "drawn", "flow", "level"
+
 
 def check(environments: VectorEnv) -> tuple[int, int]:
     """How many numbers are seen and done in each.
@@ -68,9 +72,9 @@ def advance(
     """One step of all: the transitions, what is seen then, and what else was told of each.
 
     Actions lie in [-1, 1], which is stretched onto the environments' bounds. Told are "ended"
-    (bool), "end" (how, "" where it goes on or nothing says so), "force" (N, the greatest in the
-    step) and "progress" (share of the way behind it; both NaN where nothing says so), each
-    (environments,); and where a decision can be interrupted "motions", as `Motions.pieces`.
+    (bool), "end" (how, "" where it goes on or nothing says so), and what is `TOLD`, NaN where
+    nothing says so, each (environments,); and where a decision can be interrupted "motions", as
+    `Motions.pieces`.
 
     Raises `PalpateError` for observations, rewards and costs that are not finite.
     """
@@ -94,10 +98,7 @@ def advance(
         np.asarray(terminated, np.float32),
     )
     end = _told(infos, "end", ended, np.full(len(ended), "", object))
-    told = {
-        name: _told(infos, name, ended, np.full(len(ended), np.nan))
-        for name in ("force", "progress")
-    }
+    told = {name: _told(infos, name, ended, np.full(len(ended), np.nan)) for name in TOLD}
     told |= {name: infos[name] for name in ("motions",) if name in infos}
     return lived, _finite("observation", after), {"ended": ended, "end": end, **told}
 

@@ -10,12 +10,22 @@ from gymnasium.vector import VectorEnv
 from palpate.errors import PalpateError
 from palpate.learning.off_policy.agent import Agent
 from palpate.learning.off_policy.buffer import Motion, Transition
-from palpate.learning.off_policy.environments import advance, begun, check, motions_of
+from palpate.learning.off_policy.environments import TOLD, advance, begun, check, motions_of
 from palpate.runs.progress import Watch, unwatched
 
 # From observations (environments, features), whether each has just begun, and a generator:
 # actions (environments, actions) in [-1, 1].
 Script = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
+
+
+# What is told of an episode so far, and of its next step, as one.
+JOINED: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "force": np.fmax,
+    "progress": lambda _, now: now,
+    "drawn": lambda before, now: np.nan_to_num(before) + now,
+    "flow": np.fmax,
+    "level": np.fmin,
+}
 
 
 def collect(
@@ -65,8 +75,8 @@ def evaluate(
     """What exactly `episodes` episodes gave, each array (episodes,).
 
     "return", "cost" (sums), "length" (decisions), "end" (how, "" if the environments do not say),
-    "force" (the greatest of the episode) and "progress" (in the end; both NaN if they do not say).
-    `act` gives actions
+    "force" (the greatest of the episode), "progress" (in the end), "drawn" (J, the sum), "flow" (W,
+    the most) and "level" (J, the least), all NaN if they do not say. `act` gives actions
     (environments, actions) in [-1, 1] for observations (environments, features).
 
     Which environment plays how many is settled beforehand, in turns: were the first to end the ones
@@ -80,7 +90,7 @@ def evaluate(
         raise PalpateError(f"{episodes} episodes were asked for: expected at least one")
     count = environments.num_envs
     found = {name: np.zeros(episodes) for name in ("return", "cost", "length")}
-    found |= {name: np.full(episodes, np.nan) for name in ("force", "progress")}
+    found |= {name: np.full(episodes, np.nan) for name in TOLD}
     found["end"] = np.full(episodes, "", object)
     playing = np.arange(count)  # the number of the episode that each environment plays
     observation, due = begun(environments, seed, 0), iter(watch(range(episodes)))
@@ -92,8 +102,8 @@ def evaluate(
         found["return"][those] += np.asarray(lived.reward)[counts]
         found["cost"][those] += np.asarray(lived.cost)[counts]
         found["length"][those] += 1
-        found["force"][those] = np.fmax(found["force"][those], told["force"][counts])
-        found["progress"][those] = told["progress"][counts]
+        for name, joined in JOINED.items():
+            found[name][those] = joined(found[name][those], told[name][counts])
         over = counts & told["ended"]
         found["end"][playing[over]] = told["end"][over]
         playing[over] += count

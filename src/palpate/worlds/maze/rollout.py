@@ -22,6 +22,7 @@ from palpate.worlds.world import Held, Rollout, Spring
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 FORCES = mujoco.mjtState.mjSTATE_QFRC_APPLIED
+TIP_DOFS = slice(1, 3)  # of the tip in the plane, after the base's
 
 
 @runtime_checkable
@@ -82,6 +83,7 @@ class MazeRollout(Rollout):
         for number, world in enumerate(worlds):
             pull = Spring(*(part[number] for part in spring))
             forces[number], noises[number] = world.begin_hold(pull, periods)
+        offsets = forces[:, :, TIP_DOFS]  # N: what the spring gives where the tip is at 0
         try:
             states, felt = self._engine.rollout(
                 models, self._workspace, initial, forces, control_spec=FORCES, nstep=periods
@@ -98,6 +100,11 @@ class MazeRollout(Rollout):
         nth = np.arange(len(worlds))
         before = np.where(last[:, None] > 0, states[nth, last - 1], initial)
         until = np.arange(periods) <= last[:, None]
+        starts = np.concatenate([initial[:, None], states[:, :-1]], axis=1)[:, :, 1:]
+        position, velocity = starts[:, :, TIP_DOFS], starts[:, :, models[0].nq :][:, :, TIP_DOFS]
+        given = offsets - position @ spring.stiffness - velocity @ spring.damping
+        went = states[:, :, 1:][:, :, TIP_DOFS] - position
+        drawn = np.where(until, (given * went).sum(axis=2), 0.0)
         observations, truths = [], []
         for number, world in enumerate(worlds):
             at = last[number]
@@ -109,7 +116,7 @@ class MazeRollout(Rollout):
             )  # fmt: skip
             truths.append(world.truth())
         force = np.where(until, size, 0.0).max(axis=1)
-        return Held(observations, truths, force, violated[nth, last], diverged[nth, last])
+        return Held(observations, truths, force, violated[nth, last], diverged[nth, last], drawn)
 
 
 class Springs:

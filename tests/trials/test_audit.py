@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.families.contact.environments import maze_law
+from palpate.families.contact.environments import blind_mazes, maze_law
+from palpate.learning.off_policy import evaluate
 from palpate.safety.energy_tank import EnergyTank
 from palpate.safety.filtered_law import FilteredLaw
 from palpate.safety.passivity import PassivityFilter
 from palpate.safety.valves import TextbookValve
 from palpate.trials.adversaries import RandomAdversary, SearchedAdversary
-from palpate.trials.audit import audit
+from palpate.trials.audit import EnergyWatch, audit
 from palpate.worlds.maze.maze import BlindMaze
 
 TANK = EnergyTank(initial=1.0, upper=2.0)
@@ -91,3 +92,24 @@ def test_an_audit_says_what_it_needs():
     asked = {"seed": 0, "touches": touches}
     with pytest.raises(PalpateError, match="at least one episode"):
         audit(worlds(1e-3), law, RandomAdversary(4, 5), periods=0, episodes=1, **asked)
+
+
+class Forgetful(PassivityFilter):
+    """Books nothing: its tank is always full."""
+
+    def __call__(self, state, port, action):
+        return state, super().__call__(state, port, action)[1]
+
+
+def test_a_watch_sees_energy_that_no_tank_has_paid_for():
+    """Episode by episode, in the order in which they are evaluated."""
+    stiff = np.tile([1.0, 0.0, 1.0, -1.0], (3, 1))
+    rises = {}
+    for one in (PassivityFilter(tank=TANK), Forgetful(tank=TANK)):
+        environments = blind_mazes(3, passes=one, horizon=6)
+        watch = EnergyWatch(lambda seen: stiff, environments)
+        found = evaluate(environments, watch, 5, 1)
+        rises[type(one)] = watch.rise(5)
+        assert rises[type(one)].shape == found["drawn"].shape == (5,)
+    assert np.all(rises[PassivityFilter] < 1e-4)
+    assert np.median(rises[Forgetful]) > 0.01

@@ -94,3 +94,44 @@ def audit(
             most = np.maximum(most, drawn)
     return Audit(rise, margin, most, braked, touching / (periods * episodes),
                  count * periods * episodes)  # fmt: skip
+
+
+class EnergyWatch:
+    """What a policy decides, and beside it how energy and tank go, episode by episode.
+
+    It is called as the policy is, with observations of `environments` that stand side by side, and
+    reads the meters of their worlds at each decision: of worlds that are stepped, which are those
+    behind a filter. What the last force drew and the filter has yet to book is taken off. `rise`
+    has of each episode, in the order of `palpate.learning.off_policy.evaluate`, the greatest rise
+    of what is stored and in the tank above its beginning, less the work from outside, J.
+    """
+
+    def __init__(self, act: Callable[[np.ndarray], np.ndarray], environments: Any):
+        self._act, self._inside = act, environments.lockstep
+        count = len(self._inside.worlds)
+        self._episode, self._begins = np.full(count, -1), np.zeros(count)
+        self._rises: dict[tuple[int, int], float] = {}
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """The policy's actions."""
+        inside = self._inside
+        meters = np.array([world.meter() for world in inside.worlds])
+        held, law = meters[:, 0] - meters[:, 1], inside.law
+        fresh, full = inside.fresh, law.filter.level(law.filter.begin(len(meters)))
+        if full is not None and fresh.all():
+            held = held + full
+        elif full is not None:
+            seen = side_by_side(inside.observations)
+            drawn = (law.applied * seen.displacement[:, : law.axes]).sum(axis=1)
+            held = held + np.where(fresh, full, law.level - drawn)
+        self._episode += fresh
+        self._begins = np.where(fresh, held, self._begins)
+        for number, rise in enumerate((held - self._begins).tolist()):
+            key = int(self._episode[number]), number
+            self._rises[key] = max(rise, self._rises.get(key, 0.0))
+        return self._act(observation)
+
+    def rise(self, episodes: int) -> Float[np.ndarray, " episodes"]:
+        """Of so many episodes, J."""
+        count = len(self._inside.worlds)
+        return np.array([self._rises[divmod(number, count)] for number in range(episodes)])

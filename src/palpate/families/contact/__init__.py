@@ -29,5 +29,6 @@ FAMILY = Family(
         "maze-arm": "palpate.experiments.contact.maze_arm:reproduce",
         "maze-reflex": "palpate.experiments.contact.maze_reflex:reproduce",
         "energy-audit": "palpate.experiments.contact.energy_audit:reproduce",
+        "maze-passive": "palpate.experiments.contact.maze_passive:reproduce",
     },
 )

@@ -70,6 +70,7 @@ COMMANDS = {
         own="palpate.families.own.options:train_options",
     ),
     "evaluate": Command("try a controller in a world the model cannot see into", subject="task"),
+    "audit": Command("say what energy a policy could draw, or a recording has drawn", "Audit"),
     "export": Command(
         "write a policy as ONNX, with a contract that says how to connect it", "Export"
     ),

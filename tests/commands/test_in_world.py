@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.commands import evaluate, train
+from palpate.commands import audit, evaluate, train
+from palpate.commands.options import Audit
 from palpate.errors import PalpateError
 from palpate.families.contact import methods
 from palpate.families.contact.episodes import figures
@@ -62,6 +63,52 @@ def test_a_policy_is_trained_kept_tried_and_evaluated_again(short, tmp_path, cap
     assert "held still" in said
     values = {f.name: f.value for f in read_result(tmp_path / "evaluated" / RESULT).figures}
     assert values["success_rate.held_still"] == 0
+
+
+def test_a_passive_policy_is_trained_filtered_and_audited(short, tmp_path, capsys):
+    """It sees its tank, in every world it is tried in; and an adversary can be set on it."""
+    folder = train.run(
+        TrainMaze(method="passive", steps=24, environments=2, out=tmp_path / "trained", seed=3)
+    )
+    values = {figure.name: figure.value for figure in read_result(folder / RESULT).figures}
+    assert values["least_tank_level_j.tried"] <= 0.6
+    policy, manifest = load_actor(folder / "policy.safetensors")
+    assert sum(channel.count for channel in policy.observations) == 10
+    assert manifest["constants"]["energy"] == {"initial": 0.6, "upper": 0.6, "flow": 1.5}
+    asked = EvaluateMaze(
+        policy=folder, episodes=2, filter="passivity", tank=0.5, out=tmp_path / "evaluated"
+    )
+    evaluate.run(asked)
+    assert "behind the filter passivity" in capsys.readouterr().out
+    values = {f.name: f.value for f in read_result(tmp_path / "evaluated" / RESULT).figures}
+    assert 0.05 < values["least_tank_level_j"] <= 0.5
+    options = Audit(subject=folder, filter="passivity", steps=100, out=tmp_path / "audited")
+    audit.run(options)
+    said = capsys.readouterr().out
+    assert "decisions that were searched for the worst" in said
+    values = {f.name: f.value for f in read_result(tmp_path / "audited" / RESULT).figures}
+    for adversary in ("policy", "misled", "random", "searched"):
+        assert values[f"energy_gain_j.{adversary}"] < 1e-4
+        assert values[f"tank_margin_j.{adversary}"] > 0.0
+    with pytest.raises(PalpateError, match="unknown filter 'valve'"):
+        audit.run(Audit(subject=folder, filter="valve", out=tmp_path / "again"))
+
+
+def test_of_a_recording_is_said_what_it_drew(tmp_path, capsys):
+    time = np.arange(0.0, 1.0, 0.01)
+    path = 0.1 * np.sin(np.pi * time)  # there and back against a spring of 50 N/m
+    table = tmp_path / "log.csv"
+    columns = np.transpose([time, path, -50.0 * path])
+    np.savetxt(table, columns, "%.9g", ",", header="time,x [m],fx [N]", comments="")
+    audit.run(Audit(subject=table, force=("fx",), motion=("x",), out=tmp_path / "audited"))
+    assert "J given" in capsys.readouterr().out
+    values = {f.name: f.value for f in read_result(tmp_path / "audited" / RESULT).figures}
+    assert values["energy_given_j"] == pytest.approx(0.25, rel=1e-3)
+    assert values["energy_returned_j"] == pytest.approx(0.25, rel=1e-2)
+    assert values["tank_needed_j"] == pytest.approx(0.25, rel=1e-3)
+    assert (tmp_path / "audited" / "energy.png").stat().st_size > 10_000
+    with pytest.raises(PalpateError, match="fz"):
+        audit.run(Audit(subject=table, force=("fz",), motion=("x",), out=tmp_path / "other"))
 
 
 def test_a_world_of_ones_own_and_its_limit_go_with_the_policy(short, tmp_path, capsys):

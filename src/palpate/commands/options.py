@@ -11,8 +11,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from palpate.errors import PalpateError
 from palpate.families.options import Options, Reading
 
+ChannelNames = Annotated[tuple[str, ...], arg(metavar="CHANNEL ...")]
 PerChannel = Annotated[
     tuple[str, ...],
     arg(metavar="[NAME=]NUMBER ...", help_behavior_hint="(default: the policy's)"),
@@ -104,6 +106,47 @@ class Export(Options):
     """What `palpate train` wrote: its folder, or the policy file in it."""
     onnx: Annotated[Path, arg(metavar="FILE")]
     """Where to; the contract goes beside it, ending in .json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Audit(Reading):
+    """Say what energy a policy could be made to draw, or what a recording has drawn.
+
+    Of a policy: as it is, misled by its sensors, and any decisions that its controller takes, at
+    random and searched for the worst; behind a filter or without. Of a recording: its wrench and
+    its motion, no policy needed, and the tank that would have paid for it.
+
+    1. Of a policy, behind the filter:          palpate audit POLICY --filter passivity
+    2. Felt by an arm:                          palpate audit POLICY --filter passivity --world arm
+    3. Of a recording, force on the robot:      palpate audit R.npz
+    4. Of a robot's log:                        palpate audit log.csv --force fx fy --motion x y
+    """
+
+    subject: Positional[Annotated[Path, arg(metavar="POLICY|LOG", help_behavior_hint="")]]
+    """What `palpate train` wrote, or a recording that `palpate convert` takes."""
+    world: Annotated[
+        str | None, arg(metavar="WORLD", help_behavior_hint="(default: as trained)")
+    ] = None
+    """Of a policy, as `palpate evaluate` has it."""
+    filter: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: none)")] = None
+    """Of a policy, as `palpate evaluate` has it."""
+    tank: Annotated[
+        float | None, arg(metavar="JOULE", help_behavior_hint="(default: as evaluate)")
+    ] = None
+    """Of a policy, as `palpate evaluate` has it."""
+    steps: int = 100_000
+    """Control periods of each adversary, about."""
+    force: ChannelNames = ("force",)
+    """Of a recording, N: a channel, or one for each axis; torques (N m) may follow."""
+    motion: ChannelNames = ("position",)
+    """Of a recording: positions (m, rad) or velocities (m/s, rad/s) of the same axes."""
+    by_robot: bool = False
+    """The recorded force is what the robot gives, not what acts on it."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steps < 1:
+            raise PalpateError(f"--steps is 1 or greater, not {self.steps}")
 
 
 @dataclass(frozen=True, kw_only=True)

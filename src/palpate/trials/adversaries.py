@@ -50,6 +50,37 @@ class RandomAdversary:
         return self._action.copy(), new
 
 
+class MisledPolicy:
+    """A policy that decides every so many periods, by what it sees or by what it is made to see.
+
+    `act` gives actions of features, `sees` makes these of observations; with `lies` each of them is
+    off by up to so much, anew at each decision.
+    """
+
+    def __init__(
+        self,
+        act: Callable[[np.ndarray], np.ndarray],
+        sees: Callable[[Any], np.ndarray],
+        every: int,
+        lies: float = 0.0,
+    ):
+        self._act, self._sees, self._every, self._lies = act, sees, every, lies
+
+    def begin(self, worlds: int, random: np.random.Generator) -> None:
+        """See `Adversary.begin`."""
+        self._random, self._count = random, 0
+
+    def decide(self, observation: Any) -> tuple[Actions, New]:
+        """See `Adversary.decide`."""
+        new = self._count % self._every == 0
+        if new:
+            seen = np.asarray(self._sees(observation), float)
+            seen = seen + self._random.uniform(-self._lies, self._lies, seen.shape)
+            self._action = np.asarray(self._act(seen.astype(np.float32)), float)
+        self._count += 1
+        return self._action.copy(), np.full(len(self._action), new)
+
+
 class SearchedAdversary:
     """Answers what it sees by weights of its own in each world, in every period.
 

@@ -51,17 +51,18 @@ def audit(
     touches: Callable[[Any], bool],
     reserve: float = 0.0,
 ) -> Audit:
-    """Episodes of `periods` control periods in worlds side by side, which have a meter.
+    """Episodes of `periods` control periods in worlds side by side.
 
     Energy and tank are read at the samples, when the filter has booked what the last force drew:
     `World.meter` before the next is held. `touches` says of a truth whether the robot is in
     contact. A force brakes that is against the motion and does not turn it round in one period.
-    Raises `PalpateError` for fewer than one episode or period, and for worlds without a meter.
+    Of worlds without a meter the rise is NaN. Raises `PalpateError` for fewer than one episode or
+    period.
     """
     if min(periods, episodes) < 1:
         raise PalpateError("an audit takes at least one episode of one control period")
     random = np.random.default_rng([seed, 7])
-    count = len(worlds)
+    count, metered = len(worlds), type(worlds[0]).meter is not World.meter
     rise, margin, most = np.full((3, count), -np.inf) * [[1], [-1], [1]]
     braked, touching = np.ones(count), np.zeros(count)
     for episode in range(episodes):
@@ -75,8 +76,10 @@ def audit(
             if new.any():
                 law.begin(observation, action, np.full(count, period == 0))
             force = law.command(observation)
-            meters = np.array([world.meter() for world in worlds])
-            held = meters[:, 0] - meters[:, 1]
+            held = np.full(count, np.nan)
+            if metered:
+                meters = np.array([world.meter() for world in worlds])
+                held = meters[:, 0] - meters[:, 1]
             if law.level is not None:
                 held = held + law.level
                 margin = np.minimum(margin, law.level - reserve)

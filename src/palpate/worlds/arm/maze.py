@@ -23,6 +23,7 @@ from palpate.worlds.maze.scene import (
     contact_solref,
     maze_scene,
 )
+from palpate.worlds.world import World
 
 GRAVITY = 9.81  # m/s^2
 # Where the arm stands on the base: beside the maze, which lies higher, as on a table. From there it
@@ -56,6 +57,7 @@ class ArmMaze(BlindMaze):
 
     _carried = MASS + PEG_MASS
     _rolls_out = False  # its torques follow from sensors in every period
+    meter = World.meter  # nobody has told what gravity does
     _view = (0.0, -0.12, 0.12), 1.5, 140.0, -25.0
 
     def _compiled(self, layout: Layout) -> mujoco.MjModel:

@@ -1,0 +1,31 @@
+"""Energy over time, as a picture: what trials drew, and how fast."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+from palpate.report.picture import canvas_of, legend_of, save_picture
+from palpate.safety.recorded_energy import RecordedEnergy
+
+NAMED = 8  # trials that have a line in the legend
+_SETTINGS: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+
+
+def energy_picture(out: Path, trials: Sequence[RecordedEnergy]) -> None:
+    """A PNG of energy drawn so far, and of power, of every trial."""
+    with matplotlib.rc_context(_SETTINGS):
+        canvas = canvas_of(9.0, 3.4)
+        energy, power = canvas.subplots(1, 2)
+        for number, one in enumerate(trials):
+            style = ("-", "--", ":", "-.")[number % 4]  # legible without colour
+            named = {"label": one.trial} if number < NAMED else {}
+            energy.plot(one.time, one.drawn, style, color=f"C{number % 8}", lw=1.1, **named)
+            power.plot(one.time, one.power, style, color=f"C{number % 8}", lw=0.8)
+        energy.set(xlabel="time (s)", ylabel="energy drawn so far (J)")
+        power.set(xlabel="time (s)", ylabel="power out of the robot (W)")
+        for axis in (energy, power):
+            axis.axhline(0.0, color="#1c2127", lw=0.6)
+        legend_of(canvas, "lower center", fontsize=7, ncols=NAMED // 2)
+        save_picture(out, canvas)

@@ -88,6 +88,7 @@ STAGES = {
             "safety.kinetic_barrier",
             "safety.filters",
             "safety.filtered_law",
+            "safety.filtered_drive",
             "safety.recorded_energy",
             "tasks.maze.maze",
             "tasks.maze.navigation",

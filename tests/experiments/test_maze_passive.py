@@ -39,6 +39,8 @@ def test_rows_are_held_against_agnostic_episode_by_episode(tmp_path, monkeypatch
     monkeypatch.setattr(maze_passive.train, "run", run)
     monkeypatch.setattr(maze_passive, "tried", tried)
     monkeypatch.setattr(maze_passive, "TIMED", 50)
+    ropes = {"bare": {"success": 1.0, "time": 2.0}, "filtered": {"success": 0.97, "time": 2.02}}
+    monkeypatch.setattr(maze_passive, "of_ropes", lambda quick: ropes | {"least": 0.3})
     monkeypatch.setattr(maze_passive.Experiment, "on_every_core", lambda *_: None)
     result = maze_passive.reproduce(tmp_path)
     figures = {figure.name: figure for figure in result.figures}
@@ -57,6 +59,9 @@ def test_rows_are_held_against_agnostic_episode_by_episode(tmp_path, monkeypatch
     assert not figures["arm.success_difference"].met
     assert figures["detail.kinetic-barrier.violations"].value == 0  # no tank, and no rise
     assert figures["filter_p99_ms"].value > 0.0
+    assert figures["rope.success_difference"].value == pytest.approx(-0.03)
+    assert not figures["rope.success_difference"].met
+    assert figures["rope.time_ratio"].value == pytest.approx(1.01)
     assert len(trained) == 12
     assert {costs for method, costs, _ in trained if method == "passive"} == {
         ("eb",), ("ef",), ("eb", "ef"),

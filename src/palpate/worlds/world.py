@@ -117,6 +117,19 @@ class InterruptingLaw(ControlLaw, Protocol):
     interrupted: np.ndarray
 
 
+@runtime_checkable
+class Drive(Protocol):
+    """What stands between the servos of a world's robot and the robot, such as a filter."""
+
+    def begin(self) -> None:
+        """An episode begins."""
+
+    def __call__(self, force: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """The force (axes,) N that is given in the next time step in place of the servos', where
+        encoders show a position (m) and a velocity (m/s), all (axes,)."""
+        ...
+
+
 class Spring(NamedTuple):
     """What pulls the tips of worlds side by side to set-points: F = K (x_d - x) - D xdot."""
 

@@ -200,6 +200,8 @@ class EvaluateRopeStabilization(EvaluateRope):
     """How many; each from four poses."""
     onnx: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Try this exported file too, in the loop of `palpate serve`: messages, checks and brakes."""
+    tank: Annotated[float | None, arg(metavar="JOULE", help_behavior_hint="(default: none)")] = None
+    """Put a passivity filter before the gripper's servos, whose tank holds so much."""
 
     def inputs(self) -> dict[str, Path]:
         """See `Evaluate.inputs`."""
@@ -207,9 +209,10 @@ class EvaluateRopeStabilization(EvaluateRope):
 
     def trials(self, base: RopeConfiguration) -> list[StabilizationTrial]:
         """Each rope from each pose, for four first periods of the longest."""
-        from palpate.trials.rope.stabilization import evaluation_trials
+        from palpate.trials.rope.stabilization import behind_filter, evaluation_trials
 
-        return evaluation_trials(base, self.ropes, self.seed)
+        trials = evaluation_trials(base, self.ropes, self.seed)
+        return trials if self.tank is None else behind_filter(trials, self.tank)
 
     def controlled(self, policy: CommandPolicy) -> Controller:
         """See `EvaluateRope.controlled`."""

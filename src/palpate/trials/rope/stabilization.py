@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,16 +11,22 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.report.evidence import write_evidence
 from palpate.runs import Figure, Run
+from palpate.safety.energy_tank import EnergyTank
+from palpate.safety.filtered_drive import FilteredDrive
+from palpate.safety.passivity import PassivityFilter
 from palpate.tasks.rope.stabilization import STABILISED, STAY, RopeStabilization
 from palpate.trials.rope.trials import RopeTrial
 from palpate.trials.trial import Record, first_of_each_group, wilson_interval
 from palpate.worlds.rope.rope import (
+    GRIPPER_MASS,
     START_POSES,
     RopeConfiguration,
     RopeObservation,
     RopeTruth,
+    RopeWorld,
     sample_configurations,
 )
+from palpate.worlds.world import Drive
 
 TRIAL_PERIODS = 4.0  # length of a trial, in first periods of the longest rope
 # Here and not in the task: what a policy is judged by must not follow what it is trained for. That
@@ -54,6 +60,11 @@ class StabilizationTrial(RopeTrial[Episodes]):
     """One rope that is to come to rest."""
 
     steps: int | None = None
+    drive: Callable[[RopeConfiguration], Drive] | None = None  # makes what is before the servo
+
+    def world(self) -> RopeWorld:
+        """See `RopeTrial.world`."""
+        return RopeWorld(self.configuration, self.drive and self.drive(self.configuration))
 
     def measure(self, observation: RopeObservation, truth: RopeTruth) -> Mapping[str, Any]:
         return RopeStabilization.measure(observation, truth)
@@ -84,6 +95,20 @@ def evaluation_trials(base: RopeConfiguration, ropes: int, seed: int) -> list[St
         for pose, start in enumerate(START_POSES)
         for rope, configuration in enumerate(configurations)
     ])  # fmt: skip
+
+
+def behind_filter(trials: Sequence[StabilizationTrial], tank: float) -> list[StabilizationTrial]:
+    """The trials with a passivity filter before each gripper's servos, whose tank holds so many J.
+
+    The filter knows of the gripper's own mass alone, and that its speed is limited.
+    """
+    one = EnergyTank(initial=tank, upper=tank)
+
+    def drive(configuration: RopeConfiguration) -> FilteredDrive:
+        passes = PassivityFilter(tank=one, fastest=configuration.speed_limit)
+        return FilteredDrive(passes, GRIPPER_MASS * np.eye(3), configuration.time_step)
+
+    return [dataclasses.replace(trial, drive=drive) for trial in trials]
 
 
 def lasting(trials: Sequence[StabilizationTrial]) -> list[StabilizationTrial]:

@@ -22,7 +22,7 @@ from palpate.worlds.rope.starts import (
     shake_commands,
     start_tangents,
 )
-from palpate.worlds.world import DivergedError, OffscreenCamera, World
+from palpate.worlds.world import DivergedError, Drive, OffscreenCamera, World
 
 __all__ = [
     "START_POSES", "Disturbance", "RopeConfiguration", "RopeObservation", "RopeTruth", "RopeWorld",
@@ -35,6 +35,8 @@ GRIPPER_MASS = 0.5  # kg
 # 2 / SERVO_FREQUENCY = 10 ms and no overshoot, so that a target within the limits of speed and
 # acceleration keeps the gripper within them too.
 SERVO_FREQUENCY = 200.0  # rad/s
+SERVO_STIFFNESS = GRIPPER_MASS * SERVO_FREQUENCY**2  # N/m
+SERVO_DAMPING = 2 * GRIPPER_MASS * SERVO_FREQUENCY  # N s/m
 
 
 @dataclass(frozen=True)
@@ -71,12 +73,13 @@ class RopeWorld(World):
     The commanded velocity (3,) in m/s is followed by a profile whose speed and acceleration
     stay within the configuration's limits (Euclidean norms); the profile's position is the
     target of a servo that lags 10 ms behind it. So the gripper's true motion is not quite the
-    command, as with a real arm.
+    command, as with a real arm. With a `drive` the servo's force is what that makes of it.
 
     Raises `PalpateError` for an unknown start or a malformed action, and `DivergedError`.
     """
 
-    def __init__(self, configuration: RopeConfiguration | None = None):
+    def __init__(self, configuration: RopeConfiguration | None = None, drive: Drive | None = None):
+        self.drive = drive
         self._configuration = configuration = configuration or RopeConfiguration()
         self._model = _compile(configuration)
         self._data = mujoco.MjData(self._model)
@@ -138,6 +141,8 @@ class RopeWorld(World):
             self._shake(turn)
         self._data.time = 0.0
         self._step_count = 0
+        if self.drive is not None:
+            self.drive.begin()
         self._history = [self._measure()] * (self._delay + 1)
         return self._history[0]
 
@@ -216,12 +221,21 @@ class RopeWorld(World):
             data.ctrl += self._profile_velocity * configuration.time_step
             if disturbed and configuration.disturbances:
                 self._disturb()
+            if disturbed and self.drive is not None:
+                self._pass(self.drive)
             mujoco.mj_step(self._model, data)
         if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             raise DivergedError(
                 f"the rope's simulation diverged at {data.time:.3f} s; a smaller time_step than "
                 f"{configuration.time_step:g} s or a softer rope would work"
             )
+
+    def _pass(self, drive: Drive) -> None:
+        """Give what the drive makes of the servo's force, beside the servo."""
+        data = self._data
+        position, velocity = data.qpos[:3].copy(), data.qvel[:3].copy()
+        servo = SERVO_STIFFNESS * (data.ctrl - position) - SERVO_DAMPING * velocity
+        data.qfrc_applied[:3] = drive(servo, position, velocity) - servo
 
     def _disturb(self) -> None:
         data, configuration = self._data, self._configuration
@@ -277,14 +291,12 @@ class RopeWorld(World):
 
 def _compile(configuration: RopeConfiguration) -> mujoco.MjModel:
     second_moment = math.pi * configuration.radius**4 / 4  # of the section's area
-    stiffness = GRIPPER_MASS * SERVO_FREQUENCY**2
-    damping = 2 * GRIPPER_MASS * SERVO_FREQUENCY
     slides = "".join(
         f'<joint name="{name}" type="slide" axis="{axis}"/>'
         for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))
     )
     servos = "".join(
-        f'<position joint="{name}" kp="{stiffness}" kv="{damping}"/>' for name in "xyz"
+        f'<position joint="{name}" kp="{SERVO_STIFFNESS}" kv="{SERVO_DAMPING}"/>' for name in "xyz"
     )
     spec = mujoco.MjSpec.from_string(f"""
     <mujoco model="rope">

@@ -29,7 +29,8 @@ NAME = "maze-safe"
 FIRST, TRIED = 21, 100_000
 OWN, BARE, PLAIN = "srl-vic", "no-recovery", "srl-vic-without-noise"
 POSITION = "position-critic"
-REFLEX = "bresa"  # which `maze-reflex` holds against decisions
+# What `maze-reflex` holds against decisions, and `maze-passive` against those that draw more.
+ELSEWHERE = "bresa", "passive"
 CONSTANTS = tuple(name for name, make in METHODS.items() if make().stiffness is not None)
 MORE_VIOLATIONS = 1.5  # times ours: a rival with more is none
 NOISY = 2.0  # times the sensor's noise
@@ -57,7 +58,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     Raises `PalpateError` when `out` holds other runs.
     """
     experiment, size = Experiment(NAME, out, quick, seed), QUICK if quick else FULL
-    names = [OWN, BARE, *(name for name in METHODS if name not in (OWN, BARE, REFLEX)), PLAIN]
+    names = [OWN, BARE, *(name for name in METHODS if name not in (OWN, BARE, *ELSEWHERE)), PLAIN]
     cores = 1 if quick else 2
     experiment.announce(
         {of: len(names) * size.seeds * each // cores for of, each in MINUTES.items()}

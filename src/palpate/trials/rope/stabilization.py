@@ -64,7 +64,9 @@ class StabilizationTrial(RopeTrial[Episodes]):
 
     def world(self) -> RopeWorld:
         """See `RopeTrial.world`."""
-        return RopeWorld(self.configuration, self.drive and self.drive(self.configuration))
+        if self.drive is None:
+            return super().world()
+        return RopeWorld(self.configuration, self.drive(self.configuration))
 
     def measure(self, observation: RopeObservation, truth: RopeTruth) -> Mapping[str, Any]:
         return RopeStabilization.measure(observation, truth)

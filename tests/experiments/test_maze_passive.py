@@ -23,7 +23,7 @@ def test_rows_are_held_against_agnostic_episode_by_episode(tmp_path, monkeypatch
         row = next(
             row
             for row, (training, filtered, on) in maze_passive.ROWS.items()
-            if (filtered, on) == (which, world) and folder.name.startswith(f"maze-{training}-2")
+            if (filtered, on) == (which, world) and folder.name.startswith(f"maze-{training}-3")
         )
         asked.append((row, episodes, seed))
         goals, drawn, level, rise = FOUND.get(row, (5, 3.0, None, 0.0))

@@ -63,10 +63,10 @@ def test_violations_are_pooled_over_trainings_and_success_is_set_beside(stood_in
     assert figures["decision_p99_ms"].met
     trained = [one for one in stood_in if hasattr(one, "method")]
     assert [(one.task, one.method, one.seed) for one in trained[:3]] == [
-        ("maze", "srl-vic", seed) for seed in (21, 22, 23)
+        ("maze", "srl-vic", seed) for seed in (31, 32, 33)
     ]
-    assert {one.out.name for one in trained} >= {"maze-srl-vic-21", "navigation-bresa-23"}
-    assert result.seeds[1:] == [21, 22, 23]
+    assert {one.out.name for one in trained} >= {"maze-srl-vic-31", "navigation-bresa-33"}
+    assert result.seeds[1:] == [31, 32, 33]
     again = len(stood_in)
     assert maze_reflex.reproduce(tmp_path).figures == result.figures
     assert len(stood_in) == again  # what was found of the trainings is read again

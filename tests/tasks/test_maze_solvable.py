@@ -1,7 +1,7 @@
 """Whether the maze asks for what it is meant to: one who sees everything, stiff and soft.
 
 The agent reads the truth: it follows the way to the goal softly, and pushes the block stiffly along
-the channel and softly across it, with 18 N at most.
+the channel and softly across it, with 20 N at most.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ AROUND = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 CIRCLE = 0.013 * np.stack([np.cos(AROUND), np.sin(AROUND)], -1)
 SOFT, SOFTEST = -0.83, -1.0
 LOW, HIGH = STIFFNESS_RANGE
-PUSHING = 2 * (18.0 / DISPLACEMENT_LIMIT - LOW) / (HIGH - LOW) - 1  # 18 N, as far as it may go
+PUSHING = 2 * (20.0 / DISPLACEMENT_LIMIT - LOW) / (HIGH - LOW) - 1  # as far as it may go
 
 
 def decision(truth):

@@ -32,7 +32,7 @@ FORCE_LIMIT = 26.0  # N, of the horizontal contact force on the tip; more is a v
 DISPLACEMENT_LIMIT = 0.03  # m from where the tip is to where a decision sends it
 STIFFNESS_RANGE = (50.0, 1000.0)  # N/m
 
-OBSTACLE_FRICTION = (10.0, 14.0)  # N, dry: what it takes to move the block
+OBSTACLE_FRICTION = (13.0, 17.0)  # N, dry: what it takes to move the block
 OBSTACLE_MASS = (0.5, 1.5)  # kg
 CONTACT_FRICTION = (0.2, 0.4)  # coefficient, of the tip on walls and block
 BEFORE_BLOCK = 0.4  # share of scattered episodes that begin there: hardly one would by chance

@@ -90,6 +90,9 @@ def test_a_passive_policy_is_trained_filtered_and_audited(short, tmp_path, capsy
     for adversary in ("policy", "misled", "random", "searched"):
         assert values[f"energy_gain_j.{adversary}"] < 1e-4
         assert values[f"tank_margin_j.{adversary}"] > 0.0
+    shipped = Path(audit.__file__).parents[1] / "assets" / "rope-stabilization.safetensors"
+    with pytest.raises(PalpateError, match="holds a CommandPolicy: expected an actor"):
+        audit.run(Audit(subject=shipped, out=tmp_path / "rope"))
     with pytest.raises(PalpateError, match="unknown filter 'valve'"):
         audit.run(Audit(subject=folder, filter="valve", out=tmp_path / "again"))
 

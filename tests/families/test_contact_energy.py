@@ -64,6 +64,38 @@ def test_decisions_pay_for_what_they_draw_and_see_what_is_left(costs):
     assert paid > 0.0
 
 
+def test_a_world_that_has_ended_within_a_decision_draws_no_more():
+    """The law goes on for the others, and shows it the same way again and again."""
+    stepped = blind_mazes(4, **metered_by("none", None, None), force_limit=4.0)
+    rolled = blind_mazes(4, **metered_by("none", None, None), force_limit=4.0)
+    stepped.lockstep._rollout = None
+    ended = 0
+    for _ in range(2):
+        stepped.reset(seed=5)
+        rolled.reset(seed=5)
+        for _ in range(40):
+            told = [one.step(STIFF)[4] for one in (stepped, rolled)]
+            ends = told[0]["end"] == "violation"
+            np.testing.assert_allclose(told[0]["drawn"], told[1]["drawn"], atol=0.02)
+            np.testing.assert_allclose(told[0]["level"], told[1]["level"], atol=0.02)
+            ended += int(ends.sum())
+    assert ended >= 4
+
+
+def test_behind_a_filter_without_a_tank_energy_is_counted_as_well():
+    environments = blind_mazes(2, **metered_by("kinetic-barrier", 0.5, None))
+    _, told = lived(environments, 4, STIFF[:2])
+    assert told[-1]["level"].max() < 0.5
+    assert environments.lockstep.law.filter.tank.initial == 0.5
+
+
+def test_costs_are_those_of_a_passive_training():
+    with pytest.raises(PalpateError, match="--costs are those of --method passive, not of k300"):
+        TrainMaze(method="k300", costs=("eb",))
+    with pytest.raises(PalpateError, match="expected at least one"):
+        TrainMaze(method="passive", costs=())
+
+
 def test_episodes_tell_what_was_drawn():
     environments = blind_mazes(4, **metered_by("none", None, None), horizon=12)
     found = evaluate(environments, lambda seen: STIFF, 6, 3)

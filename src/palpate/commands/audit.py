@@ -92,9 +92,13 @@ def _audit_policy(options: Audit) -> Path:
     policy, manifest = load_actor(file)
     asked = {"world": options.world, "filter": options.filter, "tank": options.tank}
     given = {name: value for name, value in asked.items() if value is not None}
-    kind = resolve(options_of("evaluate")[str(manifest.get("task"))])
-    takes = {field.name for field in fields(kind)}
-    if not (issubclass(kind, EvaluateInWorld) and "filter" in takes):
+    place = options_of("evaluate").get(str(manifest.get("task")))
+    kind = None if place is None else resolve(place)
+    if not (
+        kind is not None
+        and issubclass(kind, EvaluateInWorld)
+        and "filter" in {field.name for field in fields(kind)}
+    ):
         raise PalpateError(
             f"{file} was trained for '{manifest.get('task')}', whose energy nobody counts: "
             "expected a policy of `palpate train maze`"

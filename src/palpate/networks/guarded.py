@@ -150,8 +150,7 @@ def load_actor(path: str | Path) -> tuple[ActorPolicy, dict[str, Any]]:
     policy, manifest = load_controller(path)
     if not isinstance(policy, ActorPolicy):
         raise PalpateError(
-            f"{path} holds a {manifest['controller']['kind']}: expected an actor that learnt in a "
-            "world"
+            f"{path} holds a {type(policy).__name__}: expected an actor that learnt in a world"
         )
     return policy, manifest
 

@@ -77,6 +77,12 @@ class FilterChain:
             after.append(new)
         return tuple(after), action
 
+    @property
+    def tank(self) -> Any:
+        """The last tank that one of them has; None where none has."""
+        tanks = (getattr(each, "tank", None) for each in reversed(self.filters))
+        return next((tank for tank in tanks if tank is not None), None)
+
     def level(self, state: Any) -> Numbers | None:
         """That of the last tank; see `Filter.level`."""
         levels = [each.level(own) for each, own in zip(self.filters, state, strict=True)]

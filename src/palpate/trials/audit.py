@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from palpate.errors import PalpateError
 from palpate.safety.filtered_law import FilteredLaw
-from palpate.worlds.world import World, side_by_side
+from palpate.worlds.world import DivergedError, World, side_by_side
 
 Actions = Float[np.ndarray, "worlds actions"]
 
@@ -56,15 +56,15 @@ def audit(
     Energy and tank are read at the samples, when the filter has booked what the last force drew:
     `World.meter` before the next is held. `touches` says of a truth whether the robot is in
     contact. A force brakes that is against the motion and does not turn it round in one period.
-    Of worlds without a meter the rise is NaN. Raises `PalpateError` for fewer than one episode or
-    period.
+    Where a simulation diverges, the episode of all ends. Of worlds without a meter the rise is NaN.
+    Raises `PalpateError` for fewer than one episode or period.
     """
     if min(periods, episodes) < 1:
         raise PalpateError("an audit takes at least one episode of one control period")
     random = np.random.default_rng([seed, 7])
     count, metered = len(worlds), type(worlds[0]).meter is not World.meter
     rise, margin, most = np.full((3, count), -np.inf) * [[1], [-1], [1]]
-    braked, touching = np.ones(count), np.zeros(count)
+    braked, touching, steps = np.ones(count), np.zeros(count), 0
     for episode in range(episodes):
         first = seed + count * episode
         seen = [world.reset(first + number) for number, world in enumerate(worlds)]
@@ -89,14 +89,17 @@ def audit(
             if period == periods:
                 break
             braked = np.minimum(braked, law.braked(observation))
-            for number, world in enumerate(worlds):
-                seen[number] = world.step(force[number])
+            try:
+                for number, world in enumerate(worlds):
+                    seen[number] = world.step(force[number])
+            except DivergedError:
+                break  # of so much energy that the meter has shown it
+            steps += count
             touching += [touches(world.truth()) for world in worlds]
             went = np.array([one.displacement[: law.axes] for one in seen])
             drawn += (law.applied * went).sum(axis=1)
             most = np.maximum(most, drawn)
-    return Audit(rise, margin, most, braked, touching / (periods * episodes),
-                 count * periods * episodes)  # fmt: skip
+    return Audit(rise, margin, most, braked, touching * count / max(steps, 1), steps)
 
 
 class EnergyWatch:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium
@@ -88,11 +88,11 @@ class EnergyCosts(NamedTuple):
     lower: float  # J
     flow: float  # W
 
-    def of(self, law: MeteredLaw) -> np.ndarray:
-        """(worlds,) of the decision that has ended."""
-        level = np.inf if law.level is None else law.level
-        broken = {"eb": level <= self.lower, "ef": law.flow > self.flow}
-        return np.sum([np.broadcast_to(broken[name], law.flow.shape) for name in self.costs], 0)
+    def of(self, told: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(worlds,) of the decision that has ended, by its "flow" and, with a tank, "level"."""
+        flow = told["flow"]
+        broken = {"eb": told.get("level", flow + np.inf) <= self.lower, "ef": flow > self.flow}
+        return np.sum([broken[name] for name in self.costs], axis=0)
 
 
 class Lockstep:
@@ -122,6 +122,7 @@ class Lockstep:
         self._first: list[Any] = [None] * count  # of the episodes under way
         self.fresh = np.ones(count, bool)
         self.decisions = np.zeros(count, int)
+        self._ended: dict[int, dict[str, np.ndarray]] = {}  # in the decision: see `_drawn`
         self.motions: Motions | None = None
         if isinstance(law, InterruptingLaw):
             self.motions = Motions(law, self.features, self.every)
@@ -146,7 +147,8 @@ class Lockstep:
         seen, energy = features_of(self.task, side_by_side(self.observations)), self.energy
         if energy is None:
             return seen
-        level: Any = None if self.fresh.all() else getattr(self.law, "level", None)
+        metered = isinstance(self.law, MeteredLaw) and not self.fresh.all()
+        level = self._drawn(self.law).get("level") if metered else None  # type: ignore[arg-type]
         full = np.where(self.fresh, energy.full, energy.full if level is None else level)
         share = np.clip(full / energy.full, -FEATURE_LIMIT, FEATURE_LIMIT)
         return np.concatenate([seen, share[:, None].astype(np.float32)], axis=1)
@@ -159,7 +161,7 @@ class Lockstep:
         task, law, observations, motions = self.task, self.law, self.observations, self.motions
         if observations[0] is None:
             raise PalpateError("an environment takes a step after reset(), not before")
-        before, truths = list(self._truths), self._truths
+        before, truths, self._ended = list(self._truths), self._truths, {}
         if law is not None:
             law.begin(side_by_side(observations), actions, self.fresh.copy())
         force, end = self._held() or self._stepped(actions)
@@ -180,11 +182,9 @@ class Lockstep:
         told["force"] = force
         told["progress"] = np.array([*map(task.progress, self._first, truths)])
         if isinstance(law, MeteredLaw):
-            told |= {"drawn": law.drawn, "flow": law.flow}
-            if law.level is not None:
-                told["level"] = law.level
+            told |= self._drawn(law)
             if self.energy is not None:
-                told["cost"] = self.energy.of(law).astype(np.float32)
+                told["cost"] = self.energy.of(told).astype(np.float32)
         return reward, (end != "") & ~cut, cut, told
 
     def _held(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -201,10 +201,22 @@ class Lockstep:
         end[held.violated], end[held.diverged] = VIOLATION, DIVERGED
         return held.force, end
 
+    def _drawn(self, law: MeteredLaw) -> dict[str, np.ndarray]:
+        """What the decision has drawn so far, and what is left, each (worlds,).
+
+        Of a world that has ended within it, what was so then: the law goes on for the others.
+        """
+        found = {"drawn": law.drawn, "flow": law.flow, "level": law.level}
+        now = {name: values.copy() for name, values in found.items() if values is not None}
+        for number, then in self._ended.items():
+            for name, values in now.items():
+                values[number] = then[name][number]
+        return now
+
     def _stepped(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The greatest force in each world in a decision, N, and how it ended ("": it did not)."""
         worlds, task, law, observations = self.worlds, self.task, self.law, self.observations
-        motions, truths = self.motions, self._truths
+        motions, truths, metered = self.motions, self._truths, isinstance(law, MeteredLaw)
         end = np.full(len(worlds), "", object)
         force, running = [0.0] * len(worlds), list(range(len(worlds)))
         for period in range(self.every):
@@ -224,6 +236,10 @@ class Lockstep:
                 if task.violates(truth):
                     end[number] = VIOLATION
                     running.remove(number)
+            if metered and len(running) < len(worlds):
+                for number in np.flatnonzero(end != "").tolist():
+                    if number not in self._ended:
+                        self._ended[number] = self._drawn(law)  # type: ignore[arg-type]
         return np.array(force), end
 
 

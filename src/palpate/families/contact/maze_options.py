@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Mazes = Annotated[tuple[str, ...], arg(metavar="NAME ...")]
 HOME, CARRIERS = ("home",), ("tip", "arm")
 NONE, LEAST_TANK = "none", 0.3  # J: above its lower bound
+COSTS = "eb", "ef"
 Filters = Literal[
     "none", "passivity", "textbook-valve", "schindlbeck", "stiffness-rate", "kinetic-barrier"
 ]
@@ -56,7 +57,10 @@ class TrainMaze(TrainSkill):
     self-tuning: at one that rises while something resists; no-recovery: nothing overrules it;
     lagrangian, penalty: violations as a constraint, or at a price; passive: the energy that it
     draws as a constraint, and what is left of it is seen."""
-    costs: tuple[Literal["eb", "ef"], ...] = ("eb", "ef")
+    costs: Annotated[
+        tuple[Literal["eb", "ef"], ...] | None,
+        arg(metavar="{eb,ef} ...", help_behavior_hint="(default: eb ef)"),
+    ] = None
     """Of passive: eb: decisions that leave the tank at its lower bound; ef: those that draw more
     than its flow at a time."""
     mazes: Mazes = HOME
@@ -74,6 +78,10 @@ class TrainMaze(TrainSkill):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.costs is not None and self.method != "passive":
+            raise PalpateError(f"--costs are those of --method passive, not of {self.method}")
+        if self.costs == ():
+            raise PalpateError("--costs are one of eb and ef, or both: expected at least one")
         limit = self.force_limit
         if limit is not None and not 0 < limit < float("inf"):
             raise PalpateError(f"--force-limit is a positive number of newton, not {limit}")
@@ -116,7 +124,7 @@ class TrainMaze(TrainSkill):
         method = self.skill().method(self.method)
         metered: dict[str, Any] = {}
         if method.passive:
-            metered = metered_by(NONE, None, self.costs)
+            metered = metered_by(NONE, None, self.costs or COSTS)
         return blind_mazes(
             count,
             **metered,
@@ -216,7 +224,7 @@ class EvaluateMaze(EvaluateSkill):
         trained = manifest["options"]
         method = MAZE.method(trained["method"])
         make = arm_mazes if self.world == "arm" else blind_mazes
-        costs = tuple(trained["costs"]) if method.passive else None
+        costs = tuple(trained.get("costs", COSTS)) if method.passive else None
         return make(
             count,
             **metered_by(self.filter, self.tank, costs),
@@ -245,10 +253,10 @@ class EvaluateMaze(EvaluateSkill):
     def about(self, manifest: Mapping[str, Any]) -> str:
         mazes, file = self.mazes or manifest["options"]["mazes"], self._file(manifest)
         where = f"the maze {', '.join(mazes)}, felt by the {self.world or CARRIERS[0]}"
-        if self.filter != NONE:
-            where += f", behind the filter {self.filter}"
         if file is not None:
             where = f"the world {file}, {manifest['constants']['task.force_limit']:g} N allowed"
+        if self.filter != NONE:
+            where += f", behind the filter {self.filter}"
         return f"tried in {where}, with {self.noise:g} times the sensors' noise"
 
     def show(self, run: Run, policy: ActorPolicy, manifest: Mapping[str, Any]) -> None:
@@ -260,17 +268,21 @@ class EvaluateMaze(EvaluateSkill):
 def metered_by(name: str, tank: float | None, costs: tuple[str, ...] | None) -> dict[str, Any]:
     """Options of environments whose energy is counted, behind the filter of that name.
 
-    The tank holds so many J (None: as it was designed). With `costs` decisions cost what they draw.
+    The tank holds so many J (None: as it was designed); behind a filter without one it is only
+    counted. With `costs` decisions cost what they draw.
     """
     from palpate.families.contact.environments import TANK
     from palpate.safety.energy_tank import EnergyTank
     from palpate.safety.filters import WITH_TANK, filter_of
+    from palpate.safety.port import FilterChain
     from palpate.worlds.gymnasium import EnergyCosts
 
     numbers = TANK if tank is None else {**TANK, "initial": tank, "upper": tank}
-    asked: dict[str, Any] = {
-        "passes": filter_of(name, {"tank": numbers} if name in WITH_TANK else {})
-    }
+    if name in WITH_TANK:
+        asked: dict[str, Any] = {"passes": filter_of(name, {"tank": numbers})}
+    else:
+        meter = filter_of(NONE, {"tank": numbers})
+        asked = {"passes": FilterChain((filter_of(name, {}), meter))}
     if costs is not None:
         known = EnergyTank(**numbers)
         asked["energy"] = EnergyCosts(costs, known.initial, known.lower, known.flow)

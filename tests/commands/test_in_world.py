@@ -71,7 +71,7 @@ def test_a_passive_policy_is_trained_filtered_and_audited(short, tmp_path, capsy
         TrainMaze(method="passive", steps=24, environments=2, out=tmp_path / "trained", seed=3)
     )
     values = {figure.name: figure.value for figure in read_result(folder / RESULT).figures}
-    assert values["least_tank_level_j.tried"] <= 0.6
+    assert values["least_tank_level.tried"] <= 0.6
     policy, manifest = load_actor(folder / "policy.safetensors")
     assert sum(channel.count for channel in policy.observations) == 10
     assert manifest["constants"]["energy"] == {"initial": 0.6, "upper": 0.6, "flow": 1.5}
@@ -81,15 +81,15 @@ def test_a_passive_policy_is_trained_filtered_and_audited(short, tmp_path, capsy
     evaluate.run(asked)
     assert "behind the filter passivity" in capsys.readouterr().out
     values = {f.name: f.value for f in read_result(tmp_path / "evaluated" / RESULT).figures}
-    assert 0.05 < values["least_tank_level_j"] <= 0.5
+    assert 0.05 < values["least_tank_level"] <= 0.5
     options = Audit(subject=folder, filter="passivity", steps=100, out=tmp_path / "audited")
     audit.run(options)
     said = capsys.readouterr().out
     assert "decisions that were searched for the worst" in said
     values = {f.name: f.value for f in read_result(tmp_path / "audited" / RESULT).figures}
     for adversary in ("policy", "misled", "random", "searched"):
-        assert values[f"energy_gain_j.{adversary}"] < 1e-4
-        assert values[f"tank_margin_j.{adversary}"] > 0.0
+        assert values[f"energy_gain.{adversary}"] < 1e-4
+        assert values[f"tank_margin.{adversary}"] > 0.0
     shipped = Path(audit.__file__).parents[1] / "assets" / "rope-stabilization.safetensors"
     with pytest.raises(PalpateError, match="holds a CommandPolicy: expected an actor"):
         audit.run(Audit(subject=shipped, out=tmp_path / "rope"))
@@ -106,9 +106,9 @@ def test_of_a_recording_is_said_what_it_drew(tmp_path, capsys):
     audit.run(Audit(subject=table, force=("fx",), motion=("x",), out=tmp_path / "audited"))
     assert "J given" in capsys.readouterr().out
     values = {f.name: f.value for f in read_result(tmp_path / "audited" / RESULT).figures}
-    assert values["energy_given_j"] == pytest.approx(0.25, rel=1e-3)
-    assert values["energy_returned_j"] == pytest.approx(0.25, rel=1e-2)
-    assert values["tank_needed_j"] == pytest.approx(0.25, rel=1e-3)
+    assert values["energy_given"] == pytest.approx(0.25, rel=1e-3)
+    assert values["energy_returned"] == pytest.approx(0.25, rel=1e-2)
+    assert values["tank_needed"] == pytest.approx(0.25, rel=1e-3)
     assert (tmp_path / "audited" / "energy.png").stat().st_size > 10_000
     with pytest.raises(PalpateError, match="fz"):
         audit.run(Audit(subject=table, force=("fz",), motion=("x",), out=tmp_path / "other"))

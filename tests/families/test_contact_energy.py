@@ -102,11 +102,11 @@ def test_episodes_tell_what_was_drawn():
     assert np.all(found["drawn"] > 0.0)
     assert np.all(found["level"] < 0.6)
     named = {one.name: one.value for one in figures(found)}
-    assert named["least_tank_level_j"] == pytest.approx(found["level"].min())
-    assert named["energy_drawn_j"] is None  # none of them arrived
+    assert named["least_tank_level"] == pytest.approx(found["level"].min())
+    assert named["energy_drawn"] is None  # none of them arrived
     unmetered = evaluate(blind_mazes(2, horizon=3), lambda seen: STIFF[:2], 2, 3)
     assert np.isnan(unmetered["drawn"]).all()
-    assert "energy_drawn_j" not in {one.name for one in figures(unmetered)}
+    assert "energy_drawn" not in {one.name for one in figures(unmetered)}
 
 
 def test_a_passive_policy_sees_its_tank():

@@ -68,10 +68,10 @@ def _audit_recording(options: Audit) -> Path:
             ]
             energy_picture(run.path / PICTURE, found)
             figures = [
-                Figure("energy_given_j", float(np.median([one.given for one in found])), "J"),
-                Figure("energy_returned_j", float(np.median([one.returned for one in found])), "J"),
-                Figure("tank_needed_j", max(one.needed for one in found), "J"),
-                Figure("greatest_power_w", max(float(one.power.max()) for one in found), "W"),
+                Figure("energy_given", float(np.median([one.given for one in found])), "J"),
+                Figure("energy_returned", float(np.median([one.returned for one in found])), "J"),
+                Figure("tank_needed", max(one.needed for one in found), "J"),
+                Figure("greatest_power", max(float(one.power.max()) for one in found), "W"),
             ]
             lines = [
                 f"{one.trial}: {one.given:.3g} J given, {one.returned:.3g} J returned; a tank of "
@@ -150,16 +150,16 @@ def _tried(
                 adversary.improve(one.drawn)
             found.append(one)
         drawn = max(float(one.drawn.max()) for one in found)
-        figures.append(Figure(f"energy_drawn_j.{name}", drawn, "J"))
+        figures.append(Figure(f"energy_drawn.{name}", drawn, "J"))
         line = f"{words}: {drawn:.3g} J drawn in an episode at most"
         margin = min(float(one.margin.min()) for one in found)
         if np.isfinite(margin):
-            figures.append(Figure(f"tank_margin_j.{name}", margin, "J", better="higher"))
+            figures.append(Figure(f"tank_margin.{name}", margin, "J", better="higher"))
             side = "above" if margin >= 0.0 else "below"
             line += f"; the tank {abs(margin):.3g} J {side} its reserve"
         rise = max(float(one.rise.max()) for one in found)
         if np.isfinite(rise):
-            figures.append(Figure(f"energy_gain_j.{name}", rise, "J"))
+            figures.append(Figure(f"energy_gain.{name}", rise, "J"))
             line += f"; robot and tank {rise:.2g} J above what came from outside"
         lines.append(line)
     return figures, lines

@@ -49,10 +49,10 @@ def energy_figures(episodes: Mapping[str, np.ndarray], suffix: str = "") -> list
         return []
     arrived = drawn[episodes["end"] == GOAL]
     found = [
-        Figure(f"energy_drawn_j{suffix}", float(np.median(arrived)) if len(arrived) else None, "J"),
-        Figure(f"greatest_power_w{suffix}", float(np.median(episodes["flow"])), "W"),
+        Figure(f"energy_drawn{suffix}", float(np.median(arrived)) if len(arrived) else None, "J"),
+        Figure(f"greatest_power{suffix}", float(np.median(episodes["flow"])), "W"),
     ]
     if np.isfinite(level).any():
         least = float(np.nanmin(level))
-        found.append(Figure(f"least_tank_level_j{suffix}", least, "J", better="higher"))
+        found.append(Figure(f"least_tank_level{suffix}", least, "J", better="higher"))
     return found

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.experiments.contact import maze_passive
+from palpate.experiments.contact import maze_passive, other_robots
 
 # Of each row: goals among ten episodes, energy drawn in each, the tank's least level, the rise.
 FOUND = {
@@ -38,9 +38,17 @@ def test_rows_are_held_against_agnostic_episode_by_episode(tmp_path, monkeypatch
 
     monkeypatch.setattr(maze_passive.train, "run", run)
     monkeypatch.setattr(maze_passive, "tried", tried)
-    monkeypatch.setattr(maze_passive, "TIMED", 50)
+    monkeypatch.setattr(other_robots, "CALLS", 50)
     ropes = {"bare": {"success": 1.0, "time": 2.0}, "filtered": {"success": 0.97, "time": 2.02}}
-    monkeypatch.setattr(maze_passive, "of_ropes", lambda quick: ropes | {"least": 0.3})
+    monkeypatch.setattr(other_robots, "of_ropes", lambda count: ropes | {"least": 0.3})
+    rooms = []
+
+    def of_room(seed):
+        rooms.append(seed)
+        reached = {"bare": True, "filtered": seed % 10 > 0}  # one in ten is lost
+        return reached | {"drawn": 80.0, "least": 5.0 + seed % 2}
+
+    monkeypatch.setattr(other_robots, "of_room", of_room)
     monkeypatch.setattr(maze_passive.Experiment, "on_every_core", lambda *_: None)
     result = maze_passive.reproduce(tmp_path)
     figures = {figure.name: figure for figure in result.figures}
@@ -62,6 +70,10 @@ def test_rows_are_held_against_agnostic_episode_by_episode(tmp_path, monkeypatch
     assert figures["rope.success_difference"].value == pytest.approx(-0.03)
     assert not figures["rope.success_difference"].met
     assert figures["rope.time_ratio"].value == pytest.approx(1.01)
+    assert figures["base.success_difference"].value == pytest.approx(-0.1)
+    assert not figures["base.success_difference"].met
+    assert figures["detail.base.least_tank_level_J"].value == 5.0
+    assert sorted(rooms) == [*range(other_robots.ROOM_SEED, other_robots.ROOM_SEED + 40)]
     assert len(trained) == 12
     assert {costs for method, costs, _ in trained if method == "passive"} == {
         ("eb",), ("ef",), ("eb", "ef"),

@@ -6,8 +6,7 @@ deployment or without, and with costs of energy in training or without. *Agnosti
 learnt with both costs (`palpate train maze --method passive`); *ensured* is aware behind the
 filter. With either cost alone, behind every other filter, and on the arm stand beside. All are
 tried in the same episodes, so that what they draw is compared episode by episode. The same filter
-stands before the gripper's servos of ropes, which the policy that ships with palpate brings to
-rest.
+stands before other robots as well (`palpate.experiments.contact.other_robots`).
 
 An episode violates passivity if more energy was drawn than the tank held above its reserve; behind
 a filter also if energy stored and tank rose by more than `GAIN`, by a meter of the simulator: that
@@ -17,7 +16,6 @@ other, one on each core; what is found of one is in a small folder `TRAINING-SEE
 
 import dataclasses
 import functools
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,8 +26,8 @@ import numpy as np
 from palpate.commands import folders, train
 from palpate.commands.episodes import at_its_best
 from palpate.experiments.contact.maze_safe import FIRST
+from palpate.experiments.contact.other_robots import of_other_robots
 from palpate.experiments.experiment import Experiment, ratio, share_of
-from palpate.experiments.rope import nominal
 from palpate.families.contact.environments import TANK
 from palpate.families.contact.episodes import GOAL
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
@@ -37,13 +35,8 @@ from palpate.learning.off_policy import evaluate
 from palpate.networks.guarded import load_actor
 from palpate.runs import Figure, Result
 from palpate.safety.energy_tank import EnergyTank
-from palpate.safety.filters import FILTERS, NONE, filter_of
-from palpate.safety.port import Port
-from palpate.tasks.rope import RopeStabilization
+from palpate.safety.filters import FILTERS, NONE
 from palpate.trials.audit import EnergyWatch
-from palpate.trials.rope.learned import LearnedController
-from palpate.trials.rope.stabilization import behind_filter, evaluation_trials, summarise
-from palpate.trials.trial import run_trials
 
 NAME = "maze-passive"
 TRIED = 600_000  # the seed of the episodes
@@ -70,12 +63,9 @@ ROWS: dict[str, tuple[str, str, str]] = {
     "arm": ("passive-eb-ef", NONE, "arm"),
     "arm.filtered": ("passive-eb-ef", OURS, "arm"),
 }
-ROPES, ROPE_TANK = 10, 1.0  # each from four poses; J
 LEARNT = ("aware", "ensured", "eb", "ef")  # which are held against agnostic, episode by episode
-TIMED = 20_000  # calls of the filter
-MINUTES = {"trainings": 40, "episodes": 60, "ropes": 3}
-SUCCESS, KEPT, LESS, CLOSE, FAST = 0.8, 0.9, 0.7, -0.05, 0.1  # the bars; the last in ms
-ROPE_CLOSE, ROPE_SLOWER = -0.02, 1.02  # the same, of ropes
+MINUTES = {"trainings": 40, "episodes": 60, "other robots": 8}
+SUCCESS, KEPT, LESS, CLOSE = 0.8, 0.9, 0.7, -0.05  # the bars
 
 Episodes = Mapping[str, Sequence[Any]]  # of one row and seed: ends, energies in J
 
@@ -108,11 +98,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     for name, each in grid:
         for row, episodes in of_training(experiment, name, each)["rows"].items():
             found[row].append(episodes)
-    ropes = experiment.found("ropes", {"tank": ROPE_TANK, "ropes": ROPES}, lambda: of_ropes(quick))
-    timed = experiment.found("filter", {"calls": TIMED}, filter_times)
-    listed = [*figures(found), *rope_figures(ropes)]
-    listed.append(Figure("filter_p99_ms", timed["p99_ms"], "ms", FAST))
-    listed.append(Figure("detail.filter_median_ms", timed["median_ms"], "ms"))
+    listed = [*figures(found), *of_other_robots(experiment)]
     settings = {"size": dataclasses.asdict(size), "tank": TANK, "rows": ROWS}
     return experiment.result(listed, settings, f"the same new episodes for all, seed {TRIED}")
 
@@ -159,50 +145,6 @@ def tried(folder: Path, which: str, world: str, episodes: int, seed: int) -> Epi
     level = [None if value != value else value for value in ended["level"].tolist()]
     rise = act.rise(episodes).tolist() if watched else [0.0] * episodes
     return kept | {"level": level, "rise": rise}
-
-
-def of_ropes(quick: bool) -> dict[str, Any]:
-    """How ropes come to rest with a filter before the gripper's servos, and without."""
-    policy, _ = nominal.shipped_policy()
-    controller = LearnedController(policy, RopeStabilization())
-    trials = evaluation_trials(nominal.BASE, 1 if quick else ROPES, TRIED)
-    least, found = [], {}
-
-    def watch(_: int, worlds: Sequence[Any]) -> None:
-        least.append(min(world.drive.least for world in worlds))
-
-    for name, those in (("bare", trials), ("filtered", behind_filter(trials, ROPE_TANK))):
-        episodes = run_trials(those, controller, watch=watch if name == "filtered" else None)
-        summary = summarise(those, episodes)
-        found[name] = {"success": summary.success_rate, "time": summary.time}
-    return found | {"least": min(least)}
-
-
-def rope_figures(found: Mapping[str, Any]) -> list[Figure]:
-    """With the filter against without."""
-    bare, filtered = found["bare"], found["filtered"]
-    slower = ratio(filtered["time"], bare["time"])
-    return [
-        Figure("rope.success_difference", filtered["success"] - bare["success"], "", ROPE_CLOSE,
-               better="higher"),
-        Figure("rope.time_ratio", slower, "", ROPE_SLOWER),
-        Figure("detail.rope.success_rate", filtered["success"], "", better="higher"),
-        Figure("detail.rope.least_tank_level_J", found["least"], "J", better="higher"),
-    ]  # fmt: skip
-
-
-def filter_times() -> dict[str, float]:
-    """Of one call for one robot, half of them with an empty tank."""
-    one = filter_of(OURS, {"tank": TANK})
-    tank, times = EnergyTank(**TANK), []
-    still = np.zeros((1, 2))
-    port = Port(still + 9.0, still + 1e-4, still + 0.3, np.eye(2)[None], np.full(1, 1e-3), 1e-3)
-    for number in range(TIMED):
-        state = np.full(1, tank.lower if number % 2 else tank.initial)
-        began = time.perf_counter()
-        one(state, port, still + 9.0)
-        times.append(1e3 * (time.perf_counter() - began))
-    return {"median_ms": float(np.median(times)), "p99_ms": float(np.quantile(times, 0.99))}
 
 
 def figures(found: Mapping[str, Sequence[Episodes]]) -> list[Figure]:

@@ -21,6 +21,7 @@ from palpate.planning.movable_obstacles.search.policy import NoWayError
 from palpate.planning.movable_obstacles.search.tree_search import Settings
 from palpate.trials.furniture.namo_execution import FORCE, Contact, Execution, Frame, OutOfTimeError
 from palpate.trials.furniture.rooms import MARGIN, TIGHT, Room, ends_of
+from palpate.worlds.world import Drive
 
 # Written down before the first full run.
 BUDGET, ATTEMPTS = 240.0, 12  # simulated s, and transfers begun, of an episode
@@ -137,10 +138,13 @@ class Episode:
     tried: list[tuple[str, float]] = field(default_factory=list)
 
 
-def episode(room: Room, opinion: Opinion) -> Episode:
-    """Until the goal is reached, no way is left, or time or attempts are over."""
+def episode(room: Room, opinion: Opinion, drive: Drive | None = None) -> Episode:
+    """Until the goal is reached, no way is left, or time or attempts are over.
+
+    `drive` stands before the servos of the base.
+    """
     outcome = Episode(False, "attempts")
-    run = Execution(room, opinion.felt, BUDGET)
+    run = Execution(room, opinion.felt, BUDGET, drive=drive)
     try:
         _episode(run, room, opinion, outcome)
     except OutOfTimeError:

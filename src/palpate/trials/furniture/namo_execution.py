@@ -21,6 +21,7 @@ from palpate.planning.movable_obstacles.search.plan import Segment
 from palpate.trials.furniture.rooms import BASE_RADIUS, MARGIN, POSTURE, RADIUS, REACH, Pose, Room
 from palpate.worlds.furniture.furniture import FurnitureObservation, RobotAction
 from palpate.worlds.furniture.robot import Robot as Base
+from palpate.worlds.world import Drive
 
 FORCE = 60.0  # N, the most that the hand pulls with
 SPEED, RATE = 0.25, 0.5  # m/s, rad/s of the hand with an object
@@ -76,14 +77,20 @@ class OutOfTimeError(Exception):
 class Execution:
     """One episode in a room's world: what the robot does, and what is counted meanwhile.
 
-    `learn` is called with every `Contact` as it ends. `budget` in s of simulated time.
+    `learn` is called with every `Contact` as it ends. `budget` in s of simulated time. `drive`
+    stands before the servos of the base.
     """
 
     def __init__(
-        self, room: Room, learn: Callable[[Contact], None], budget: float, frame_period: float = 0.4
+        self,
+        room: Room,
+        learn: Callable[[Contact], None],
+        budget: float,
+        frame_period: float = 0.4,
+        drive: Drive | None = None,
     ) -> None:
         self.room, self.learn, self.budget = room, learn, budget
-        self.world = room.world()
+        self.world = room.world(drive)
         self.names = self.world.names
         self.outlines = self.world.outlines
         self.period = self.world.control_period

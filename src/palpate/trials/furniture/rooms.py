@@ -21,6 +21,9 @@ from palpate.planning.movable_obstacles.maps.map import Map, Movable, map_of
 from palpate.planning.movable_obstacles.maps.map import Robot as Disc
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.maps.regions import regions_of
+from palpate.safety.energy_tank import EnergyTank
+from palpate.safety.filtered_drive import FilteredDrive
+from palpate.safety.passivity import PassivityFilter
 from palpate.worlds.furniture.furniture import (
     FurnitureWorld,
     Piece,
@@ -29,6 +32,9 @@ from palpate.worlds.furniture.furniture import (
     Robot,
 )
 from palpate.worlds.furniture.pieces import Mount
+from palpate.worlds.furniture.robot import BASE_SPEED, TURN_SPEED, base_inertia
+from palpate.worlds.furniture.scene import TIME_STEP
+from palpate.worlds.world import Drive
 
 Construction = Literal["casters", "feet", "wheels", "locked", "hinged", "bolted"]
 Pose = tuple[float, float, float]
@@ -84,10 +90,10 @@ class Room:
     bounds: tuple[float, float, float, float]
     seed: int
 
-    def world(self) -> FurnitureWorld:
-        """The MuJoCo world, not yet reset."""
+    def world(self, drive: Drive | None = None) -> FurnitureWorld:
+        """The MuJoCo world, not yet reset; `drive` stands before the servos of the base."""
         robot = Robot(self.start, radius=BASE_RADIUS, nominal=POSTURE)
-        return FurnitureWorld(self.pieces, self.walls, robot)
+        return FurnitureWorld(self.pieces, self.walls, robot, drive=drive)
 
     def map(
         self,
@@ -119,6 +125,17 @@ class Room:
         seen = self.map(world.outlines, world.starts, self.start)
         ends = ends_of(seen)
         return min(ends) >= 0 and ends[0] != ends[1]
+
+
+def base_filter(tank: float) -> FilteredDrive:
+    """A passivity filter before the servos of a room's base, whose tank holds so many J.
+
+    The filter knows of the robot's own mass alone, and of its greatest speed.
+    """
+    one = EnergyTank(initial=tank, upper=tank)
+    robot = Robot(radius=BASE_RADIUS, nominal=POSTURE)
+    fastest = math.hypot(BASE_SPEED, TURN_SPEED)
+    return FilteredDrive(PassivityFilter(tank=one, fastest=fastest), base_inertia(robot), TIME_STEP)
 
 
 def ends_of(world: Map) -> tuple[int, int]:

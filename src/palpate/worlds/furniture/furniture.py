@@ -35,7 +35,7 @@ from palpate.worlds.furniture.robot import (
 )
 from palpate.worlds.furniture.scene import TIME_STEP, convex_parts, furniture_scene
 from palpate.worlds.furniture.touch import felt_wrenches
-from palpate.worlds.world import DivergedError, OffscreenCamera, World
+from palpate.worlds.world import DivergedError, Drive, OffscreenCamera, World
 
 CONTROL_PERIOD = 0.02  # s
 STEPS_PER_PERIOD = round(CONTROL_PERIOD / TIME_STEP)
@@ -112,7 +112,8 @@ class FurnitureWorld(World):
     frame's origin, held for one control period; with one it is a `RobotAction`.
 
     Hidden constants that a piece does not bring are drawn by the seed of `reset`. `walls` are
-    simple polygons (points, 2) in m.
+    simple polygons (points, 2) in m. With a `drive` the forces of the servos of the robot's base
+    (3,) N, N, N m are what that makes of them.
 
     Raises `PalpateError` for a scene without pieces, pieces that start inside one another or a
     wall, a malformed wall or action; and `DivergedError`, also when a piece tips over.
@@ -124,6 +125,7 @@ class FurnitureWorld(World):
         walls: Sequence[ArrayLike] = (),
         robot: Robot | None = None,
         sensors: FurnitureSensors | None = None,
+        drive: Drive | None = None,
     ):
         if not pieces:
             raise PalpateError("a furniture world needs at least one piece")
@@ -132,7 +134,7 @@ class FurnitureWorld(World):
         self._walls = [np.asarray(wall, float) for wall in walls]
         for wall in self._walls:
             convex_parts(wall)
-        self._robot = robot
+        self._robot, self.drive = robot, drive
         self._sensors = sensors or FurnitureSensors()
         self._names = _distinct([kind.name for kind in self._kinds])
         self._camera: OffscreenCamera | None = None
@@ -207,7 +209,7 @@ class FurnitureWorld(World):
         data = mujoco.MjData(model)
         bodies = Bodies(model, data, self._names, self._kinds, start[:, 2])
         outlines = list(self.outlines.values())
-        robot = self._robot and RobotInScene(model, data, self._robot, bodies, outlines)
+        robot = self._robot and RobotInScene(model, data, self._robot, bodies, outlines, self.drive)
         mujoco.mj_step(model, data, round(SETTLING / TIME_STEP))
         self._running = _Running(model, data, bodies, robot)
         self._check()

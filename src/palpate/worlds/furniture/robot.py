@@ -2,9 +2,10 @@
 
 The base is a cylinder on two slides and a yaw hinge (it never tips, and its own wheels are left
 out), the arm has three hinges. Servos of both follow the integral of the commanded velocities, and
-give way at their force limits. Base and gripper collide; the links, above the furniture, do not. A
-grasp is a weld, made where the gripper touches an outline. What is sensed: encoders, motor efforts
-and a force-torque sensor in the wrist.
+give way at their force limits; those of the base may stand behind a drive, such as a filter. Base
+and gripper collide; the links, above the furniture, do not. A grasp is a weld, made where the
+gripper touches an outline. What is sensed: encoders, motor efforts and a force-torque sensor in the
+wrist.
 """
 
 import math
@@ -20,6 +21,7 @@ from palpate.numerics.polygons import placed
 from palpate.worlds.furniture.bodies import Bodies
 from palpate.worlds.furniture.pieces import BAND, HANDLE_HEIGHT
 from palpate.worlds.furniture.scene import BODY_BIT, DRAWN, SOLID
+from palpate.worlds.world import Drive
 
 BASE_MASS = 30.0  # kg
 LINK_MASS = 1.0  # kg, of each
@@ -105,6 +107,19 @@ class RobotTruth:
     holding: int | None
 
 
+def base_inertia(robot: Robot) -> np.ndarray:
+    """(3, 3) kg, kg, kg m^2: what the base's servos move, its arm as in `nominal`.
+
+    How the arm couples turning with driving is left out: that depends on the heading.
+    """
+    joints = forward_kinematics(np.zeros(3), np.asarray(robot.nominal), robot.links)
+    middles = (joints[1:] + joints[:-1]) / 2
+    arm = LINK_MASS * (middles**2).sum() + GRIPPER_MASS * (joints[-1] ** 2).sum()
+    rods = LINK_MASS * (np.square(robot.links) / 12).sum()
+    mass = BASE_MASS + 3 * LINK_MASS + GRIPPER_MASS
+    return np.diag([mass, mass, BASE_MASS * robot.radius**2 / 2 + arm + rods])
+
+
 def forward_kinematics(
     base_pose: np.ndarray, joint_angles: np.ndarray, links: Sequence[float]
 ) -> np.ndarray:
@@ -181,8 +196,9 @@ class RobotInScene:
         robot: Robot,
         bodies: Bodies,
         outlines: Sequence[np.ndarray],
+        drive: Drive | None = None,
     ):
-        self._model, self._data, self._robot = model, data, robot
+        self._model, self._data, self._robot, self._drive = model, data, robot, drive
         self._bodies, self._outlines = bodies, outlines
         # Three joints of the base and three of the arm, one after the other; views of the state.
         first, motor = model.joint("base 0"), model.actuator("base 0").id
@@ -190,6 +206,7 @@ class RobotInScene:
         self._velocity = data.qvel[first.dofadr[0] :][:6]
         self._command = data.ctrl[motor:][:6]
         self._effort = data.actuator_force[motor:][:6]
+        self._given = data.qfrc_applied[first.dofadr[0] :][:3]
         self._welds = [model.equality(f"grasp {name}").id for name in bodies.names]
         self._gripper, self._claw = model.body("gripper").id, model.geom("gripper").id
         self._site = model.site("wrist").id
@@ -198,6 +215,10 @@ class RobotInScene:
         self._position[2:] = [robot.pose[2], *robot.nominal]
         self._command[:] = self._position
         self._target, self._profile = self._position.copy(), np.zeros(6)
+        if drive is not None:  # which gives the forces of the base's servos in their place
+            model.actuator_gainprm[motor : motor + 3] = 0.0
+            model.actuator_biasprm[motor : motor + 3] = 0.0
+            drive.begin()
         mujoco.mj_forward(model, data)
 
     def advance(self, action: RobotAction, period: float) -> tuple[np.ndarray, np.ndarray]:
@@ -220,17 +241,32 @@ class RobotInScene:
             self._target = np.clip(self._target, self._position - LEAD, self._position + LEAD)
             self._target[3:] = np.clip(self._target[3:], -JOINT_LIMIT, JOINT_LIMIT)
             self._command[:] = self._target + self._profile * feed_forward
-            mujoco.mj_step(model, data, round(time / model.opt.timestep))
+            for _ in range(round(time / model.opt.timestep)):
+                if self._drive is not None:
+                    self._given[:] = self._drive(
+                        self._servo_force(), self._position[:3], self._velocity[:3].copy()
+                    )
+                mujoco.mj_step(model, data)
             # In the site's axes, of which z is vertical.
             axes = data.site_xmat[self._site].reshape(3, 3)
             wrist[:2] += axes[:2] @ data.sensordata[:3]
             wrist[2] += data.sensordata[5]
-            effort += self._effort[:2]
+            effort += self._effort[:2] + self._given[:2]
         acceleration = (self._velocity[:2] - before) / period
         wrist, effort = wrist / SAMPLES, effort / SAMPLES
-        # The servo's damping acts at the end of each implicit step; `effort` is of its beginning.
-        inertia = self._mass + DAMPING[0] * model.opt.timestep
+        inertia = self._mass
+        if self._drive is None:
+            # The servo's damping acts at the end of an implicit step; `effort` is of its beginning.
+            inertia = inertia + DAMPING[0] * model.opt.timestep
         return wrist, effort - inertia * acceleration - wrist[:2]
+
+    def _servo_force(self) -> np.ndarray:
+        """What the base's servos would give now, N, N, N m."""
+        stiffness, damping, most = (
+            np.array(each[:3]) for each in (STIFFNESS, DAMPING, GREATEST_FORCE)
+        )
+        force = stiffness * (self._command - self._position)[:3] - damping * self._velocity[:3]
+        return np.clip(force, -most, most)
 
     def truth(self) -> RobotTruth:
         """Where the robot is and how it moves, without noise."""

@@ -13,7 +13,7 @@ from palpate.deployment.plausibility import Values
 from palpate.deployment.supervisor import Limits, Order, Supervisor
 from palpate.families.rope.chain_check import ChainCheck
 from palpate.models.rope import Rope
-from palpate.networks import Channel, CommandPolicy, GuardedPolicy, save_controller
+from palpate.networks import Channel, CommandPolicy, GuardedPolicy, count_of, save_controller
 from palpate.networks.actor import GaussianActor
 from palpate.networks.guarded import untrained_guard
 from palpate.tasks.rope import RopeStabilization
@@ -65,20 +65,25 @@ def impedance_policy(**changes) -> CommandPolicy:
     return dataclasses.replace(policy, network=scaled(policy.network, 4.0))
 
 
-def actor_file(method: str = "srl-vic", **changes) -> GuardedPolicy:
-    """A guarded policy that acts at random, as `palpate train maze` keeps it."""
+def actor_file(method: str = "srl-vic", energy=None, **changes) -> GuardedPolicy:
+    """A guarded policy that acts at random, as `palpate train maze` keeps it; with an `energy` it
+    sees a tank, too."""
     keys = jax.random.split(jax.random.key(0))
+    observations = Channel("wrench", (6,)), Channel("position", (3,))
+    if energy is not None:
+        observations = *observations, Channel("tank", (1,))
     policy = GuardedPolicy(
-        actor=GaussianActor.create(keys[0], 9, 4, 16, 2),
+        actor=GaussianActor.create(keys[0], count_of(observations), 4, 16, 2),
         guard=untrained_guard(keys[1], 6, 4, (16, 16), tuple(range(6))),
         threshold=0.5,
-        observations=(Channel("wrench", (6,)), Channel("position", (3,))),
+        observations=observations,
         actions=(Channel("displacement", (2,)), Channel("stiffness", (2,))),
         period=0.1,
     )
     constants = {"task.force_limit": 20.0, "task.reference_height": 0.05}
     constants |= {"task.position_scale": 0.3, "world.displacement_limit": 0.02}
     constants |= {"world.stiffness_range": [50.0, 1000.0]}
+    constants |= {} if energy is None else {"energy": energy}
     told = {"task": "maze", "options": {"method": method}, "constants": constants}
     save_controller("actor.safetensors", policy, told | changes)
     return policy

@@ -42,7 +42,8 @@ def test_channels_are_shown_in_their_order():
     random = np.random.default_rng(0)
     position, velocity = random.normal(size=(2, 5, 3)).astype(np.float32)
     decision = ChannelDecision(policy)
-    decision.see({"position": position, "velocity": velocity})
+    names = [channel.name for channel in policy.observations]
+    decision.see({"another": np.ones(1), names[1]: velocity, names[0]: position})
     command = np.full(3, 0.1, np.float32)
     features = np.concatenate([position, velocity]).reshape(-1)
     _, expected = policy(jnp.asarray(command[None]), jnp.asarray(features))

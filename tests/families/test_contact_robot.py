@@ -1,12 +1,17 @@
 """The simulated tip behind a link: it goes where it is told, and brakes when nobody speaks."""
 
 import numpy as np
+import pytest
 
 from palpate.deployment.messages import CommandMessage, decode_state, encode_command
+from palpate.deployment.tank import TANK
 from palpate.families.contact import robot
 from palpate.networks import Channel
+from palpate.safety.filters import filter_of
 from palpate.tasks.maze.maze import MazeTask
 from palpate.worlds.maze.maze import BlindMaze
+from palpate.worlds.maze.scene import TIP_MASS
+from palpate.worlds.world import innermost
 
 SENSORS = Channel("wrench", (6,)), Channel("position", (3,))
 
@@ -14,8 +19,8 @@ SENSORS = Channel("wrench", (6,)), Channel("position", (3,))
 class Loop:
     """Says the same in every period, on a clock that moves with the robot's sleep."""
 
-    def __init__(self, monkeypatch):
-        self.now, self.states = 0.0, []
+    def __init__(self, monkeypatch, sensors=SENSORS):
+        self.now, self.states, self.sensors = 0.0, [], sensors
         self.command: tuple[float, ...] | None = None
         self.decided_on: int | None = None  # None: every command on the newest state
         monkeypatch.setattr(robot.time, "sleep", self.sleep)
@@ -27,7 +32,7 @@ class Loop:
         self.now += seconds
 
     def send(self, data):
-        self.states.append(decode_state(data, SENSORS))
+        self.states.append(decode_state(data, self.sensors))
 
     def arrivals(self):
         if self.command is None:
@@ -51,7 +56,7 @@ def test_it_goes_where_it_is_told_and_brakes_when_nobody_speaks(monkeypatch):
     loop.command = None
     for _ in range(4):
         tip.advance()
-    assert np.abs(tip._law.stiffness).max() == 0.0
+    assert np.abs(innermost(tip._law).stiffness).max() == 0.0
     assert np.abs(tip._seen.velocity).max() < 0.01
     assert tip.force >= 0.0
     assert tip.progress < 1.0
@@ -69,3 +74,19 @@ def test_a_motion_goes_on_until_another_is_decided_on(monkeypatch):
     for _ in range(60):
         tip.advance()
     assert abs(loop.states[-1].values["position"][0] - first - 0.02) < 2e-4
+
+
+def test_behind_a_filter_it_sends_its_tank_and_the_tank_pays_for_its_motion(monkeypatch):
+    loop = Loop(monkeypatch, (*SENSORS, TANK))
+    passes = filter_of("passivity", {"tank": {"initial": 0.22, "upper": 0.22}})
+    world = BlindMaze(noise=0.0, sway=0.0)
+    tip = robot.TipRobot(loop, world, MazeTask(), seed=0, period=0.1, passes=passes)
+    fastest = 0.0
+    for number in range(6):
+        loop.command = (0.02 * (-1) ** number, 0.0, 1000.0, 1000.0)
+        tip.advance()
+        fastest = max(fastest, np.linalg.norm(tip._seen.velocity))
+    levels = [float(state.values["tank"][0]) for state in loop.states]
+    assert levels[0] == pytest.approx(0.22)
+    assert 0.05 < min(levels) < 0.22
+    assert 0.5 * TIP_MASS * fastest**2 < 0.03  # J: what is above the lower bound

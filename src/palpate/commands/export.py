@@ -37,13 +37,15 @@ def run(options: Export) -> Path:
     check_writable(target)
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_network(file)
+    deployment = deployment_of(policy, manifest)
+    if options.filter is not None:
+        deployment.stand_behind(options.filter, options.tank)
     with folders.begin(options, "export", {"policy": file}) as run:
         if isinstance(policy, CommandPolicy):
             write_onnx(run.path / ONNX, policy)
             apart = {ONNX: difference(run.path / ONNX, policy, STEPS, options.seed)}
             most = AGREES
         else:
-            deployment = deployment_of(policy, manifest)
             apart = _actor_written(run.path, policy, deployment, options.seed)
             most = ACTOR_AGREES
         for name, off in apart.items():
@@ -56,7 +58,7 @@ def run(options: Export) -> Path:
         for name in apart:
             write_bytes(targets[name], (run.path / name).read_bytes())
         if isinstance(policy, CommandPolicy):
-            write_contract(beside, policy, manifest, target.name)
+            write_contract(beside, policy, manifest, target.name, deployment.filter)
         else:
             reflex = targets[REFLEX].name if REFLEX in apart else None
             write_actor_contract(beside, policy, deployment, target.name, reflex)

@@ -19,6 +19,10 @@ PerChannel = Annotated[
     tuple[str, ...],
     arg(metavar="[NAME=]NUMBER ...", help_behavior_hint="(default: the policy's)"),
 ]
+FilterName = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: none)")]
+TankSize = Annotated[
+    float | None, arg(metavar="JOULE", help_behavior_hint="(default: as the policy's task has it)")
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +110,10 @@ class Export(Options):
     """What `palpate train` wrote: its folder, or the policy file in it."""
     onnx: Annotated[Path, arg(metavar="FILE")]
     """Where to; the contract goes beside it, ending in .json."""
+    filter: FilterName = None
+    """Of energy, which the contract asks the robot's program for."""
+    tank: TankSize = None
+    """That the filter's tank holds in the beginning, and at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,6 +167,7 @@ class Serve(Options):
     1. With a simulated robot, for a look:      palpate serve POLICY --simulate
     2. With a robot's program that connects:    palpate serve POLICY --rate-limit 4
     3. More rows of a channel than needed:      palpate serve POLICY --rows markers=21
+    4. Behind a filter of energy:               palpate serve POLICY --filter passivity --tank 1
     """
 
     policy: Positional[Annotated[Path, arg(metavar="POLICY", help_behavior_hint="")]]
@@ -177,3 +186,7 @@ class Serve(Options):
     """Of the action, in its unit; lower than the policy's. One number, or one for each channel."""
     rate_limit: PerChannel = ()
     """Of the action's change, per second; it brakes with this."""
+    filter: FilterName = None
+    """Of energy, in the robot's program, which then sends what its tank holds after all else."""
+    tank: TankSize = None
+    """That the filter's tank holds in the beginning, and at most."""

@@ -18,15 +18,17 @@ from palpate.deployment.intake import MISSING, Intake
 from palpate.deployment.loop import Record, run_loop
 from palpate.deployment.scheduling import real_time
 from palpate.deployment.supervisor import ASKED, NOTHING, Limits, Mode, Supervisor
+from palpate.deployment.tank import TANK, TankLog
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.errors import PalpateError, StoppedError
 from palpate.family import check_name
+from palpate.report.energy_picture import level_picture
 from palpate.runs import Figure
 from palpate.runs.figure_names import lines_of
 from palpate.runs.progress import Stop, interruptible
 from palpate.runs.storage import write_json
 
-LATENCY = "latency.json"
+LATENCY, TANK_FILE, TANK_PICTURE = "latency.json", "tank.json", "tank.png"
 SIMULATED = 10.0  # s
 START = 60.0  # s that a simulated robot may take to start, on a busy machine
 FAREWELL = 1.0  # s in which it says what happened
@@ -44,8 +46,11 @@ def run(options: Serve) -> Path:
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_network(file)
     deployment = deployment_of(policy, manifest, numbers(options.rows, "--rows", [], int))
+    if options.filter is not None:
+        deployment.stand_behind(options.filter, options.tank)
     limits = limits_of(deployment, options.limit, options.rate_limit)
     supervisor = supervisor_of(deployment, limits)
+    levels = TankLog() if TANK in deployment.sensors else None
     listen, words = options.listen, None
     if options.simulate:
         listen = free_endpoint()
@@ -65,10 +70,17 @@ def run(options: Serve) -> Path:
             if not prompt:
                 print(f"note: {ORDINARY}")
             print(f"listening at {listen}; Ctrl-C brakes and ends", flush=True)
-            record, asked = _served(supervisor, link, limits.period, options.seconds, robot)
+            served = supervisor, link, limits.period, options.seconds, robot, levels
+            record, asked = _served(*served)
             printed, status = ([], 0) if robot is None else _ended(robot)
         write_json(run.path / LATENCY, record.to_dict())
         figures = figures_of(record) + (deployment.outcome(printed[-1]) if printed else [])
+        if levels is not None and deployment.filter is not None:
+            write_json(run.path / TANK_FILE, deployment.filter.to_dict() | levels.to_dict())
+            figures.append(Figure("least_tank_level_J", levels.least, "J", better="higher"))
+            if levels.times and (tank := deployment.filter.tank) is not None:
+                shown = levels.times, levels.levels, tank, deployment.filter.name
+                level_picture(run.path / TANK_PICTURE, *shown)
         folders.finish(run, figures, {"real_time_scheduling": prompt})
         print("\n".join(lines_of(figures)))
         path = folders.hand_over(options, run, "A policy in real time")
@@ -143,7 +155,7 @@ def supervisor_of(deployment: Deployment, limits: Limits) -> Supervisor:
         decision.see(nothing)
         decision.decide(limits.rest)
     decision.forget()
-    intake = Intake(deployment.check(), sensors, limits.period)
+    intake = Intake(deployment.checks(), sensors, limits.period)
     return Supervisor(intake, decision, limits)
 
 
@@ -173,8 +185,9 @@ def _served(
     period: float,
     seconds: float | None,
     robot: subprocess.Popen | None,
+    levels: TankLog | None,
 ) -> tuple[Record, bool]:
-    """How it went, and whether it was ended by a signal."""
+    """How it went, and whether it was ended by a signal; `levels` fill meanwhile."""
 
     def report(mode: Mode, reason: str) -> None:
         print(f"{mode.name.lower()}{': ' if reason else ''}{reason}", flush=True)
@@ -187,7 +200,8 @@ def _served(
     record = Record()
     # Ctrl-C is how serving ends: nothing is cut off by it.
     with contextlib.suppress(KeyboardInterrupt), interruptible() as stop:
-        record = run_loop(supervisor, link, period, lambda now: goes_on(now, stop), report)
+        kept = {} if levels is None else {"watch": levels}
+        record = run_loop(supervisor, link, period, lambda now: goes_on(now, stop), report, **kept)
         return record, bool(stop)
     return record, True
 

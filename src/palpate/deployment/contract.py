@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.deployment.deployment import Deployment
+from palpate.deployment.tank import RobotFilter
 from palpate.errors import PalpateError
 from palpate.networks import (
     ActorPolicy,
@@ -26,13 +27,25 @@ _FORMAT = "palpate.contract"
 _VERSION = 2  # the first had one action, its limits beside it
 RISK = "of what was proposed: the discounted probability of a violation, in [0, 1]"
 UNDER_WAY = "of the policy or, if it is later, this graph's last action_out"
+FILTERED = (
+    "stands in the robot's program, before its drives: `palpate.safety.filters.filter_of(name, "
+    "numbers)`, called in every control period with what is wanted then, and what passes is held"
+)
+LEVEL = "J: what is left in its tank, which `palpate serve` is sent as its last channel, `tank`"
 _TRAINED = ("command", "seed", "training", "model", "machine", "wall_time_s")
 
 
 def write_contract(
-    path: str | Path, policy: CommandPolicy, manifest: Mapping[str, Any], file: str
+    path: str | Path,
+    policy: CommandPolicy,
+    manifest: Mapping[str, Any],
+    file: str,
+    by: RobotFilter | None = None,
 ) -> None:
-    """Write the contract of the policy, whose manifest this is, exported as `file`."""
+    """Write the contract of the policy, whose manifest this is, exported as `file`.
+
+    `by` is the filter of energy that the robot's program has to have.
+    """
     action = {"shape": ["batch", *policy.action_shape], "dtype": "float32"}
     content = {
         **_head(policy, manifest, file),
@@ -59,7 +72,7 @@ def write_contract(
         },
         "trained": _trained(manifest),
     }
-    write_json(path, content)
+    write_json(path, content | _filtered(by))
 
 
 def write_actor_contract(
@@ -120,7 +133,17 @@ def write_actor_contract(
             "now, holds until the next decision, and is itself replaced after no less than `pace` "
             "periods. Where features are not finite, rest until the next decision",
         }
-    write_json(path, content)
+    write_json(path, content | _filtered(deployment.filter))
+
+
+def _filtered(by: RobotFilter | None) -> dict[str, Any]:
+    """What a filter before the robot's drives adds to a contract."""
+    if by is None:
+        return {}
+    about = {"about": FILTERED}
+    if by.tank is not None:
+        about["level"] = LEVEL
+    return {"filter": by.to_dict() | about}
 
 
 def _head(policy: DeclaredController, manifest: Mapping[str, Any], file: str) -> dict[str, Any]:

@@ -4,11 +4,13 @@ Of NumPy, ONNX Runtime and JAX, asked one decision at a time on a busy machine, 
 shortest tail; `python -m benchmarks.serve` measures it.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from palpate.deployment.plausibility import Values
 from palpate.deployment.scaling import Scaling
-from palpate.networks import ActorPolicy, CommandPolicy, GuardedPolicy, count_of
+from palpate.networks import ActorPolicy, Channel, CommandPolicy, GuardedPolicy, count_of
 from palpate.networks.in_numpy import ActorInNumpy, GuardInNumpy
 
 
@@ -62,7 +64,7 @@ class ChannelDecision:
     """A policy that is shown exactly what it observes, channel by channel."""
 
     def __init__(self, policy: CommandPolicy):
-        self._network = NetworkDecision(policy)
+        self._network, self._observed = NetworkDecision(policy), policy.observations
         self._features = np.zeros(count_of(policy.observations), np.float32)
 
     def forget(self) -> None:
@@ -70,7 +72,7 @@ class ChannelDecision:
 
     def see(self, values: Values) -> None:
         """See `palpate.deployment.supervisor.Decision.see`."""
-        _fill(self._features, values)
+        _fill(self._features, self._observed, values)
 
     def decide(self, command: np.ndarray) -> np.ndarray:
         """See `palpate.deployment.supervisor.Decision.decide`."""
@@ -96,7 +98,7 @@ class ActorDecision:
 
     def see(self, values: Values) -> None:
         """See `palpate.deployment.supervisor.Decision.see`."""
-        _fill(self._measured, values)
+        _fill(self._measured, self._scaling.sensors, values)
 
     def decide(self, command: np.ndarray) -> np.ndarray:
         """See `palpate.deployment.supervisor.Decision.decide`."""
@@ -141,9 +143,10 @@ class ReflexDecision(ActorDecision):
         return self._scaling.command(self._under_way)[0]
 
 
-def _fill(flat: np.ndarray, values: Values) -> None:
-    """The numbers of all channels, one after the other."""
+def _fill(flat: np.ndarray, channels: Sequence[Channel], values: Values) -> None:
+    """The numbers of these channels, one after the other."""
     first = 0
-    for value in values.values():
+    for channel in channels:
+        value = values[channel.name]
         flat[first : first + value.size] = value.reshape(-1)
         first += value.size

@@ -8,10 +8,12 @@ from palpate.deployment.decision import ActorDecision, ChannelDecision, ReflexDe
 from palpate.deployment.plausibility import ChannelCheck, Check
 from palpate.deployment.scaling import Scaling
 from palpate.deployment.supervisor import Decision
+from palpate.deployment.tank import TANK, RobotFilter, TankCheck, numbers_with
 from palpate.errors import PalpateError
 from palpate.family import places, resolve
 from palpate.networks import ActorPolicy, CommandPolicy, load_controller
 from palpate.runs import Figure
+from palpate.safety.filters import WITH_TANK
 
 NetworkPolicy = CommandPolicy | ActorPolicy
 Policy = TypeVar("Policy", bound=NetworkPolicy)
@@ -30,7 +32,8 @@ class Deployment(Generic[Policy]):
     A family whose robots send something else, or whose sensors can be checked better, names a
     class derived from this one in its table, as `deployments`, by task. `sensors` are the channels
     that are sent, `actions` those that the robot is told; `period` is that of states and commands,
-    in s: a decision's, or that in which a reflex may interrupt again.
+    in s: a decision's, or that in which a reflex may interrupt again. `filter` is one of energy
+    that stands in the robot's program, None without.
 
     Args:
         policy: to be served.
@@ -51,6 +54,7 @@ class Deployment(Generic[Policy]):
         names = [channel.name for channel in self.sensors]
         if len(set(names)) != len(names):
             raise PalpateError(f"two sensor channels have one name: {', '.join(names)}")
+        self.filter: RobotFilter | None = None
         self.set_rows(rows)
 
     def actor_scaling(self) -> Scaling:
@@ -69,6 +73,28 @@ class Deployment(Generic[Policy]):
                 + ", ".join(f"{channel.name} {channel.shape}" for channel in self.sensors)
                 + ": expected no --rows"
             )
+
+    def stand_behind(self, name: str, tank: float | None) -> None:
+        """Have the robot's program put the filter of that name before its drives.
+
+        Its tank holds so many J, None: as the family has it; then the robot sends what is in it
+        after all else. Raises `PalpateError` for a filter that there is not, and without a tank
+        where the family has none.
+        """
+        if name not in WITH_TANK and tank is not None:
+            raise PalpateError(f"the filter {name} has no tank: expected no --tank")
+        self.filter = RobotFilter(name, self.filter_numbers(name, tank))
+        if self.filter.tank is not None and TANK not in self.sensors:
+            self.sensors = (*self.sensors, TANK)
+
+    def filter_numbers(self, name: str, tank: float | None) -> dict[str, Any]:
+        """Of a filter, as `palpate.safety.filters.filter_of` takes them."""
+        return numbers_with(tank) if name in WITH_TANK else {}
+
+    def checks(self) -> Check:
+        """`check`, and of the tank's level where the robot sends it."""
+        by = self.filter
+        return self.check() if by is None or by.tank is None else TankCheck(self.check(), by)
 
     def decision(self) -> Decision:
         """The policy, fed by `sensors`."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from palpate.deployment.latency import Histogram
 from palpate.deployment.messages import CommandMessage, encode_command
+from palpate.deployment.plausibility import Values
 from palpate.deployment.supervisor import Mode, Supervisor
 
 SPIN = 5e-4  # s before a deadline from which on the clock is watched instead of sleeping
@@ -69,13 +70,15 @@ def run_loop(
     period: float,
     goes_on: Callable[[float], bool],
     report: Callable[[Mode, str], None] = lambda mode, reason: None,
+    watch: Callable[[float, Values], None] = lambda time, values: None,
 ) -> Record:
     """One order every `period` s while `goes_on(seconds since the start)`; then a brake to rest.
 
     Deadlines lie `LEAD` after the arrival of a state, as far as following the sender's clock by
     `FOLLOW` of a period allows, or when a state becomes missing, if that is sooner. One that has
     passed is skipped, not made up for. A first call may be slow: warm up what decides before.
-    Garbage is collected before and after, not in between. `report` hears of every change of mode.
+    Garbage is collected before and after, not in between. `report` hears of every change of mode,
+    and `watch` of the newest good state, when its command is sent.
     """
     record, clock = Record(), link.clock
     session, sequence = secrets.randbits(64), 0
@@ -106,6 +109,8 @@ def run_loop(
                 )
             )
             if arrivals:
+                if (values := supervisor.values) is not None:
+                    watch(now - began, values)
                 newest = arrivals[-1][0]
                 if order.mode is Mode.RUNNING:
                     record.decisions.add(decided - now)

@@ -142,6 +142,12 @@ class Supervisor:
         return 0 if newest is None else newest.sequence
 
     @property
+    def values(self) -> Values | None:
+        """What the newest good state showed, None without one."""
+        newest = self._intake.newest
+        return None if newest is None else newest.values
+
+    @property
     def decided_on(self) -> int:
         """Sequence number of the state that the motion under way was decided on."""
         return self._decided_on if self.mode is Mode.RUNNING else self.seen

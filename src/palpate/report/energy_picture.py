@@ -1,4 +1,4 @@
-"""Energy over time, as a picture: what trials drew, and how fast."""
+"""Energy over time, as a picture: what trials drew, and how fast; what a tank held."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,10 +7,27 @@ from typing import Any
 import matplotlib
 
 from palpate.report.picture import canvas_of, legend_of, save_picture
+from palpate.safety.energy_tank import EnergyTank
 from palpate.safety.recorded_energy import RecordedEnergy
 
 NAMED = 8  # trials that have a line in the legend
 _SETTINGS: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+
+
+def level_picture(
+    out: Path, times: Sequence[float], levels: Sequence[float], tank: EnergyTank, name: str
+) -> None:
+    """A PNG of a tank's level, J, over the time, s, with the bounds of the tank."""
+    with matplotlib.rc_context(_SETTINGS):
+        canvas = canvas_of(7.0, 2.8)
+        axis = canvas.subplots()
+        axis.plot(times, levels, color="C0", lw=1.2, label=f"tank of the filter '{name}'")
+        bounds = ("upper bound", tank.upper), ("lower bound", tank.lower), ("reserve", tank.reserve)
+        for style, (bound, level) in zip(("-.", "--", ":"), bounds, strict=True):
+            axis.axhline(level, color="#1c2127", lw=0.8, ls=style, label=bound)
+        axis.set(xlabel="time (s)", ylabel="energy in the tank (J)")
+        legend_of(canvas, "lower center", fontsize=7)
+        save_picture(out, canvas)
 
 
 def energy_picture(out: Path, trials: Sequence[RecordedEnergy]) -> None:

@@ -15,15 +15,17 @@ from palpate.safety.stiffness_rate import StiffnessRate
 from palpate.safety.valves import TextbookValve, schindlbeck
 
 NONE = "none"  # which blocks nothing, and counts
+PASSIVITY = "passivity"
 FILTERS: dict[str, Callable[..., Filter]] = {
-    "passivity": PassivityFilter,
+    PASSIVITY: PassivityFilter,
     "textbook-valve": TextbookValve,
     "schindlbeck": schindlbeck,
     "stiffness-rate": StiffnessRate,
     "kinetic-barrier": KineticBarrier,
     NONE: TankMeter,
 }
-WITH_TANK = "passivity", "textbook-valve", "schindlbeck", NONE
+OF_IMPEDANCES = "textbook-valve", "schindlbeck", "stiffness-rate"  # which have to know them
+WITH_TANK = PASSIVITY, "textbook-valve", "schindlbeck", NONE
 
 
 def filter_of(name: str, numbers: Mapping[str, Any]) -> Filter:

@@ -5,18 +5,23 @@ displacement, as stiff as it is told along that way and across it.
 """
 
 import json
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from palpate.deployment.deployment import Deployment, Pace
 from palpate.deployment.scaling import Scaling
+from palpate.deployment.tank import TANK as TANK_CHANNEL
+from palpate.deployment.tank import numbers_with
 from palpate.errors import PalpateError
 from palpate.families.contact import robot
-from palpate.families.contact.environments import REFLEX_PACE, SELF_TUNING
+from palpate.families.contact.environments import REFLEX_PACE, SELF_TUNING, TANK
 from palpate.families.contact.episodes import GOAL
 from palpate.families.contact.methods import MAZE, NAVIGATION, Method, Skill
 from palpate.networks import ActorPolicy, Channel
 from palpate.runs import Figure
+from palpate.safety.filters import NONE, WITH_TANK
 from palpate.tasks.maze.navigation import FEATURE_SCALE
 from palpate.worlds.maze.navigation import PERIODS
 from palpate.worlds.maze.scene import TIME_STEP
@@ -61,6 +66,19 @@ class MazeDeployment(_SkillDeployment):
 
     skill, control_period, pace_count = MAZE, TIME_STEP, REFLEX_PACE[0]
 
+    def __init__(
+        self, policy: ActorPolicy, manifest: Mapping[str, Any], rows: Mapping[str, int]
+    ) -> None:
+        super().__init__(policy, manifest, rows)
+        if self.method.passive:  # which sees the tank: where no filter stands, one that is counted
+            self.stand_behind(NONE, None)
+
+    def filter_numbers(self, name: str, tank: float | None) -> dict[str, Any]:
+        """See `Deployment.filter_numbers`; usually the tank of the policy's training."""
+        if name not in WITH_TANK:
+            return {}
+        return numbers_with(tank, self.manifest["constants"].get("energy", TANK))
+
     def actor_scaling(self) -> Scaling:
         force, height = self.constant("task.force_limit"), self.constant("task.reference_height")
         displacement = float(self.constant("world.displacement_limit"))
@@ -73,12 +91,16 @@ class MazeDeployment(_SkillDeployment):
             )
         chosen = (low, high) if stiffness is None else (float(stiffness), float(stiffness))
         scale = [force] * 3 + [force * height] * 3 + [self.constant("task.position_scale")] * 3
+        sensors = (
+            # Force and torque are one vector here, of which a force is the longer part.
+            Channel("wrench", (6,), "N, N m", IMPOSSIBLE_FORCE * float(force)),
+            Channel("position", (3,), "m", FARTHEST, FASTEST),
+        )
+        if self.method.passive:
+            scale.append(self.manifest["constants"]["energy"]["initial"])
+            sensors = *sensors, TANK_CHANNEL
         return Scaling(
-            sensors=(
-                # Force and torque are one vector here, of which a force is the longer part.
-                Channel("wrench", (6,), "N, N m", IMPOSSIBLE_FORCE * float(force)),
-                Channel("position", (3,), "m", FARTHEST, FASTEST),
-            ),
+            sensors=sensors,
             actions=(
                 Channel("displacement", (2,), "m", displacement, 2 * displacement / self.period),
                 Channel("stiffness", (2, 1), "N/m", high - low, (high - low) / self.period),
@@ -98,6 +120,7 @@ class MazeDeployment(_SkillDeployment):
             *(robot.__name__, "--connect", endpoint, "--seconds", f"{seconds}"),
             *("--seed", f"{seed}", "--period", f"{self.period}", *where),
             *("--force-limit", f"{self.constant('task.force_limit')}"),
+            *(() if self.filter is None else ("--filter", json.dumps(self.filter.to_dict()))),
         ]
 
     def outcome(self, printed: str) -> list[Figure]:

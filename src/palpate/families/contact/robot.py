@@ -19,13 +19,17 @@ from palpate.deployment.loop import Link
 from palpate.deployment.messages import StateMessage, decode_command, encode_state
 from palpate.deployment.scheduling import ROBOT, real_time
 from palpate.deployment.supervisor import PAUSE
+from palpate.deployment.tank import TANK
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.families.contact.environments import maze_law
+from palpate.safety.filtered_law import FilteredLaw
+from palpate.safety.filters import filter_of
+from palpate.safety.port import Filter, FilterChain
 from palpate.tasks.maze.maze import MazeTask
 from palpate.worlds.gymnasium import VIOLATION
 from palpate.worlds.maze.maze import DISPLACEMENT_LIMIT, STIFFNESS_RANGE, BlindMaze
 from palpate.worlds.maze.mjcf import MjcfWorld
-from palpate.worlds.maze.tip import TipWorld
+from palpate.worlds.maze.tip import DRIVE_LIMIT, TipWorld
 from palpate.worlds.world import side_by_side
 
 LISTENS = 0.005  # s, from one look for commands to the next
@@ -40,12 +44,23 @@ class TipRobot:
         task: what ends an episode there.
         seed: of the world.
         period: seconds between states, a whole number of `LISTENS`.
+        passes: a filter before its drives.
     """
 
-    def __init__(self, link: Link, world: TipWorld, task: MazeTask, seed: int, period: float):
+    def __init__(
+        self,
+        link: Link,
+        world: TipWorld,
+        task: MazeTask,
+        seed: int,
+        period: float,
+        passes: Filter | None = None,
+    ):
         self._link, self.period = link, period
         self._world, self._task = world, task
-        self._law = maze_law(mass=world.effective_mass)
+        mass, every = world.effective_mass, world.control_period
+        passes = FilterChain(() if passes is None else (passes,))
+        self._law = FilteredLaw(maze_law(mass=mass), passes, mass, every, DRIVE_LIMIT)
         self._seen = self._world.reset(seed)
         self._first = self._world.truth()
         self._session, self._sequence = secrets.randbits(64), 0
@@ -80,6 +95,8 @@ class TipRobot:
     def _publish(self) -> None:
         self._sequence += 1
         values = {"wrench": self._seen.wrench, "position": self._seen.position}
+        if self._law.level is not None:
+            values |= {TANK.name: self._law.level}
         message = StateMessage(self._session, self._sequence, self._link.clock(), values)
         self._link.send(encode_state(message))
 
@@ -113,6 +130,7 @@ def main() -> None:
     parser.add_argument("--period", type=float, required=True)
     parser.add_argument("--seconds", type=float, required=True)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--filter", type=json.loads, help="before its drives, as JSON")
     options = parser.parse_args()
     asked: list[Any] = []
     signal.signal(signal.SIGTERM, lambda *given: asked.append(given))
@@ -120,8 +138,9 @@ def main() -> None:
     # Urgent, because it stands for a robot with a computer of its own.
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
         world = MjcfWorld(options.world) if options.world else BlindMaze(options.mazes)
-        task = MazeTask(options.force_limit)
-        robot = TipRobot(link, world, task, options.seed, options.period)
+        task, told = MazeTask(options.force_limit), options.filter
+        passes = None if told is None else filter_of(**told)
+        robot = TipRobot(link, world, task, options.seed, options.period, passes)
         ends = link.clock() + options.seconds
         while link.clock() < ends and not asked and not robot.end:
             robot.advance()

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from palpate.networks import Channel, CommandPolicy
 from palpate.perception.rope.nodes import at_nodes
 from palpate.perception.velocity import VelocityEstimator
 from palpate.runs import Figure
+from palpate.safety.filters import FILTERS, OF_IMPEDANCES, PASSIVITY
 from palpate.trials.rope.stabilization import settling_time
 
 Network = Callable[[np.ndarray, np.ndarray], np.ndarray]  # features and command to a command
@@ -89,6 +91,18 @@ class RopeDeployment(Deployment[CommandPolicy]):
         noise = self.manifest.get("training", {}).get("observation_noise", 0.0)
         return ChainCheck(self.segment_lengths(), self.policy.period, noise)
 
+    def filter_numbers(self, name: str, tank: float | None) -> dict[str, Any]:
+        """See `Deployment.filter_numbers`; the gripper is no faster than it is told."""
+        if name in OF_IMPEDANCES:
+            others = ", ".join(sorted(set(FILTERS) - set(OF_IMPEDANCES)))
+            raise PalpateError(
+                f"the filter {name} has to know an impedance, and the servos of a rope's gripper "
+                f"have none: expected one of {others}"
+            )
+        numbers = super().filter_numbers(name, tank)
+        fastest = self.policy.actions[0].limit
+        return numbers | ({"fastest": fastest} if name == PASSIVITY and fastest else {})
+
     def segment_lengths(self) -> np.ndarray:
         """Rest length (markers - 1,) in m between markers of the rope that was trained on."""
         rows = self.manifest.get("model", [])
@@ -114,6 +128,8 @@ class RopeDeployment(Deployment[CommandPolicy]):
         robot.servoed(rope, period)
         described = json.dumps(dataclasses.asdict(rope))
         arguments = {"rope": described, "period": period, "seconds": seconds, "seed": seed}
+        if self.filter is not None:
+            arguments["filter"] = json.dumps(self.filter.to_dict())
         words = [robot.__name__, "--connect", endpoint]
         return words + [
             word for name, value in arguments.items() for word in (f"--{name}", f"{value}")

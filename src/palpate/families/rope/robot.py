@@ -22,9 +22,17 @@ from palpate.deployment.messages import (
 )
 from palpate.deployment.scheduling import ROBOT, real_time
 from palpate.deployment.supervisor import PAUSE, Mode, slowed
+from palpate.deployment.tank import TANK
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.families.rope.counterpart import adapted
-from palpate.worlds.rope.rope import RopeConfiguration, RopeObservation, RopeWorld
+from palpate.safety.filtered_drive import FilteredDrive
+from palpate.safety.filters import filter_of
+from palpate.worlds.rope.rope import (
+    GRIPPER_MASS,
+    RopeConfiguration,
+    RopeObservation,
+    RopeWorld,
+)
 
 SERVO = 0.002  # s, about, in which a new command is followed
 
@@ -39,13 +47,20 @@ class RopeRobot:
         link: to the loop.
         configuration, seed, start: of the rope; its control period is the servo's.
         period: seconds between states.
+        drive: a filter before the servos of the gripper.
     """
 
     def __init__(
-        self, link: Link, configuration: RopeConfiguration, seed: int, start: str, period: float
+        self,
+        link: Link,
+        configuration: RopeConfiguration,
+        seed: int,
+        start: str,
+        period: float,
+        drive: FilteredDrive | None = None,
     ):
-        self._link = link
-        self._world = RopeWorld(configuration)
+        self._link, self._drive = link, drive
+        self._world = RopeWorld(configuration, drive)
         self._steps = round(period / configuration.control_period)
         self._seen: RopeObservation = self._world.reset(seed, start=start)
         self._change = configuration.acceleration_limit * configuration.control_period
@@ -90,6 +105,8 @@ class RopeRobot:
         self.published_at = self._link.clock()
         seen = self._seen
         values = {"gripper": seen.gripper_position, "markers": seen.markers}
+        if self._drive is not None and np.isfinite(self._drive.level):
+            values |= {TANK.name: np.array([self._drive.level])}
         message = StateMessage(self._session, self._sequence, self.published_at, values)
         self._link.send(encode_state(message))
 
@@ -118,6 +135,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, required=True)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--start", default="straight")
+    parser.add_argument("--filter", type=json.loads, help="before its servos, as JSON")
     options = parser.parse_args()
     asked: list[Any] = []
     signal.signal(signal.SIGTERM, lambda *given: asked.append(given))
@@ -125,7 +143,11 @@ def main() -> None:
     # Urgent, because it stands for a robot with a computer of its own.
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
         rope = servoed(RopeConfiguration(**options.rope), options.period)
-        robot = RopeRobot(link, rope, options.seed, options.start, options.period)
+        told, drive = options.filter, None
+        if told is not None:
+            mass = GRIPPER_MASS * np.eye(3)
+            drive = FilteredDrive(filter_of(**told), mass, rope.time_step)
+        robot = RopeRobot(link, rope, options.seed, options.start, options.period, drive)
         energies, speeds = [robot.energy], [robot.gripper_speed]
         ends = link.clock() + options.seconds
         while link.clock() < ends and not asked:

@@ -37,7 +37,8 @@ def rope(**constants) -> RopeWorld:
 
 def seen(markers: np.ndarray, gripper_position: np.ndarray, time: float = 0.0) -> RopeObservation:
     """What several ropes (worlds, markers, 3), (worlds, 3) show side by side; grippers at rest."""
-    return RopeObservation(time, markers, gripper_position, np.zeros_like(gripper_position))
+    still, pull = np.zeros((2, *gripper_position.shape))
+    return RopeObservation(time, markers, gripper_position, still, pull)
 
 
 def commands(controller: Controller, observations, goal=None) -> list[np.ndarray]:

@@ -28,7 +28,7 @@ def hanging(aside: float) -> RopeObservation:
     markers = np.zeros((2, 6, 3))
     markers[:, :, 2] = -0.1 * np.arange(6)
     markers[1, :, 0] = aside * np.arange(6)
-    return RopeObservation(0.0, markers, np.zeros((2, 3)), np.zeros((2, 3)))
+    return RopeObservation(0.0, markers, *np.zeros((3, 2, 3)))
 
 
 def test_it_watches_first_and_then_begins_softly(served):

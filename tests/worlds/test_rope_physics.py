@@ -9,7 +9,13 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.worlds.rope import rope as rope_world
-from palpate.worlds.rope.rope import START_POSES, Disturbance, RopeConfiguration, RopeWorld
+from palpate.worlds.rope.rope import (
+    FORCE_NOISE,
+    START_POSES,
+    Disturbance,
+    RopeConfiguration,
+    RopeWorld,
+)
 from palpate.worlds.world import DivergedError
 from small_rope import FREE, QUIET, SMALL, STILL, rope
 
@@ -233,3 +239,27 @@ def test_a_rope_that_diverges_while_it_is_shaken_is_not_started(tmp_path, monkey
         world.step(STILL)
     world.reset(0)
     assert world.step(STILL).markers[-1] == pytest.approx([0, 0, 0.5], abs=1e-3)
+
+
+def test_the_grip_feels_the_weight_at_rest_and_its_work_is_what_the_rope_gains():
+    """Momentum and energy: without damping the rope has all that the gripper gave."""
+    world = rope(**FREE, time_step=1e-4)
+    configuration = world.truth().configuration
+    world.reset(0)
+    weight = configuration.mass * configuration.gravity
+    # At first the servo has to give way by what its force takes.
+    still = [world.step(np.zeros(3)).grip_force for _ in range(60)][30:]
+    assert np.mean(still, axis=0) == pytest.approx([0.0, 0.0, -weight], abs=3 * FORCE_NOISE)
+    begins = world.truth()
+    work, before = 0.0, begins.gripper_position
+    for number in range(100):
+        wanted = 0.5 * np.array([np.sin(0.2 * number), 0.0, 0.4 * np.cos(0.15 * number)])
+        force = world.step(wanted).grip_force
+        now = world.truth().gripper_position
+        work -= force @ (now - before)
+        before = now
+    ends = world.truth()
+    lifted = weight * (ends.gripper_position[2] - begins.gripper_position[2])
+    gained = ends.energy - begins.energy + lifted
+    assert gained > 0.01
+    assert work == pytest.approx(gained, rel=0.03)

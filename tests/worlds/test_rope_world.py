@@ -154,7 +154,7 @@ def test_a_seed_that_is_none_is_refused(seed):
 def test_only_what_a_sensor_sees_is_observed():
     observation = rope().reset(0)
     names = {field.name for field in dataclasses.fields(observation)}
-    assert names == {"time", "markers", "gripper_position", "gripper_velocity"}
+    assert names == {"time", "markers", "gripper_position", "gripper_velocity", "grip_force"}
     assert observation.markers.shape == (11, 3)
 
 

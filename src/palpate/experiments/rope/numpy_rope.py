@@ -163,6 +163,7 @@ class NumpyRope(World):
             markers=markers + noise,
             gripper_position=self._position[0].copy(),
             gripper_velocity=self._velocity[0].copy(),
+            grip_force=np.full(3, np.nan),
         )
 
 

@@ -15,7 +15,7 @@ from palpate.recordings import Aligned, Channel, Driven, Recording, Role, Trial
 from palpate.worlds.excitation import excitation, record
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 
-MARKERS, GRIPPER, COMMAND = "markers", "gripper", "command"
+MARKERS, GRIPPER, COMMAND, FORCE = "markers", "gripper", "command", "force"
 NODE_MASS = 4e-3  # kg, where nothing was weighed: the motion tells stiffness per mass and no more
 TIME_STEP = 1e-3  # s, about, of the model's integration
 BEND_DAMPING = 6e-4  # m^4/s, over the rope's density, that a model should be able to integrate
@@ -29,8 +29,8 @@ def record_rope(
     """Shake a MuJoCo rope from hanging, one trial of `duration` seconds for each seed.
 
     Channels: `markers` (frames, markers, 3) as seen, `gripper` (frames, 1, 3) where the driven end
-    was, and `command` (steps, 1, 3) the velocity that was ordered. Raises `PalpateError` when the
-    simulation diverges.
+    was, `command` (steps, 1, 3) the velocity that was ordered, and `force` (frames, 1, 3) what the
+    rope pulled the gripper with. Raises `PalpateError` when the simulation diverges.
     """
     world = RopeWorld(configuration)
     trials = []
@@ -42,6 +42,7 @@ def record_rope(
         channels = (
             Channel(MARKERS, Role.OBSERVATION, data["time"], data["markers"], "m"),
             Channel(GRIPPER, Role.DRIVEN, data["time"], data["gripper_position"][:, None], "m"),
+            Channel(FORCE, Role.OBSERVATION, data["time"], data["grip_force"][:, None], "N"),
             Channel(COMMAND, Role.COMMAND, data["command_time"], data["command"][:, None], "m/s"),
         )
         by_name = {channel.name: channel for channel in channels}

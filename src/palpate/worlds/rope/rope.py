@@ -37,16 +37,20 @@ GRIPPER_MASS = 0.5  # kg
 SERVO_FREQUENCY = 200.0  # rad/s
 SERVO_STIFFNESS = GRIPPER_MASS * SERVO_FREQUENCY**2  # N/m
 SERVO_DAMPING = 2 * GRIPPER_MASS * SERVO_FREQUENCY  # N s/m
+FORCE_NOISE = 0.005  # N, standard deviation
 
 
 @dataclass(frozen=True)
 class RopeObservation:
-    """What a camera and the gripper's encoder show; positions in the world frame."""
+    """What a camera, the gripper's encoder and its force sensor show, in the world frame."""
 
     time: float  # s since reset at which this was measured
     markers: np.ndarray  # (markers, 3) m, from gripper to tip, with noise
     gripper_position: np.ndarray  # (3,) m
     gripper_velocity: np.ndarray  # (3,) m/s
+    # (3,) N, on the gripper: what the rope pulls with, mean over the last control period, by a
+    # sensor in the wrist, with noise; NaN where there is none.
+    grip_force: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,7 @@ class RopeWorld(World):
             raise PalpateError(f"a seed is a whole number, 0 or greater, not {seed!r}")
         self._history = []  # not to be stepped on if this start fails
         self._random = np.random.default_rng(seed)
+        self._force_random = np.random.default_rng([seed, 1])  # so that it spoils no other draw
         drawn = self._random.uniform(0, 2 * np.pi)
         azimuth = drawn if azimuth is None else float(azimuth)
         if not math.isfinite(azimuth):
@@ -143,6 +148,8 @@ class RopeWorld(World):
         self._step_count = 0
         if self.drive is not None:
             self.drive.begin()
+        mujoco.mj_forward(self._model, self._data)
+        self._pull = GRIPPER_MASS * self._data.qacc[:3] - self._given()
         self._history = [self._measure()] * (self._delay + 1)
         return self._history[0]
 
@@ -215,6 +222,7 @@ class RopeWorld(World):
         configuration, data = self._configuration, self._data
         command = _limit(command, configuration.speed_limit)
         greatest_change = configuration.acceleration_limit * configuration.time_step
+        before, given = data.qvel[:3].copy(), np.zeros(3)
         for _ in range(self._steps_per_period):
             change = _limit(command - self._profile_velocity, greatest_change)
             self._profile_velocity = self._profile_velocity + change
@@ -224,6 +232,10 @@ class RopeWorld(World):
             if disturbed and self.drive is not None:
                 self._pass(self.drive)
             mujoco.mj_step(self._model, data)
+            given += self._given()
+        # What the servo has not given to the gripper's momentum, which keeps its own weight.
+        gained = GRIPPER_MASS * (data.qvel[:3] - before) / self.control_period
+        self._pull = gained - given / self._steps_per_period
         if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             raise DivergedError(
                 f"the rope's simulation diverged at {data.time:.3f} s; a smaller time_step than "
@@ -236,6 +248,10 @@ class RopeWorld(World):
         position, velocity = data.qpos[:3].copy(), data.qvel[:3].copy()
         servo = SERVO_STIFFNESS * (data.ctrl - position) - SERVO_DAMPING * velocity
         data.qfrc_applied[:3] = drive(servo, position, velocity) - servo
+
+    def _given(self) -> np.ndarray:
+        """What servo and drive have given to the gripper in the last time step, N."""
+        return self._data.qfrc_actuator[:3] + self._data.qfrc_applied[:3]
 
     def _disturb(self) -> None:
         data, configuration = self._data, self._configuration
@@ -260,6 +276,7 @@ class RopeWorld(World):
             markers=markers + noise,
             gripper_position=np.array(GRIPPER_START) + data.qpos[:3],
             gripper_velocity=data.qvel[:3].copy(),
+            grip_force=self._pull + FORCE_NOISE * self._force_random.standard_normal(3),
         )
 
     def _nodes(self) -> np.ndarray:

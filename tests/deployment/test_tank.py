@@ -56,8 +56,13 @@ def test_a_tank_that_only_counts_may_be_empty():
 
 def test_filters_that_cannot_be_are_refused():
     deployment = toy(name=None)
-    with pytest.raises(PalpateError, match="unknown filter 'passive'; there are: passivity"):
-        deployment.stand_behind("passive", None)
+    for tank in (None, 1.0):
+        with pytest.raises(PalpateError, match="did you mean 'passivity'"):
+            deployment.stand_behind("passive", tank)
+    with pytest.raises(PalpateError, match="--tank 1 is that of a filter: give --filter, too"):
+        deployment.stand_behind(None, 1.0)
+    deployment.stand_behind(None, None)
+    assert deployment.filter is None
     with pytest.raises(PalpateError, match="give --tank JOULE"):
         deployment.stand_behind("passivity", None)
     with pytest.raises(PalpateError, match="the filter kinetic-barrier has no tank"):
@@ -103,6 +108,12 @@ def test_a_policy_that_sees_the_tank_is_sent_it_and_has_the_tank_of_its_training
         decision.see({"wrench": np.zeros(6), "position": np.zeros(3), "tank": np.array([level])})
         actions.append(decision.decide(np.zeros(4, np.float32)))
     assert not np.allclose(*actions)
+    with pytest.raises(
+        PalpateError, match="the policy sees a tank, and the filter kinetic-barrier"
+    ):
+        deployment.stand_behind("kinetic-barrier", None)
+    deployment.stand_behind(None, 0.7)  # of what it has anyway
+    assert deployment.filter == RobotFilter("none", {"tank": tank | {"initial": 0.7, "upper": 0.7}})
     deployment.stand_behind("passivity", 0.8)
     assert deployment.filter.tank.initial == 0.8
     assert deployment.filter.tank.flow == 1.5

@@ -38,8 +38,7 @@ def run(options: Export) -> Path:
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_network(file)
     deployment = deployment_of(policy, manifest)
-    if options.filter is not None:
-        deployment.stand_behind(options.filter, options.tank)
+    deployment.stand_behind(options.filter, options.tank)
     with folders.begin(options, "export", {"policy": file}) as run:
         if isinstance(policy, CommandPolicy):
             write_onnx(run.path / ONNX, policy)

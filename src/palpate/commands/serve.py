@@ -46,8 +46,7 @@ def run(options: Serve) -> Path:
     file = folders.product_of(options.policy, folders.POLICY, "train")
     policy, manifest = load_network(file)
     deployment = deployment_of(policy, manifest, numbers(options.rows, "--rows", [], int))
-    if options.filter is not None:
-        deployment.stand_behind(options.filter, options.tank)
+    deployment.stand_behind(options.filter, options.tank)
     limits = limits_of(deployment, options.limit, options.rate_limit)
     supervisor = supervisor_of(deployment, limits)
     levels = TankLog() if TANK in deployment.sensors else None
@@ -77,7 +76,7 @@ def run(options: Serve) -> Path:
         figures = figures_of(record) + (deployment.outcome(printed[-1]) if printed else [])
         if levels is not None and deployment.filter is not None:
             write_json(run.path / TANK_FILE, deployment.filter.to_dict() | levels.to_dict())
-            figures.append(Figure("least_tank_level_J", levels.least, "J", better="higher"))
+            figures.append(Figure("least_tank_level", levels.least, "J", better="higher"))
             if levels.times and (tank := deployment.filter.tank) is not None:
                 shown = levels.times, levels.levels, tank, deployment.filter.name
                 level_picture(run.path / TANK_PICTURE, *shown)
@@ -155,7 +154,7 @@ def supervisor_of(deployment: Deployment, limits: Limits) -> Supervisor:
         decision.see(nothing)
         decision.decide(limits.rest)
     decision.forget()
-    intake = Intake(deployment.checks(), sensors, limits.period)
+    intake = Intake(deployment.state_check(), sensors, limits.period)
     return Supervisor(intake, decision, limits)
 
 

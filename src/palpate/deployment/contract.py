@@ -27,7 +27,7 @@ _FORMAT = "palpate.contract"
 _VERSION = 2  # the first had one action, its limits beside it
 RISK = "of what was proposed: the discounted probability of a violation, in [0, 1]"
 UNDER_WAY = "of the policy or, if it is later, this graph's last action_out"
-FILTERED = (
+FILTER = (
     "stands in the robot's program, before its drives: `palpate.safety.filters.filter_of(name, "
     "numbers)`, called in every control period with what is wanted then, and what passes is held"
 )
@@ -40,11 +40,11 @@ def write_contract(
     policy: CommandPolicy,
     manifest: Mapping[str, Any],
     file: str,
-    by: RobotFilter | None = None,
+    robot_filter: RobotFilter | None = None,
 ) -> None:
     """Write the contract of the policy, whose manifest this is, exported as `file`.
 
-    `by` is the filter of energy that the robot's program has to have.
+    `robot_filter` is the filter of energy that the robot's program has to have.
     """
     action = {"shape": ["batch", *policy.action_shape], "dtype": "float32"}
     content = {
@@ -72,7 +72,7 @@ def write_contract(
         },
         "trained": _trained(manifest),
     }
-    write_json(path, content | _filtered(by))
+    write_json(path, content | _filter_of(robot_filter))
 
 
 def write_actor_contract(
@@ -133,17 +133,17 @@ def write_actor_contract(
             "now, holds until the next decision, and is itself replaced after no less than `pace` "
             "periods. Where features are not finite, rest until the next decision",
         }
-    write_json(path, content | _filtered(deployment.filter))
+    write_json(path, content | _filter_of(deployment.filter))
 
 
-def _filtered(by: RobotFilter | None) -> dict[str, Any]:
+def _filter_of(robot_filter: RobotFilter | None) -> dict[str, Any]:
     """What a filter before the robot's drives adds to a contract."""
-    if by is None:
+    if robot_filter is None:
         return {}
-    about = {"about": FILTERED}
-    if by.tank is not None:
+    about = {"about": FILTER}
+    if robot_filter.tank is not None:
         about["level"] = LEVEL
-    return {"filter": by.to_dict() | about}
+    return {"filter": robot_filter.to_dict() | about}
 
 
 def _head(policy: DeclaredController, manifest: Mapping[str, Any], file: str) -> dict[str, Any]:

@@ -8,12 +8,12 @@ from palpate.deployment.decision import ActorDecision, ChannelDecision, ReflexDe
 from palpate.deployment.plausibility import ChannelCheck, Check
 from palpate.deployment.scaling import Scaling
 from palpate.deployment.supervisor import Decision
-from palpate.deployment.tank import TANK, RobotFilter, TankCheck, numbers_with
+from palpate.deployment.tank import TANK, RobotFilter, TankCheck, tank_numbers
 from palpate.errors import PalpateError
-from palpate.family import places, resolve
+from palpate.family import check_name, places, resolve
 from palpate.networks import ActorPolicy, CommandPolicy, load_controller
 from palpate.runs import Figure
-from palpate.safety.filters import WITH_TANK
+from palpate.safety.filters import FILTERS, WITH_TANK
 
 NetworkPolicy = CommandPolicy | ActorPolicy
 Policy = TypeVar("Policy", bound=NetworkPolicy)
@@ -74,13 +74,26 @@ class Deployment(Generic[Policy]):
                 + ": expected no --rows"
             )
 
-    def stand_behind(self, name: str, tank: float | None) -> None:
+    def stand_behind(self, name: str | None, tank: float | None) -> None:
         """Have the robot's program put the filter of that name before its drives.
 
-        Its tank holds so many J, None: as the family has it; then the robot sends what is in it
-        after all else. Raises `PalpateError` for a filter that there is not, and without a tank
-        where the family has none.
+        Without a name it is the one that the policy has anyway, if any. Its tank holds so many J,
+        None: as the family has it; then the robot sends what is in it after all else. Raises
+        `PalpateError` for a filter that there is not, for a tank without a filter, and for a filter
+        without a tank where the family knows none.
         """
+        if name is None and tank is None:
+            return
+        if name is None:
+            if self.filter is None:
+                raise PalpateError(f"--tank {tank:g} is that of a filter: give --filter, too")
+            name = self.filter.name
+        check_name("filter", name, FILTERS)
+        if name not in WITH_TANK and TANK in self.scaling.sensors:
+            raise PalpateError(
+                f"the policy sees a tank, and the filter {name} has none: expected one of "
+                + ", ".join(WITH_TANK)
+            )
         if name not in WITH_TANK and tank is not None:
             raise PalpateError(f"the filter {name} has no tank: expected no --tank")
         self.filter = RobotFilter(name, self.filter_numbers(name, tank))
@@ -89,12 +102,13 @@ class Deployment(Generic[Policy]):
 
     def filter_numbers(self, name: str, tank: float | None) -> dict[str, Any]:
         """Of a filter, as `palpate.safety.filters.filter_of` takes them."""
-        return numbers_with(tank) if name in WITH_TANK else {}
+        return tank_numbers(tank) if name in WITH_TANK else {}
 
-    def checks(self) -> Check:
-        """`check`, and of the tank's level where the robot sends it."""
-        by = self.filter
-        return self.check() if by is None or by.tank is None else TankCheck(self.check(), by)
+    def state_check(self) -> Check:
+        """`check`, and that of the tank where the robot sends its level."""
+        if self.filter is None or self.filter.tank is None:
+            return self.check()
+        return TankCheck(self.check(), self.filter)
 
     def decision(self) -> Decision:
         """The policy, fed by `sensors`."""

@@ -42,16 +42,16 @@ class RobotFilter:
 
 
 class TankCheck:
-    """Another check, and whether the tank is above its reserve; of a filter that only counts not.
+    """Another check, and one of the tank, so that a robot whose filter does not hold is braked.
 
-    A tank that is below it, or of which nothing is known, is a fault: a robot whose filter does not
-    hold is braked.
+    A level that is not finite is a fault, and one below the tank's reserve, except where the filter
+    (`NONE`) only counts.
     """
 
-    def __init__(self, other: Check, by: RobotFilter):
-        tank = by.tank
+    def __init__(self, other: Check, robot_filter: RobotFilter):
+        tank = robot_filter.tank
         self._other = other
-        self._reserve = -np.inf if tank is None or by.name == NONE else tank.reserve
+        self._reserve = -np.inf if tank is None or robot_filter.name == NONE else tank.reserve
 
     def forget(self) -> None:
         """See `Check.forget`."""
@@ -93,10 +93,10 @@ class TankLog:
         return {"time_s": self.times, "level_J": self.levels, "least_J": self.least}
 
 
-def numbers_with(tank: float | None, usual: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Those of a filter whose tank holds so many J at first and at most.
+def tank_numbers(tank: float | None, usual: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The numbers of a filter whose tank holds so many J in the beginning, and at most.
 
-    Where it is None, they are the `usual` ones; raises `PalpateError` where there are none.
+    They are the `usual` ones where `tank` is None; raises `PalpateError` where both are.
     """
     if tank is None and usual is None:
         raise PalpateError("a filter with a tank needs to know what that holds: give --tank JOULE")

@@ -13,7 +13,7 @@ import numpy as np
 from palpate.deployment.deployment import Deployment, Pace
 from palpate.deployment.scaling import Scaling
 from palpate.deployment.tank import TANK as TANK_CHANNEL
-from palpate.deployment.tank import numbers_with
+from palpate.deployment.tank import tank_numbers
 from palpate.errors import PalpateError
 from palpate.families.contact import robot
 from palpate.families.contact.environments import REFLEX_PACE, SELF_TUNING, TANK
@@ -77,7 +77,12 @@ class MazeDeployment(_SkillDeployment):
         """See `Deployment.filter_numbers`; usually the tank of the policy's training."""
         if name not in WITH_TANK:
             return {}
-        return numbers_with(tank, self.manifest["constants"].get("energy", TANK))
+        return tank_numbers(tank, self._trained_tank)
+
+    @property
+    def _trained_tank(self) -> Mapping[str, Any]:
+        """Numbers of the tank that the policy was trained with, else of the maze's."""
+        return self.manifest.get("constants", {}).get("energy", TANK)
 
     def actor_scaling(self) -> Scaling:
         force, height = self.constant("task.force_limit"), self.constant("task.reference_height")
@@ -97,7 +102,7 @@ class MazeDeployment(_SkillDeployment):
             Channel("position", (3,), "m", FARTHEST, FASTEST),
         )
         if self.method.passive:
-            scale.append(self.manifest["constants"]["energy"]["initial"])
+            scale.append(self._trained_tank["initial"])
             sensors = *sensors, TANK_CHANNEL
         return Scaling(
             sensors=sensors,

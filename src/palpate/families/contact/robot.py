@@ -138,8 +138,8 @@ def main() -> None:
     # Urgent, because it stands for a robot with a computer of its own.
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
         world = MjcfWorld(options.world) if options.world else BlindMaze(options.mazes)
-        task, told = MazeTask(options.force_limit), options.filter
-        passes = None if told is None else filter_of(**told)
+        task = MazeTask(options.force_limit)
+        passes = None if options.filter is None else filter_of(**options.filter)
         robot = TipRobot(link, world, task, options.seed, options.period, passes)
         ends = link.clock() + options.seconds
         while link.clock() < ends and not asked and not robot.end:

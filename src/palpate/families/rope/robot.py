@@ -143,10 +143,10 @@ def main() -> None:
     # Urgent, because it stands for a robot with a computer of its own.
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
         rope = servoed(RopeConfiguration(**options.rope), options.period)
-        told, drive = options.filter, None
-        if told is not None:
+        drive = None
+        if options.filter is not None:
             mass = GRIPPER_MASS * np.eye(3)
-            drive = FilteredDrive(filter_of(**told), mass, rope.time_step)
+            drive = FilteredDrive(filter_of(**options.filter), mass, rope.time_step)
         robot = RopeRobot(link, rope, options.seed, options.start, options.period, drive)
         energies, speeds = [robot.energy], [robot.gripper_speed]
         ends = link.clock() + options.seconds

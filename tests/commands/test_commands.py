@@ -272,11 +272,14 @@ def test_a_recording_holds_what_the_world_shows_and_how_it_was_made(tmp_path, ca
     assert main(["record", "rope", "--out", "R.npz", "--seed", "3", *SHORT]) == 0
     assert capsys.readouterr().out == "recording: R.npz (2 trials of 0.5 s)\n"
     recording = read_recording("R.npz")
-    assert [channel.role for channel in recording.trials[0].channels.values()] == [
-        Role.OBSERVATION,
-        Role.DRIVEN,
-        Role.COMMAND,
-    ]
+    roles = {name: channel.role for name, channel in recording.trials[0].channels.items()}
+    assert roles == {
+        "markers": Role.OBSERVATION,
+        "gripper": Role.DRIVEN,
+        "force": Role.OBSERVATION,
+        "command": Role.COMMAND,
+    }
+    assert recording.trials[0]["force"].values.shape == (51, 1, 3)
     assert recording.trials[0]["markers"].values.shape == (51, 5, 3)
     assert recording.trials[0]["gripper"].values.shape == (51, 1, 3)
     assert recording.provenance["seed"] == 3

@@ -30,6 +30,8 @@ STAGES = {
         *("models.planar.planar", "models.planar.parameters", "models.planar.shapes"),
         *("models.planar.wheels", "families.furniture.structures"),
         *("models.contact.tip", "families.contact.touches"),
+        *("models.articulated.articulated", "models.articulated.parameters"),
+        "models.articulated.links",
     ],
     "identification": [
         *("identification.identify", "identification.declarations", "identification.verdicts"),

@@ -1,0 +1,12 @@
+"""Appliances: things with doors, lids and drawers."""
+
+from palpate.family import Family
+
+FAMILY = Family(
+    name="appliance",
+    about="what has doors, lids and drawers",
+    models={"articulated": "palpate.models.articulated:Articulated"},
+    experiments={
+        "articulated-model": "palpate.experiments.appliance.articulated_model:reproduce",
+    },
+)

@@ -1,0 +1,182 @@
+"""Trees of rigid links, whose joints damp, rub, spring and stop."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from palpate.models.articulated import integration
+from palpate.models.articulated.dynamics import Bodies, in_world, motion
+from palpate.models.articulated.integration import Resistance, System
+from palpate.models.articulated.kinematics import (
+    axial,
+    carriers,
+    fields,
+    joints_of,
+    outer,
+    poses,
+)
+from palpate.models.articulated.parameters import ArticulatedState, TreeParameters
+
+ACTION = 7  # of a link: torque or force of its joint, a force on it, and where
+
+
+class Articulated(TreeParameters):
+    """A tree of rigid links in the world, one joint each: what `TreeParameters` declares, moving.
+
+    An action is, for each link and for one control period, the torque (N m) or force (N) of its
+    joint, a force on the link (N, in the world's axes) and the point of the link's frame (m) where
+    it acts. Joint positions are observed. Dynamics as in `dynamics`, steps as in `integration`,
+    `substeps` of them in a control period; `resisted` says whether any joint has dry friction or a
+    stop: without, a step costs a third. A free body is a link on six joints in a row, see
+    `free_links`.
+
+    Batch axes lead everywhere: parameters and states of a batch of trees lie side by side. The
+    structure has a batch axis where the trees differ in it. What is no step is compiled by itself.
+    """
+
+    @property
+    def action_shape(self) -> tuple[int, int]:
+        """(links, 7): of the joint, of the force on the link x y z, and of its point x y z."""
+        return self.links, ACTION
+
+    @property
+    def observation_shape(self) -> tuple[int]:
+        """(links,): joint positions."""
+        return (self.links,)
+
+    def step(self, state: ArticulatedState, action: Array) -> ArticulatedState:
+        return self.stepper()(state, action)
+
+    def stepper(self) -> Callable[[ArticulatedState, Array], ArticulatedState]:
+        if self.parent.ndim > 1:
+            return self._one_by_one
+        system = self.system()
+        time_step = self.control_period / self.substeps
+
+        def step(state: ArticulatedState, action: Array) -> ArticulatedState:
+            single = state.position.ndim == 1
+            torque, push = _forces(action)
+
+            def advanced(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+                return integration.advance(
+                    system, *carry, torque, push, time_step,
+                    resisted=self.resisted, slip=self.slip,
+                ), None  # fmt: skip
+
+            start = _lanes(state.position, 1), _lanes(state.velocity, 1)
+            end, _ = jax.lax.scan(advanced, start, None, length=self.substeps)
+            return ArticulatedState(*(_lead(part, single) for part in end))
+
+        return step
+
+    def _one_by_one(self, state: ArticulatedState, action: Array) -> ArticulatedState:
+        """The step of trees that differ in structure, one axis of a batch."""
+        axes = jax.tree.map(lambda leaf: 0 if leaf.ndim > 1 else None, self)
+        return jax.vmap(type(self).step, in_axes=(axes, 0, 0))(self, state, action)
+
+    def system(self) -> System:
+        """Its parameters as a step uses them: lanes last, one of them where there is no batch."""
+        mass = _lanes(self.mass * self.solid, 1)
+        centre, unit = _lanes(self.centre_of_mass, 2), _lanes(self.shape_inertia, 3)
+        inertia = (mass * jnp.square(_lanes(self.gyration, 1)))[:, None, None] * unit
+        trace = inertia[:, 0, 0] + inertia[:, 1, 1] + inertia[:, 2, 2]
+        identity = jnp.eye(3, dtype=mass.dtype)[None, :, :, None]
+        first = mass[:, None] * centre
+        revolute, prismatic = _lanes(self.revolute, 1), _lanes(self.prismatic, 1)
+        resistance = (_lanes(getattr(self, name), 1) for name in Resistance._fields)
+        return System(
+            joints=joints_of(
+                self.parent,
+                _lanes(self.rotation, 3),
+                _lanes(self.origin, 2),
+                _lanes(self.axis, 2),
+                revolute,
+                prismatic,
+            ),
+            bodies=Bodies(
+                mass,
+                first,
+                0.5 * trace[:, None, None] * identity - inertia + outer(first, centre),
+            ),
+            resistance=Resistance(*resistance),
+            carried=carriers(self.parent, mass.dtype),
+            gravity=_lanes(self.gravity, 1),
+            fixed=1.0 - revolute - prismatic,
+        )
+
+    @eqx.filter_jit
+    def acceleration(self, state: ArticulatedState, action: Array) -> Float[Array, "*batch links"]:
+        """Of the joints (rad/s^2 or m/s^2), without dry friction and stops."""
+        torque, push = _forces(action)
+        position, velocity = _lanes(state.position, 1), _lanes(state.velocity, 1)
+        found = integration.acceleration(self.system(), position, velocity, torque, push)
+        return _lead(found, state.position.ndim == 1)
+
+    @eqx.filter_jit
+    def energy(self, state: ArticulatedState) -> Float[Array, "*batch"]:
+        """Kinetic energy, and that in gravity (zero at the world's origin) and springs, J."""
+        system = self.system()
+        position, velocity = _lanes(state.position, 1), _lanes(state.velocity, 1)
+        joints, bodies, resistance = system.joints, system.bodies, system.resistance
+        still = jnp.zeros_like(velocity)
+        now = motion(joints, bodies, system.carried, system.gravity, position, still)
+        moving = jnp.sum(now.matrix * velocity[None, :] * velocity[:, None], axis=(0, 1))
+        moving = moving + jnp.sum(resistance.armature * jnp.square(velocity), axis=0)
+        stretched = position - resistance.rest
+        springs = jnp.sum(resistance.stiffness * jnp.square(stretched), axis=0)
+        first = in_world(bodies, now.pose)[1]
+        lifted = -jnp.sum(first * system.gravity, axis=(0, 1))
+        total = 0.5 * (moving + springs) + lifted
+        return total[0] if state.position.ndim == 1 else total
+
+    @eqx.filter_jit
+    def link_poses(
+        self, position: Float[Array, "*batch links"]
+    ) -> tuple[Float[Array, "*batch links 3 3"], Float[Array, "*batch links 3"]]:
+        """World from link: rotations and origins (m) of the links' frames."""
+        pose = poses(self.system().joints, _lanes(position, 1))
+        single = position.ndim == 1
+        return _lead(pose.matrix, single), _lead(pose.vector, single)
+
+    @eqx.filter_jit
+    def screws(self, position: Float[Array, "*batch links"]) -> Float[Array, "*batch links 6"]:
+        """Twist of the links that each joint carries per rad/s or m/s: angular, then linear.
+
+        In the world's axes, at the world's origin.
+        """
+        joints = self.system().joints
+        field = fields(joints, poses(joints, _lanes(position, 1)))
+        found = jnp.concatenate([axial(field.matrix), field.vector], axis=1)
+        return _lead(found, position.ndim == 1)
+
+    def observe(self, state: ArticulatedState) -> Float[Array, "*batch links"]:
+        """Joint positions, rad or m."""
+        return state.position
+
+    def initial_state(self, observations: Float[Array, "*batch frames links"]) -> ArticulatedState:
+        """At the last of a few frames, with the velocity between the last two; of one at rest."""
+        last, before = observations[..., -1, :], observations[..., -2:, :][..., 0, :]
+        return ArticulatedState(last, (last - before) / self.control_period)
+
+    def velocity(self, state: ArticulatedState) -> Float[Array, "*batch links"]:
+        """Of the joints, rad/s or m/s."""
+        return state.velocity
+
+
+def _lanes(value: Array, axes: int) -> Array:
+    """The batch axis last, of length one where there is none; `axes` are those of one tree."""
+    return value[..., None] if value.ndim == axes else jnp.moveaxis(value, 0, -1)
+
+
+def _lead(value: Array, single: bool) -> Array:
+    """The batch axis first again, none of a single one."""
+    return value[..., 0] if single else jnp.moveaxis(value, -1, 0)
+
+
+def _forces(action: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Of the joints, and on the links: force and point."""
+    laned = _lanes(action, 2)
+    return laned[:, 0], (laned[:, 1:4], laned[:, 4:])

@@ -173,7 +173,8 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
-            "articulated-model, maze-safe, contact-model, maze-arm, maze-reflex, energy-audit, maze-passive, "
+            "articulated-model, "
+            "maze-safe, contact-model, maze-arm, maze-reflex, energy-audit, maze-passive, "
             "namo-scenarios, namo-scaling, namo-online, "
             "calibration, one-shot, cart-online, velocity-yardstick, "
             "own-model, rope-model, rope-stabilization, rope-ablation, rope-rivals, rope-bound, "

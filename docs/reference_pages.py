@@ -31,7 +31,9 @@ STAGES = {
         *("models.planar.wheels", "families.furniture.structures"),
         *("models.contact.tip", "families.contact.touches"),
         *("models.articulated.articulated", "models.articulated.parameters"),
-        "models.articulated.links",
+        *("models.articulated.links", "models.articulated.description"),
+        *("models.articulated.urdf", "models.articulated.faults", "models.articulated.meshes"),
+        "models.articulated.assembly",
     ],
     "identification": [
         *("identification.identify", "identification.declarations", "identification.verdicts"),

@@ -147,7 +147,7 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "idenitfy rope R.npz",
             "unknown command 'idenitfy'; did you mean 'identify'? there are: demo, record, "
-            "convert, track, identify, plan, train, evaluate, audit, export, serve, report, "
+            "convert, check, track, identify, plan, train, evaluate, audit, export, serve, report, "
             "reproduce",
         ),
         (

@@ -50,6 +50,25 @@ class Convert(Reading):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Check(Options):
+    """Say what is wrong with a URDF file, and where it would fail; write a mended copy.
+
+    Missing masses, inertias and limits, meshes that are not there or have no hull, links that hang
+    on none: each is named with the readers that fail on it. A copy has all of it put right, its
+    meshes beside it, and is tried in MuJoCo. What only somebody who knows the object can put right
+    is named, and there is no copy then.
+
+    1. What is wrong:                           palpate check FILE.urdf
+    2. A copy that loads and moves:             palpate check FILE.urdf --fix OUT.urdf
+    """
+
+    file: Positional[Annotated[Path, arg(metavar="FILE", help_behavior_hint="")]]
+    """A URDF file."""
+    fix: Annotated[Path | None, arg(metavar="OUT", help_behavior_hint="(default: no copy)")] = None
+    """Write a mended copy here, its meshes in a folder beside it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report(Options):
     """Write the page of one or several runs.
 

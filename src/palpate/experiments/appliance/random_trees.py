@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from palpate.errors import PalpateError
+from palpate.errors import extra_module
 from palpate.models.articulated import Link
 
 MOST = 12  # joints
@@ -124,12 +124,7 @@ def pinocchio_acceleration(case: Case) -> Float[np.ndarray, " links"]:
 
     Raises `PalpateError` where it is not installed.
     """
-    try:
-        import pinocchio as pin
-    except ModuleNotFoundError as error:
-        raise PalpateError(
-            "comparing with Pinocchio needs it: pip install 'palpate[pinocchio]'"
-        ) from error
+    pin = extra_module("pinocchio", "pinocchio", "Pinocchio")
     pin_model: Any = pin.Model()
     ids = [0]
     for index, link in enumerate(case.links):

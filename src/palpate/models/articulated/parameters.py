@@ -14,7 +14,8 @@ Each = Float[Array, "*batch links"]
 Vectors = Float[Array, "*batch links 3"]
 Matrices = Float[Array, "*batch links 3 3"]
 
-OF_JOINTS = "N m of a hinge, N of a slide"
+# Of a hinge or of a slide.
+FORCE, DAMPING, STIFFNESS = "N m or N", "N m s or N s/m", "N m/rad or N/m"
 
 
 class ArticulatedState(eqx.Module):
@@ -54,16 +55,16 @@ class TreeParameters(Model):
         about="radii of gyration about the centre of mass, in those of the link's shape",
     )
     damping: Each = parameter(
-        f"{OF_JOINTS}, per rad/s or m/s",
+        DAMPING,
         prior=LogNormal(0.1, 1.5),
         spread=0.3,
         about="viscous friction of the joint",
     )
     friction: Each = parameter(
-        OF_JOINTS, prior=LogNormal(0.1, 1.5), spread=0.3, about="dry friction of the joint"
+        FORCE, prior=LogNormal(0.1, 1.5), spread=0.3, about="dry friction of the joint"
     )
     stiffness: Each = parameter(
-        f"{OF_JOINTS}, per rad or m",
+        STIFFNESS,
         prior=LogNormal(0.1, 2.0),
         fixed=True,
         about="of a spring at the joint",
@@ -78,13 +79,13 @@ class TreeParameters(Model):
         "rad or m", prior=Normal(None, 0.02), fixed=True, about="where the joint's range ends"
     )
     stop_stiffness: Each = parameter(
-        f"{OF_JOINTS}, per rad or m",
+        STIFFNESS,
         prior=LogNormal(1e3, 1.5),
         fixed=True,
         about="of the stops at both ends",
     )
     stop_damping: Each = parameter(
-        f"{OF_JOINTS}, per rad/s or m/s",
+        DAMPING,
         prior=LogNormal(10.0, 1.5),
         fixed=True,
         about="of the stops, while a link runs into them",

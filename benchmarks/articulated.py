@@ -1,4 +1,4 @@
-"""Speed of articulated models against MuJoCo: `python -m benchmarks.articulated [--out FILE] [--quick]`.
+"""Speed of articulated models against MuJoCo: `python -m benchmarks.articulated [--quick]`.
 
 A seven-joint arm and a cabinet of three joints (two doors and a drawer), 4,096 at once, damped,
 without dry friction, stops and contact, which MuJoCo would need its solver for. Both simulate 1 ms

@@ -20,6 +20,7 @@ from palpate.experiments.appliance.random_trees import (
 )
 from palpate.models import rollout
 from palpate.models.articulated import Articulated, ArticulatedState, Link, free_links, tree_of
+from palpate.models.articulated.lanes import BLOCK
 from palpate.models.contract import check_model
 from palpate.models.files import load_model, save_model
 from palpate.parameters import value_of, with_values
@@ -245,6 +246,18 @@ def test_batches_are_the_same_as_one_after_another(strict):
         state = jax.tree.map(lambda leaf, lane=lane: leaf[lane], start)
         apart = run(one, state, actions[lane])
         np.testing.assert_allclose(together.position[lane], apart.position, rtol=2e-5, atol=1e-6)
+
+
+def test_more_lanes_than_a_block_are_the_same_as_few():
+    model = tree_of([ROD, dataclasses.replace(DRAWER, parent=0, friction=0.5)], substeps=4)
+    count = BLOCK + 7
+    masses = jnp.linspace(0.5, 3.0, 2 * count).reshape(count, 2)
+    start = ArticulatedState(jnp.linspace(0, 1, 2 * count).reshape(count, 2), jnp.ones((count, 2)))
+    actions = jnp.ones((count, 3, 2, 7))
+    together = run(with_values(model, {"mass": masses}), start, actions)
+    last = jax.tree.map(lambda leaf: leaf[-5:], start)
+    few = run(with_values(model, {"mass": masses[-5:]}), last, actions[-5:])
+    np.testing.assert_allclose(together.position[-5:], few.position, rtol=1e-5, atol=1e-6)
 
 
 def test_trees_of_different_structure_are_a_batch():

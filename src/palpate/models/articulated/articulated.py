@@ -1,6 +1,7 @@
 """Trees of rigid links, whose joints damp, rub, spring and stop."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,6 +19,7 @@ from palpate.models.articulated.kinematics import (
     outer,
     poses,
 )
+from palpate.models.articulated.lanes import in_blocks
 from palpate.models.articulated.parameters import ArticulatedState, TreeParameters
 
 ACTION = 7  # of a link: torque or force of its joint, a force on it, and where
@@ -56,19 +58,25 @@ class Articulated(TreeParameters):
         system = self.system()
         time_step = self.control_period / self.substeps
 
-        def step(state: ArticulatedState, action: Array) -> ArticulatedState:
-            single = state.position.ndim == 1
-            torque, push = _forces(action)
+        def advanced(system: System, own: Any) -> tuple[Array, Array]:
+            """Positions and velocities a control period later, lanes last."""
+            position, velocity, torque, push = own
 
-            def advanced(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-                return integration.advance(
+            def once(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+                following = integration.advance(
                     system, *carry, torque, push, time_step,
                     resisted=self.resisted, slip=self.slip,
-                ), None  # fmt: skip
+                )  # fmt: skip
+                return following, None
 
-            start = _lanes(state.position, 1), _lanes(state.velocity, 1)
-            end, _ = jax.lax.scan(advanced, start, None, length=self.substeps)
-            return ArticulatedState(*(_lead(part, single) for part in end))
+            # the inside of a time step is computed again on the way back: keeping it costs more
+            again = jax.checkpoint(once, prevent_cse=False)
+            return jax.lax.scan(again, (position, velocity), None, length=self.substeps)[0]
+
+        def step(state: ArticulatedState, action: Array) -> ArticulatedState:
+            own = (_lanes(state.position, 1), _lanes(state.velocity, 1), *_forces(action))
+            found = in_blocks(advanced, system, own)
+            return ArticulatedState(*(_lead(part, state.position.ndim == 1) for part in found))
 
         return step
 

@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from palpate.numerics.trigonometry import cosine_and_sine
+
 Each = Float[Array, "*links #lanes"]
 Vector = Float[Array, "*links 3 #lanes"]
 Matrix = Float[Array, "*links 3 3 #lanes"]
@@ -154,8 +156,8 @@ def with_row(array: Array, value: Array, index: Array) -> Array:
 
 def local_poses(joints: Joints, position: Each) -> Affine:
     """Parent from link, from joint positions (rad or m)."""
-    sine, half = jnp.sin(position), jnp.sin(0.5 * position)
-    versine = 2.0 * jnp.square(half)
+    cosine, sine = cosine_and_sine(position)
+    versine = 1.0 - cosine
     turn = joints.sine * sine[:, None, None] + joints.versine * versine[:, None, None]
     return Affine(joints.still + turn, joints.origin + joints.slide * position[:, None])
 

@@ -33,7 +33,7 @@ STAGES = {
         *("models.articulated.articulated", "models.articulated.parameters"),
         *("models.articulated.links", "models.articulated.description"),
         *("models.articulated.urdf", "models.articulated.faults", "models.articulated.meshes"),
-        "models.articulated.assembly",
+        *("models.articulated.assembly", "models.articulated.mjcf", "families.appliance.mjcf"),
     ],
     "identification": [
         *("identification.identify", "identification.declarations", "identification.verdicts"),

@@ -332,5 +332,15 @@ def test_a_copy_never_replaces_a_file(file):
     path = file(DOOR.replace(BODY, ""))
     with pytest.raises(PalpateError, match="is there already"):
         check.run(Check(file=path, fix=path))
-    with pytest.raises(PalpateError, match=r"ends in \.urdf"):
-        check.run(Check(file=path, fix=path.with_suffix(".xml")))
+    with pytest.raises(PalpateError, match=r"ends in \.urdf or \.xml"):
+        check.run(Check(file=path, fix=path.with_suffix(".txt")))
+
+
+def test_a_copy_may_be_mjcf_and_is_checked_as_such(file, capsys):
+    path = file(DOOR.replace(BODY, BOX))
+    out = path.with_name("copy.xml")
+    check.run(Check(file=path, fix=out))
+    check.run(Check(file=out))
+    assert "1 joint: 1 revolute" in capsys.readouterr().out
+    with pytest.raises(PalpateError, match="--fix is for URDF"):
+        check.run(Check(file=out, fix=path.with_name("another.urdf")))

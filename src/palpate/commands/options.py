@@ -51,19 +51,20 @@ class Convert(Reading):
 
 @dataclass(frozen=True, kw_only=True)
 class Check(Options):
-    """Say what is wrong with a URDF file, and where it would fail; write a mended copy.
+    """Say what is wrong with a file of links and joints, and where; write a mended copy.
 
     Missing masses, inertias and limits, meshes that are not there or have no hull, links that hang
     on none: each is named with the readers that fail on it. A copy has all of it put right, its
     meshes beside it, and is tried in MuJoCo. What only somebody who knows the object can put right
-    is named, and there is no copy then.
+    is named, and there is no copy then. Of an MJCF file it says what moves in MuJoCo.
 
     1. What is wrong:                           palpate check FILE.urdf
     2. A copy that loads and moves:             palpate check FILE.urdf --fix OUT.urdf
+    3. The same in MuJoCo's format:             palpate check FILE.urdf --fix OUT.xml
     """
 
     file: Positional[Annotated[Path, arg(metavar="FILE", help_behavior_hint="")]]
-    """A URDF file."""
+    """A URDF or MJCF file."""
     fix: Annotated[Path | None, arg(metavar="OUT", help_behavior_hint="(default: no copy)")] = None
     """Write a mended copy here, its meshes in a folder beside it."""
 

@@ -39,7 +39,7 @@ def read_urdf(path: str | Path, note: Note | None = None) -> Description:
     number.
     """
     path = Path(path)
-    root = read_xml(path, LARGEST)
+    root = read_xml(path)
     if root.tag != "robot":
         raise PalpateError(f"{path} holds <{root.tag}>: expected URDF, which begins with <robot>")
 
@@ -55,11 +55,11 @@ def read_urdf(path: str | Path, note: Note | None = None) -> Description:
     )
 
 
-def read_xml(path: Path, largest: int) -> Element:
-    """The root of a file of at most `largest` bytes; raises `PalpateError` if it is no XML."""
+def read_xml(path: Path) -> Element:
+    """The root of a file; raises `PalpateError` if it is no XML or too large for a description."""
     try:
-        if path.stat().st_size > largest:
-            size = f"larger than {largest / 1e6:g} MB"
+        if path.stat().st_size > LARGEST:
+            size = f"larger than {LARGEST / 1e6:g} MB"
             raise PalpateError(f"{path} is {size}: expected a description without its meshes")
         return fromstring(path.read_bytes(), forbid_dtd=True)
     except OSError as error:
@@ -68,7 +68,7 @@ def read_xml(path: Path, largest: int) -> Element:
         if isinstance(error, PalpateError):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise PalpateError(f"{path} is not plain XML: expected a URDF file ({reason})") from error
+        raise PalpateError(f"{path} is not plain XML: expected a description ({reason})") from error
 
 
 class _Reader:
@@ -202,10 +202,10 @@ def write_urdf(path: str | Path, description: Description) -> None:
 
 
 def _write_inertial(node: Element, inertial: Inertial) -> None:
-    SubElement(node, "origin", xyz=_spell(inertial.centre))
-    SubElement(node, "mass", value=_spell([inertial.mass]))
+    SubElement(node, "origin", xyz=spell(inertial.centre))
+    SubElement(node, "mass", value=spell([inertial.mass]))
     entries = {
-        name: _spell([inertial.inertia[i, k]])
+        name: spell([inertial.inertia[i, k]])
         for i, row in enumerate(ENTRIES)
         for k, name in enumerate(row)
     }
@@ -217,12 +217,12 @@ def _write_geometry(node: Element, shape: Geometry) -> None:
     form = SubElement(SubElement(node, "geometry"), shape.kind)
     if shape.kind == "mesh":
         form.set("filename", shape.file)
-        form.set("scale", _spell(shape.size))
+        form.set("scale", spell(shape.size))
     elif shape.kind == "box":
-        form.set("size", _spell(shape.size))
+        form.set("size", spell(shape.size))
     else:
         for name, value in zip(("radius", "length"), shape.size, strict=False):
-            form.set(name, _spell([value]))
+            form.set(name, spell([value]))
 
 
 def _write_joint(node: Element, joint: DescribedJoint) -> None:
@@ -230,26 +230,27 @@ def _write_joint(node: Element, joint: DescribedJoint) -> None:
     SubElement(node, "child", link=joint.child)
     _write_place(node, joint.place)
     if joint.kind != "fixed":
-        SubElement(node, "axis", xyz=_spell(joint.axis))
+        SubElement(node, "axis", xyz=spell(joint.axis))
     limits = {
-        name: _spell([value])
+        name: spell([value])
         for name in ("lower", "upper", "effort", "velocity")
         if (value := getattr(joint, name)) is not None
     }
     if limits:
         SubElement(node, "limit", limits)
     if joint.damping or joint.friction:
-        values = {"damping": _spell([joint.damping]), "friction": _spell([joint.friction])}
+        values = {"damping": spell([joint.damping]), "friction": spell([joint.friction])}
         SubElement(node, "dynamics", values)
     if joint.mimic:
         SubElement(node, "mimic", joint=joint.mimic)
 
 
 def _write_place(node: Element, place: Place) -> None:
-    SubElement(node, "origin", xyz=_spell(place.origin), rpy=_spell(turn_of(place.rotation)))
+    SubElement(node, "origin", xyz=spell(place.origin), rpy=spell(turn_of(place.rotation)))
 
 
-def _spell(numbers: Any) -> str:
+def spell(numbers: Any) -> str:
+    """Numbers as XML has them, to twelve digits."""
     return " ".join(f"{float(number):.12g}" for number in numbers)
 
 

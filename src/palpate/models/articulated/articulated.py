@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.models.articulated import integration
@@ -48,6 +49,14 @@ class Articulated(TreeParameters):
     def observation_shape(self) -> tuple[int]:
         """(links,): joint positions."""
         return (self.links,)
+
+    @property
+    def observation_units(self) -> tuple[str, ...]:
+        """rad of a hinge, m of a slide; of a batch those of the first tree."""
+        if isinstance(self.prismatic, jax.core.Tracer):  # compiled code has no use for words
+            return super().observation_units
+        slides = np.asarray(self.prismatic).reshape(-1, self.links)[0]
+        return tuple("m" if slide else "rad" for slide in slides)
 
     def step(self, state: ArticulatedState, action: Array) -> ArticulatedState:
         return self.stepper()(state, action)

@@ -38,7 +38,7 @@ class Joints(NamedTuple):
 
     At a position q the link is in its parent's frame, the world's for a parent of -1, at the
     rotation `still` + `sine` sin q + `versine` (1 - cos q) and at `origin` + `slide` q. Its own
-    velocity field there is `spin` x + `slip` per rad/s or m/s, in its own frame. Both are nothing
+    velocity field there is `spin` x + `shift` per rad/s or m/s, in its own frame. Both are nothing
     for a link that is fixed.
     """
 
@@ -49,7 +49,7 @@ class Joints(NamedTuple):
     origin: Vector
     slide: Vector
     spin: Matrix
-    slip: Vector
+    shift: Vector
 
 
 def joints_of(
@@ -65,10 +65,10 @@ def joints_of(
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     rows = (zero, -z, y), (z, zero, -x), (-y, x, zero)
     turning = jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
-    spin, slip = turning * revolute[:, None, None], axis * prismatic[:, None]
+    spin, shift = turning * revolute[:, None, None], axis * prismatic[:, None]
     sine = product(rotation, spin)
     return Joints(
-        parent, rotation, sine, product(sine, spin), origin, applied(rotation, slip), spin, slip
+        parent, rotation, sine, product(sine, spin), origin, applied(rotation, shift), spin, shift
     )
 
 
@@ -179,7 +179,7 @@ def poses(joints: Joints, position: Each) -> Affine:
 def fields(joints: Joints, pose: Affine) -> Affine:
     """Velocity of the points that each joint carries, per rad/s or m/s."""
     matrix = product_transposed(product(pose.matrix, joints.spin), pose.matrix)
-    vector = applied(pose.matrix, joints.slip) - applied(matrix, pose.vector)
+    vector = applied(pose.matrix, joints.shift) - applied(matrix, pose.vector)
     return Affine(matrix, vector)
 
 

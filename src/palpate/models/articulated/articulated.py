@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from palpate.models.articulated import integration
@@ -53,7 +54,7 @@ class Articulated(TreeParameters):
     @property
     def observation_units(self) -> tuple[str, ...]:
         """rad of a hinge, m of a slide; of a batch those of the first tree."""
-        if isinstance(self.prismatic, jax.core.Tracer):  # compiled code has no use for words
+        if isinstance(self.prismatic, Tracer):  # compiled code has no use for words
             return super().observation_units
         slides = np.asarray(self.prismatic).reshape(-1, self.links)[0]
         return tuple("m" if slide else "rad" for slide in slides)

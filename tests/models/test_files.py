@@ -18,7 +18,7 @@ from toys import Cart
 
 REMOVED = object()
 
-KNOWN = "there are: tip, planar, rope"
+KNOWN = "there are: articulated, tip, planar, rope"
 
 
 def rope() -> Rope:
@@ -129,7 +129,7 @@ def test_a_model_that_nobody_could_read_again_is_not_saved(tmp_path):
         save_model(tmp_path / "model.json", Hidden(1.0, 0.5))
     assert str(error.value) == (
         "a model of type Hidden cannot be saved: expected a class at the top of a Python file, or "
-        "one of tip, planar, rope"
+        "one of articulated, tip, planar, rope"
     )
     assert not (tmp_path / "model.json").exists()
 

@@ -65,14 +65,13 @@ PLACE_KEEPERS = {"families", "family", "cli"}
 FAMILY_WORDS = {"rope", "ropes", "furniture", "appliance", "appliances", "maze", "mazes"}
 GENERAL = {
     *FOUNDATION,
-    "commands/identification",
+    *("commands/identification", "commands/in_world"),
     *("identification", "planning", "learning", "safety", "deployment", "report", "cli"),
     *(
         f"commands/{name}.py"
         for name in (
             *("demo", "record", "convert", "track", "identify", "plan", "train", "evaluate"),
             *("export", "serve", "report", "reproduce", "folders", "parsing"),
-            *("train_in_world", "evaluate_in_world", "episodes"),
         )
     ),
     *("models/model.py", "models/residual.py", "models/files.py"),

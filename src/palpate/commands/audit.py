@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.episodes import at_its_best
+from palpate.commands.in_world.episodes import at_its_best
 from palpate.commands.options import Audit
 from palpate.errors import PalpateError
 from palpate.families.world_options import EvaluateInWorld

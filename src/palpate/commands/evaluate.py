@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 
 from palpate.commands import folders
-from palpate.commands.evaluate_in_world import evaluate_in_world
+from palpate.commands.in_world.evaluate import evaluate_in_world
 from palpate.commands.train import named_task
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate, Found

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 from palpate.commands import folders
-from palpate.commands.train_in_world import train_in_world
+from palpate.commands.in_world.train import train_in_world
 from palpate.families.options import Train
 from palpate.families.world_options import TrainInWorld
 from palpate.family import find

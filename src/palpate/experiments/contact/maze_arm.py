@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders, train
-from palpate.commands.episodes import at_its_best, played
+from palpate.commands.in_world.episodes import at_its_best, played
 from palpate.experiments.contact.maze_safe import FIRST
 from palpate.experiments.experiment import Experiment
 from palpate.families.contact.episodes import figures

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders, train
-from palpate.commands.episodes import at_its_best
+from palpate.commands.in_world.episodes import at_its_best
 from palpate.experiments.contact.maze_safe import FIRST
 from palpate.experiments.contact.other_robots import of_other_robots
 from palpate.experiments.experiment import Experiment, ratio, share_of

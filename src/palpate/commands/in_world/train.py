@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.episodes import at_its_best, played
+from palpate.commands.in_world.episodes import at_its_best, played
 from palpate.families.world_options import TrainInWorld
 from palpate.learning.off_policy import train_off_policy
 from palpate.networks import save_controller

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.episodes import at_its_best, played
+from palpate.commands.in_world.episodes import at_its_best, played
 from palpate.errors import PalpateError
 from palpate.families.world_options import EvaluateInWorld
 from palpate.networks.guarded import load_actor

@@ -75,8 +75,8 @@ def test_a_limit_finds_its_price(episodic: bool) -> None:
 
 
 def test_a_regulator_comes_near_its_riccati_gain() -> None:
-    settings = OffPolicyTraining(8000, warm_up=500, batch=64, capacity=8000, ratio=1.0)
-    agent = SoftActorCritic(width=64, learning_rate=1e-3, target_rate=0.02, temperature=0.03)
+    settings = OffPolicyTraining(5000, warm_up=500, batch=64, capacity=5000, ratio=1.0)
+    agent = SoftActorCritic(width=64, learning_rate=1e-3, target_rate=0.02, temperature=0.2)
     state = train_off_policy(side_by_side(Regulator, 8), agent, settings, 0)
     seen = np.linspace(-0.8, 0.8, 9)[:, None]
     executed = 2.0 * greedy(agent, state, seen)  # stretched onto the bounds

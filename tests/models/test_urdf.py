@@ -334,6 +334,10 @@ def test_a_copy_never_replaces_a_file(file):
         check.run(Check(file=path, fix=path))
     with pytest.raises(PalpateError, match=r"ends in \.urdf or \.xml"):
         check.run(Check(file=path, fix=path.with_suffix(".txt")))
+    out = path.with_name("copy.urdf")
+    out.write_text("old")
+    assert check.run(Check(file=path, fix=out, fresh=True)) == out
+    assert read_urdf(out).links[1].inertial is not None
 
 
 def test_a_copy_may_be_mjcf_and_is_checked_as_such(file, capsys):

@@ -13,7 +13,7 @@ from palpate.models.articulated.mjcf import write_mjcf
 from palpate.models.articulated.urdf import read_urdf, read_xml, write_urdf
 from palpate.worlds.descriptions import refusal
 
-READERS = ("urdfdom", "palpate")  # of what is no number
+FAILING = ("urdfdom", "palpate")  # of what is no number
 WRITERS = {".urdf": write_urdf, ".xml": write_mjcf}
 
 
@@ -28,14 +28,14 @@ def run(options: Check) -> Path | None:
     if out is not None and out.suffix not in WRITERS:
         expected = f"expected one that ends in {' or '.join(WRITERS)}"
         raise PalpateError(f"--fix {out} is no name for a copy: {expected}")
-    if out is not None and out.exists():
-        raise PalpateError(f"{out} is there already: give another --fix")
+    if out is not None and out.exists() and not options.fresh:
+        raise PalpateError(f"{out} is there already: give another --fix, or --fresh to replace it")
     if read_xml(options.file).tag == "mujoco":
         return check_mjcf(options)
     faults: list[Fault] = []
 
     def note(where: str, what: str) -> None:
-        faults.append(Fault(where, what, READERS, "taken as missing"))
+        faults.append(Fault(where, what, FAILING, "taken as missing"))
 
     description = read_urdf(options.file, note)
     whole, found = mended(description)

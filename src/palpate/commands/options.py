@@ -50,7 +50,7 @@ class Convert(Reading):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(Options):
+class Check:
     """Say what is wrong with a file of links and joints, and where; write a mended copy.
 
     Missing masses, inertias and limits, meshes that are not there or have no hull, links that hang
@@ -67,6 +67,8 @@ class Check(Options):
     """A URDF or MJCF file."""
     fix: Annotated[Path | None, arg(metavar="OUT", help_behavior_hint="(default: no copy)")] = None
     """Write a mended copy here, its meshes in a folder beside it."""
+    fresh: bool = False
+    """Replace a file that is there already."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -57,7 +57,8 @@ class Fault(NamedTuple):
 
     def __str__(self) -> str:
         fails = f" (fails in {', '.join(self.fails)})" if self.fails else ""
-        return f"{self.where}: {self.what}{fails}; {self.mend or 'cannot be mended by itself'}"
+        mend = f"mend: {self.mend}" if self.mend else "cannot be mended by itself"
+        return f"{self.where}: {self.what}{fails}; {mend}"
 
 
 Faults = list[Fault]

@@ -7,16 +7,16 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from palpate.errors import PalpateError
 from palpate.models.articulated.articulated import Articulated
+from palpate.models.articulated.description import Place, Square, Triple
 from palpate.parameters import as_floating
 
 FREE = 1e6  # rad or m: where a joint without limits ends
-Triple = tuple[float, float, float] | Float[np.ndarray, "3"]
-Square = Float[np.ndarray, "3 3"]
+ThreeNumbers = tuple[float, float, float] | Triple
 
+LEAST = 1e-12  # kg m^2 or kg: what is less is no inertia
 GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 
 
@@ -30,11 +30,11 @@ class Link:
 
     joint: Literal["fixed", "revolute", "prismatic"] = "revolute"
     parent: int = -1
-    origin: Triple = (0.0, 0.0, 0.0)
+    origin: ThreeNumbers = (0.0, 0.0, 0.0)
     rotation: Square = dataclasses.field(default_factory=lambda: np.eye(3))
-    axis: Triple = (0.0, 0.0, 1.0)
+    axis: ThreeNumbers = (0.0, 0.0, 1.0)
     mass: float = 1.0
-    centre_of_mass: Triple = (0.0, 0.0, 0.0)
+    centre_of_mass: ThreeNumbers = (0.0, 0.0, 0.0)
     inertia: Square = dataclasses.field(default_factory=lambda: 1e-3 * np.eye(3))
     damping: float = 0.0
     friction: float = 0.0
@@ -59,19 +59,20 @@ def tree_of(
     links: Sequence[Link],
     *,
     size: int | None = None,
-    gravity: Triple = GRAVITY,
+    gravity: ThreeNumbers = GRAVITY,
     **settings: Any,
 ) -> Articulated:
     """The model of these links, filled up to `size`; `settings` are fields of `Articulated`.
 
     Raises `PalpateError` for no link, more than `size`, a parent that does not come before, an axis
-    without a direction, and numbers that no rigid body has.
+    without a direction, numbers that no rigid body has, and a joint that moves nothing inert.
     """
     size = len(links) if size is None else size
     if not 0 < len(links) <= size:
         raise PalpateError(f"expected between 1 and {size} links, got {len(links)}")
     for index, link in enumerate(links):
         _check(index, link)
+    check_inert(links)
     filled = [*links, *[FILLING] * (size - len(links))]
     mass = np.array([link.mass for link in filled], float)
     unit = np.array([np.asarray(link.inertia, float) for link in filled])
@@ -141,9 +142,9 @@ def _check(index: int, link: Link) -> None:
     if link.joint != "fixed" and not np.linalg.norm(link.axis) > 1e-9:
         raise PalpateError(f"the axis of {what} has no direction: {tuple(link.axis)}")
     rotation = np.asarray(link.rotation, float)
-    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5):
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
         raise PalpateError(f"the rotation of {what} is no rotation matrix: {rotation.tolist()}")
-    for name in ("mass", "damping", "friction", "stiffness", "armature"):
+    for name in _POSITIVE:
         if getattr(link, name) < 0.0:
             raise PalpateError(f"the {name} of {what} is negative: {getattr(link, name)}")
     if link.lower > link.upper:
@@ -151,7 +152,41 @@ def _check(index: int, link: Link) -> None:
     check_inertia(what, link.mass, np.asarray(link.inertia, float))
 
 
-def check_inertia(what: str, mass: float, inertia: np.ndarray) -> None:
+def check_inert(links: Sequence[Link]) -> None:
+    """Raise `PalpateError` for a joint along which nothing resists being accelerated.
+
+    It would have no acceleration. As the tree is described, with all joints at zero.
+    """
+    places: list[Place] = []
+    for link in links:
+        above = places[link.parent] if link.parent >= 0 else Place()
+        origin = np.asarray(link.origin, float)
+        places.append(above @ Place(origin, np.asarray(link.rotation, float)))
+    carried = [{index} for index in range(len(links))]
+    for index in range(len(links) - 1, -1, -1):
+        if links[index].parent >= 0:
+            carried[links[index].parent] |= carried[index]
+    for index, (link, place) in enumerate(zip(links, places, strict=True)):
+        if link.joint == "fixed":
+            continue
+        axis = np.asarray(link.axis, float) / np.linalg.norm(link.axis)
+        along, inert = place.rotation @ axis, link.armature
+        for body, there in ((links[k], places[k]) for k in carried[index]):
+            if link.joint == "prismatic":
+                inert += body.mass
+                continue
+            centre = there.origin + there.rotation @ np.asarray(body.centre_of_mass, float)
+            arm = np.cross(along, centre - place.origin)
+            own = there.rotation.T @ along
+            inert += body.mass * arm @ arm + own @ np.asarray(body.inertia, float) @ own
+        if inert < LEAST:
+            raise PalpateError(
+                f"the joint of link {index} moves nothing with a mass or inertia about it: "
+                "give the link, or one that it carries, a mass, or the joint an armature"
+            )
+
+
+def check_inertia(what: str, mass: float, inertia: Square) -> None:
     """Raise `PalpateError` for an inertia (kg m^2) that no body of this mass (kg) has.
 
     It has to be symmetric, and no principal moment larger than the sum of the other two.
@@ -170,4 +205,8 @@ def check_inertia(what: str, mass: float, inertia: np.ndarray) -> None:
         raise PalpateError(f"{what} has an inertia and no mass")
 
 
+_POSITIVE = (
+    *("mass", "damping", "friction", "stiffness", "armature"),
+    *("stop_stiffness", "stop_damping"),
+)
 _NUMBERS = [field for field in dataclasses.fields(Link) if field.name not in ("joint", "parent")]

@@ -250,8 +250,8 @@ def _write_place(node: Element, place: Place) -> None:
 
 
 def spell(numbers: Any) -> str:
-    """Numbers as XML has them, to twelve digits."""
-    return " ".join(f"{float(number):.12g}" for number in numbers)
+    """Numbers as XML has them, to twelve digits, and never minus zero."""
+    return " ".join(f"{float(number) + 0.0:.12g}" for number in numbers)
 
 
 def rotation_of(turn: Triple) -> Square:

@@ -43,6 +43,9 @@ STAGES = {
         *("identification.posterior.comparison", "identification.posterior.calibration"),
         *("identification.posterior.diagnostics", "identification.posterior.files"),
         "identification.posterior.settled",
+        *("identification.interactive.twin", "identification.interactive.handling"),
+        *("identification.interactive.screws", "identification.interactive.labels"),
+        *("identification.interactive.refinement", "identification.interactive.description"),
         *("identification.samplers.draws", "identification.samplers.target"),
         *("identification.samplers.hamiltonian", "identification.samplers.metropolis"),
         *("identification.samplers.local_global", "identification.samplers.tempered"),
@@ -50,6 +53,7 @@ STAGES = {
         "identification.regression.gaussian_process",
     ],
     "learning": [
+        "learning.active",
         *("learning.self_supervised", "learning.closed_loop", "learning.dagger"),
         *("learning.loss_monitor", "networks.policy", "networks.controller", "networks.channels"),
         *("learning.off_policy.loop", "learning.off_policy.agent", "learning.off_policy.buffer"),
@@ -79,6 +83,8 @@ STAGES = {
         *("worlds.maze.navigation", "worlds.mjcf"),
         *("worlds.arm.maze", "worlds.arm.panda", "worlds.arm.control", "worlds.arm.joints"),
         *("worlds.contact.plates", "worlds.contact.touching"),
+        *("worlds.appliance.appliance", "worlds.appliance.categories", "worlds.appliance.design"),
+        *("worlds.appliance.fittings", "worlds.depth"),
         *(
             "safety.impedance",
             "safety.self_tuning",
@@ -100,13 +106,14 @@ STAGES = {
     ],
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),
-        "perception.rope.marker_observer",
+        *("perception.rope.marker_observer", "perception.clouds"),
     ],
     "trials": [
         *("trials.trial", "trials.controller", "trials.audit", "trials.adversaries"),
         *("trials.rope.stabilization", "trials.rope.tracking"),
         *("trials.rope.learned", "trials.rope.baselines", "trials.rope.planners"),
         *("trials.furniture.namo_episode", "trials.furniture.cart_trials"),
+        *("trials.appliance.hand", "trials.appliance.interaction", "trials.appliance.score"),
     ],
     "deployment": [
         *("deployment.deployment", "deployment.supervisor", "deployment.intake"),

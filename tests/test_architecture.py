@@ -54,6 +54,7 @@ TRUTH_FILES = {
     *("experiments/rope/bound.py", "experiments/rope/swing.py"),
     "experiments/furniture/one_shot.py",
     *("families/rope/robot.py", "families/contact/robot.py"),
+    "trials/appliance/score.py",
     "families/contact/path_picture.py",  # which draws what happened
     "families/contact/probes.py",  # which asks what happened next
 }
@@ -80,7 +81,7 @@ GENERAL = {
 NAMED_FOR_A_FAMILY = {
     "planning/movable_obstacles",
     "planning/movable_obstacles.py",
-    "identification/interactive.py",
+    "identification/interactive",
 }
 
 UNPICKLERS = {"pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
@@ -404,7 +405,7 @@ ALLOWED = [
     ("learning/a.py", '"""Trained a rope first."""\nfrom ..models.model import Model\n# a rope'),
     ("learning/b.py", "property, Properties, europe, grope, mazed = prototype('properties')"),
     ("planning/movable_obstacles/a.py", "from ...worlds.furniture import Furniture"),
-    ("identification/interactive.py", "appliance = 1"),
+    ("identification/interactive", "appliance = 1"),
     ("models/rope.py", "class Rope: ...\nfrom .model import Model\nfrom palpate.errors import E"),
     ("parameters.py", "from . import __version__\nKEYS = 'palpate.keys'\nSUFFIX = '.npz'"),
     ("recordings/a.py", "np.load(path, allow_pickle=False)\nmodel.eval()\njax.eval_shape(f)"),

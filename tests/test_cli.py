@@ -148,8 +148,8 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "idenitfy rope R.npz",
             "unknown command 'idenitfy'; did you mean 'identify'? there are: demo, record, "
-            "convert, check, track, identify, plan, train, evaluate, audit, export, serve, report, "
-            "reproduce",
+            "convert, check, interact, track, identify, plan, train, evaluate, audit, export, "
+            "serve, report, reproduce",
         ),
         (
             "identify rpoe R.npz",
@@ -174,7 +174,7 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
-            "articulated-model, "
+            "articulated-model, twin-interactive, "
             "maze-safe, contact-model, maze-arm, maze-reflex, energy-audit, maze-passive, "
             "namo-scenarios, namo-scaling, namo-online, "
             "calibration, one-shot, cart-online, velocity-yardstick, "

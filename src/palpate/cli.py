@@ -58,6 +58,7 @@ COMMANDS = {
     "record": Command("record a simulated object", subject="family"),
     "convert": Command("turn a robot's log or any recording into another format", "Convert"),
     "check": Command("say what is wrong with a file of links and joints, and mend it", "Check"),
+    "interact": Command("handle something until its joints are known: its twin", "Interact"),
     "track": Command("follow an object through a camera's pictures", subject="family"),
     "identify": Command(
         "find an object's physical parameters from recordings of it",

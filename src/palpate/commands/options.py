@@ -72,6 +72,36 @@ class Check:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Interact(Options):
+    """Handle a simulated appliance until its parts and joints are known, and write its twin.
+
+    A hand pulls at places that depth cameras show, one after the other: where it tells the most.
+    What moves together is a part, how it moves is its joint. The run holds the twin as URDF and
+    MJCF, a picture of it, and how well it fits the appliance that was drawn.
+
+    1. A microwave, six pushes:                 palpate interact microwave --out RUN
+    2. Another one, seen by one camera:         palpate interact microwave --views 1 --seed 1
+    3. Pushing anywhere, to compare:            palpate interact microwave --choose random
+    """
+
+    category: Positional[Annotated[str, arg(metavar="CATEGORY", help_behavior_hint="")]]
+    """box, door, microwave, oven, refrigerator or "storage furniture"."""
+    pushes: int = 6
+    """How often the hand takes hold of something."""
+    views: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: drawn, 1 to 4)")
+    ] = None
+    """Cameras before the appliance."""
+    choose: Literal["information", "random"] = "information"
+    """Where to pull next: where most is expected to be learnt, or anywhere."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.pushes < 1:
+            raise PalpateError(f"--pushes is 1 or greater, not {self.pushes}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report(Options):
     """Write the page of one or several runs.
 

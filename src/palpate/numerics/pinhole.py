@@ -127,3 +127,22 @@ class Frame:
                 f"a frame's depth has the shape of its colour, {self.colour.shape[:2]}, "
                 f"not {self.depth.shape}"
             )
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """What a depth camera saw at `time` (s): `depth` (height, width) m along the optical axis.
+
+    NaN where it saw nothing. Raises `PalpateError` where the depth is not of the camera's size.
+    """
+
+    time: float
+    pinhole: Pinhole
+    depth: np.ndarray
+
+    def __post_init__(self):
+        if self.depth.shape != (self.pinhole.height, self.pinhole.width):
+            raise PalpateError(
+                f"a depth image has the shape of its camera, ({self.pinhole.height}, "
+                f"{self.pinhole.width}), not {self.depth.shape}"
+            )

@@ -109,7 +109,7 @@ class Camera:
         rows, columns = np.nonzero(self._near_what_moves())
         rays = self._directions[index][rows, columns]
         origin = self.pinhole.position
-        geoms, distance, normals = _cast(self._model, self._data, origin, rays, still=False)
+        geoms, distance, normals = cast(self._model, self._data, origin, rays, still=False)
         nearer = distance < depth[rows, columns]
         rows, columns, geoms = rows[nearer], columns[nearer], geoms[nearer]
         colour[rows, columns] = _lit(self._model.geom_rgba[geoms, :3], normals[nearer])
@@ -135,7 +135,7 @@ class Camera:
         depth = np.full(len(flat), np.inf)
         for still in self._fixed:
             origin = self.pinhole.position
-            geoms, distance, normals = _cast(still.model, still.data, origin, flat, still=True)
+            geoms, distance, normals = cast(still.model, still.data, origin, flat, still=True)
             hit = (distance < depth) & still.fixed[geoms]
             points = origin + flat[hit] * distance[hit, None]
             squares = np.floor(points / CHECKER + 1e-3).sum(-1) % 2
@@ -156,7 +156,7 @@ class _Still:
             self.data.geom_xpos[geom] = (0.0, 0.0, -1e3)
 
 
-def _cast(
+def cast(
     model: mujoco.MjModel, data: mujoco.MjData, origin, rays: np.ndarray, *, still: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What `rays` (n, 3) of depth 1 meet first: geoms (n,), depths (n,) in m, normals (n, 3).

@@ -8,5 +8,6 @@ FAMILY = Family(
     models={"articulated": "palpate.models.articulated:Articulated"},
     experiments={
         "articulated-model": "palpate.experiments.appliance.articulated_model:reproduce",
+        "twin-interactive": "palpate.experiments.appliance.twin_interactive:reproduce",
     },
 )

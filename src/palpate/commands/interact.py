@@ -1,0 +1,72 @@
+"""`palpate interact`: handle an appliance until its joints are known, and write its twin."""
+
+from pathlib import Path
+
+from palpate.commands import folders
+from palpate.commands.options import Interact
+from palpate.families.appliance.twin_picture import PICTURE, show_twin
+from palpate.identification.interactive.description import describe
+from palpate.identification.interactive.twin import Twin
+from palpate.learning.active import CHOICES
+from palpate.models.articulated.mjcf import write_mjcf
+from palpate.models.articulated.urdf import write_urdf
+from palpate.runs.run import RESULT
+from palpate.runs.storage import read_json
+from palpate.trials.appliance.interaction import interact
+from palpate.trials.appliance.score import figures_of, score
+from palpate.worlds.appliance.appliance import ApplianceWorld
+
+TWIN, OTHER = "twin.urdf", "twin.xml"
+
+
+def run(options: Interact) -> Path:
+    """Handle the appliance, say what was found, and return where the twin is.
+
+    Raises `PalpateError` for a category that there is not and where nothing was found to move.
+    """
+    with folders.begin(options, "interact") as run:
+        if not run.finished:
+            world = ApplianceWorld(options.category, options.seed, views=options.views)
+            world.reset(options.seed)
+            choose, twin = CHOICES[options.choose], Twin()
+            for number, step in enumerate(interact(world, choose, options.pushes, options.seed)):
+                twin = step.twin
+                print(f"push {number + 1}: {said(twin)}", flush=True)
+            description = describe(twin, options.category.replace(" ", "_"))
+            write_urdf(run.path / TWIN, description)
+            write_mjcf(run.path / OTHER, description)
+            twin.relabel(0)  # of parts that were found later, too
+            show_twin(run.path / PICTURE, twin, options.category)
+            lines = rows(twin)
+            folders.finish(run, figures_of([score(twin, world)]), {folders.SUMMARY: lines})
+        print("\n".join(read_json(run.path / RESULT)["settings"][folders.SUMMARY]))
+        folders.hand_over(options, run, f"Twin: {options.category}")
+        print(f"twin: {run.path / TWIN}")
+        print(f"picture: {run.path / PICTURE}")
+        return run.path / TWIN
+
+
+def said(twin: Twin) -> str:
+    """What came of the last push, in a few words."""
+    handling = twin.handled[-1]
+    parts = f"{len(twin.parts)} part{'s' * (len(twin.parts) != 1)}"
+    if not handling.held:
+        return f"no hold; {parts}"
+    if not handling.moved:
+        return f"nothing moved; {parts}"
+    return f"moved {100.0 * handling.travel:.0f} cm; {parts}"
+
+
+def rows(twin: Twin) -> list[str]:
+    """Each part's joint with its intervals, a line each."""
+    found = []
+    for number, part in enumerate(twin.parts):
+        angle, place = part.estimate.intervals
+        x, y, z = part.screw.axis
+        on = "" if part.parent < 0 else f" on part {part.parent + 1}"
+        at = f", its place to {100.0 * place:.1f} cm" if part.screw.joint == "revolute" else ""
+        found.append(
+            f"part {number + 1}: {part.screw.joint}{on}, axis ({x:.3f}, {y:.3f}, {z:.3f}) to "
+            f"{angle:.1f} degrees{at} (90 %)"
+        )
+    return found

@@ -1,0 +1,160 @@
+"""`palpate reproduce twin-interactive`: appliances nobody has handled, and their twins.
+
+Of each of six categories some are drawn, and handled as often as three times for each moving part
+and three times more, where most is expected to be learnt. Of those with two parts or more, some are
+handled at random, too.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.experiments.experiment import Experiment, ratio
+from palpate.learning.active import CHOICES
+from palpate.runs import Figure, Result
+from palpate.trials.appliance.interaction import interact
+from palpate.trials.appliance.score import Score, figures_of, score
+from palpate.worlds.appliance.appliance import ApplianceWorld
+from palpate.worlds.appliance.categories import CATEGORIES, draw_design
+
+NAME = "twin-interactive"
+FIRST, FIRST_QUICK = 510_000, 490_000  # seed of the first appliance
+OBJECTS, PAIRED, QUICK = 20, 5, 1  # of each category
+EACH, MORE = 3, 3  # pushes for each moving part, and in all
+NEAR = 2.0  # degrees that every axis is known to
+MINUTES = {"by information": 60, "at random": 20}
+
+
+def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
+    """Handle appliances below `out`; `quick` is one of each category.
+
+    Raises `PalpateError` when `out` holds other runs.
+    """
+    experiment, count = Experiment(NAME, out, quick, seed), QUICK if quick else OBJECTS
+    experiment.announce({"by information": 3} if quick else MINUTES)
+    first = experiment.uses(FIRST_QUICK if quick else FIRST, count)
+    grid = [
+        (category.replace(" ", "-"), number, "information")
+        for category in CATEGORIES
+        for number in range(first, first + count)
+    ]
+    if not quick:
+        grid += [(*one, "random") for one in several_parts(first, count)]
+    experiment.on_every_core(of_appliance, grid, "appliances")
+    found = {one: of_appliance(experiment, *one) for one in grid}
+    return experiment.result(
+        figures(found),
+        {"objects": count, "pushes": f"{EACH} for each part and {MORE}"},
+        "each appliance is drawn by its own seed; nothing is fitted to any before",
+    )
+
+
+def several_parts(first: int, count: int) -> list[tuple[str, int]]:
+    """Of each category the first few appliances that have two moving parts or more."""
+    found = []
+    for category in CATEGORIES:
+        name = category.replace(" ", "-")
+        numbers = range(first, first + count)
+        many = [number for number in numbers if len(draw_design(category, number).parts) > 1]
+        found += [(name, number) for number in many[:PAIRED]]
+    return found
+
+
+def of_appliance(experiment: Experiment, name: str, number: int, choose: str) -> dict[str, Any]:
+    """What was found of one appliance, in a stage of its own."""
+
+    def work() -> dict[str, Any]:
+        world = ApplianceWorld(name.replace("-", " "), number)
+        world.reset(number)
+        pushes = EACH * len(world.design.parts) + MORE
+        near, seconds, last = pushes + 1, [], None
+        began = time.perf_counter()
+        for step, state in enumerate(interact(world, CHOICES[choose], pushes, number)):
+            seconds.append(state.seconds)
+            last = score(state.twin, world)
+            known = last.degrees[np.isfinite(last.degrees)]
+            if len(known) == len(last.found) and (known <= NEAR).all():
+                near = min(near, step + 1)
+        assert last is not None
+        listed = {key: _plain(np.asarray(value).tolist()) for key, value in vars(last).items()}
+        whole = time.perf_counter() - began
+        return {"score": listed, "pushes_to_near": near, "seconds": seconds, "whole_s": whole}
+
+    about = {"category": name, "number": number, "choose": choose}
+    return experiment.found(f"{name}-{number}-{choose}", about, work)
+
+
+def figures(found: Mapping[tuple[str, int, str], Mapping[str, Any]]) -> list[Figure]:
+    """What counts, of all appliances, and of each category."""
+    own = {one[:2]: each for one, each in found.items() if one[2] == "information"}
+    others = {one[:2]: each for one, each in found.items() if one[2] == "random"}
+    scores = {one: read_score(each["score"]) for one, each in own.items()}
+    pooled = figures_of(list(scores.values()))
+    by_category = {
+        name: figures_of([each for one, each in scores.items() if one[0] == name])
+        for name in dict.fromkeys(one[0] for one in scores)
+    }
+    worst = {
+        key: max(
+            (one.value for each in by_category.values() for one in each
+             if one.name == key and one.value is not None),
+            default=None,
+        )
+        for key in ("axis_deg", "axis_cm")
+    }  # fmt: skip
+    seconds = np.concatenate([each["seconds"] for each in own.values()])
+    listed = [
+        *pooled,
+        Figure("axis_deg_worst_category", worst["axis_deg"], "deg", 2.0),
+        Figure("axis_cm_worst_category", worst["axis_cm"], "cm", 2.0),
+        Figure("interaction_s_p95", float(np.quantile(seconds, 0.95)), "s", 5.0),
+    ]
+    if others:
+        listed += compared(own, others)
+    for name, each in by_category.items():
+        prefix = name.replace("-", "_")
+        listed += [Figure(f"{prefix}.{one.name}", one.value, one.unit) for one in each]
+    return listed
+
+
+def compared(
+    own: Mapping[tuple[str, int], Mapping[str, Any]],
+    others: Mapping[tuple[str, int], Mapping[str, Any]],
+) -> list[Figure]:
+    """How many pushes the choice takes until every axis is near, over those taken at random.
+
+    Paired by appliance; the upper end is that of a 90 % bootstrap interval.
+    """
+    pairs = np.array(
+        [[own[one]["pushes_to_near"], others[one]["pushes_to_near"]] for one in others]
+    )
+    random = np.random.default_rng(0)
+    drawn = pairs[random.integers(len(pairs), size=(2000, len(pairs)))].sum(axis=1)
+    upper = float(np.quantile(drawn[:, 0] / drawn[:, 1], 0.95))
+    total = pairs.sum(axis=0)
+    share = ratio(float(total[0]), float(total[1]))
+    return [
+        Figure("pushes_to_2deg_over_random", share, "", 0.8),
+        Figure("pushes_to_2deg_over_random_upper", upper, "", 1.0),
+    ]
+
+
+def read_score(listed: Mapping[str, Any]) -> Score:
+    """A score from what a stage keeps of it."""
+    extra = int(listed["extra"])
+    rows = {
+        key: np.array(value, float)  # None, as JSON has NaN, becomes NaN
+        for key, value in listed.items()
+        if key != "extra"
+    }
+    return Score(**rows, extra=extra)
+
+
+def _plain(value: Any) -> Any:
+    """With None, as JSON has it, for what is not known."""
+    if isinstance(value, list):
+        return [_plain(one) for one in value]
+    return None if value != value else value

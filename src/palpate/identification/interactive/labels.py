@@ -1,0 +1,95 @@
+"""Which part each point of a look belongs to, from how well each part's motion explains it.
+
+A point that belongs to a part is, in every other look, where the part has gone: on a surface that
+was seen there, or hidden. What a camera would have to look through is no part of it.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from palpate.identification.interactive.screws import Pose
+from palpate.perception.clouds import Cloud
+
+# logarithms of how much likelier each is of a point that moves so than of another
+ON, FREE, HIDDEN = 0.9, -2.9, -0.4
+TOLERANCE = 3.0  # standard deviations of depth
+AGREES = 0.7  # cosine of the angle between the normals of what is the same surface
+NEIGHBOURS = 10
+SMOOTH = 0.45  # how much likelier neighbours on one surface are of one part (logarithm)
+ROUNDS = 40
+STANDS = 1.0  # how much likelier a point is to stand still, before anything is seen (logarithm)
+MOST_EVIDENCE = 6.0  # of all looks together: their errors are not independent
+
+Scores = Float[np.ndarray, "labels points"]
+
+
+def evidence(cloud: Cloud, points: np.ndarray, normals: np.ndarray) -> Float[np.ndarray, " n"]:
+    """How much likelier it makes these points that a look is as it is (logarithm)."""
+    on, free = cloud.surfaces(points, TOLERANCE)
+    reach = 0.02 + TOLERANCE * float(np.median(cloud.deviation))
+    distance, index = cloud.tree.query(points, distance_upper_bound=reach)
+    met = np.isfinite(distance)
+    alike = np.zeros(len(points), bool)
+    alike[met] = np.sum(cloud.normals[index[met]] * normals[met], axis=1) > AGREES
+    found = np.full(len(points), HIDDEN)
+    found[free] = FREE
+    found[on & alike] = ON
+    found[on & met & ~alike] = HIDDEN  # at an edge, or another surface: says little
+    return found
+
+
+def scores(
+    cloud: Cloud,
+    others: Sequence[Cloud],
+    motions: Sequence[Sequence[Pose]],
+    chosen: np.ndarray | slice = slice(None),
+) -> Scores:
+    """Of each label, for each of the chosen points of a look; the first is what stands still.
+
+    `motions[label][other]` is how what has the label has moved from this look to each other.
+    """
+    points, normals = cloud.points[chosen], cloud.normals[chosen]
+    found = np.zeros((len(motions), len(points)))
+    for number, other in enumerate(others):
+        known: list[tuple[Pose, np.ndarray]] = []
+        for label, motion in enumerate(motions):
+            pose = motion[number]
+            same = next((value for one, value in known if _same(one, pose)), None)
+            if same is None:
+                same = evidence(other, pose.at(points), pose.turned(normals))
+                known.append((pose, same))
+            found[label] += same
+    found = np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
+    found[0] += STANDS
+    return found
+
+
+def smoothed(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels points"]:
+    """Probabilities of the labels, with neighbours on one surface likely of one part.
+
+    Mean field of a Potts model on the graph of nearest neighbours (Krahenbuhl and Koltun 2011).
+    """
+    neighbours = cloud.tree.query(cloud.points, NEIGHBOURS + 1)[1][:, 1:]
+    alike = np.sum(cloud.normals[:, None] * cloud.normals[neighbours], axis=2)
+    apart = cloud.points[neighbours] - cloud.points[:, None]
+    step = np.sum(cloud.normals[:, None] * apart, axis=2) / (3e-3 + 2.0 * cloud.deviation[:, None])
+    weight = SMOOTH * np.clip(alike, 0.0, 1.0) ** 4 * np.exp(-0.5 * step**2)
+    chance = _softmax(given)
+    for _ in range(ROUNDS):
+        around = np.einsum("lnk,nk->ln", chance[:, neighbours], weight)
+        chance = _softmax(given + around)
+    return chance
+
+
+def _softmax(values: np.ndarray) -> np.ndarray:
+    raised = np.exp(values - values.max(axis=0))
+    return raised / raised.sum(axis=0)
+
+
+def _same(one: Pose, other: Pose) -> bool:
+    return bool(
+        np.abs(one.rotation - other.rotation).max() < 1e-6
+        and np.abs(one.origin - other.origin).max() < 1e-6
+    )

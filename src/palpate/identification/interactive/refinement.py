@@ -1,0 +1,249 @@
+"""A joint from everything that was seen of its part: Gauss-Newton over all looks at once.
+
+Points of the part in one look, moved by the joint, have to be on its surface in another (point to
+plane, with the mean of both normals: Rusinkiewicz 2019, ACM TOG 38:4), and each way of a hand on it
+on one circle or line. Far outliers have no say (Tukey's biweight).
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from palpate.identification.interactive.screws import Pose, Screw
+from palpate.perception.clouds import Cloud
+
+CREEP = 3e-3  # m by which a hand may have crept on its hold over `CREEP_TRAVEL`, as a random walk
+CREEP_TRAVEL = 0.3  # m
+HAND = 1e-3  # m, how well the hand is known to itself
+ALIKE = 0.8  # cosine of the angle between normals of the same surface
+CUTOFF = 4.685  # standard deviations: Tukey's biweight, 95 % as efficient as least squares
+PATCH = 0.08  # m: the errors of points so near each other are not independent
+MODEL_ERROR = 1e-3  # m: of surfaces that are no planes, and of their normals
+POINTS = 700  # of a pair of looks
+PAIRS = 14
+AXES = 4  # numbers of a screw
+FEWEST = 20  # points that say anything
+LEAST = 1e-3  # rad or m between two places
+ROUNDS, COARSE = 8, 3  # of Gauss-Newton, and those first ones that look further
+NEAR = 0.025, 0.05  # m beside noise, from a point to its surface: late and early
+MOMENTS = 25  # of a hand's way
+STEP = 1e-5  # of differences
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sighting:
+    """Points of a part in one look, as if what carries it had not moved since it was described."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    deviation: Float[np.ndarray, " n"]
+    tree: cKDTree
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Estimate:
+    """A joint, its position in each look, and how far to trust it.
+
+    `covariance` is of the screw's four numbers (`Screw.varied`) at its point; `misfit` is twice the
+    negative logarithm of the likelihood, `independent` how many observations it stands on.
+    """
+
+    screw: Screw
+    positions: Float[np.ndarray, " looks"]
+    covariance: Float[np.ndarray, "4 4"]
+    misfit: float
+    independent: float
+
+    @property
+    def intervals(self) -> tuple[float, float]:
+        """Half-widths of 90 % intervals, the wider of two: of the direction, deg, and place, m."""
+        wide = 1.645 * np.sqrt(np.diag(self.covariance))
+        return float(np.degrees(wide[:2].max())), float(wide[2:].max())
+
+
+def sighting(cloud: Cloud, chosen: Int[np.ndarray, " n"], back: Pose) -> Sighting:
+    """Points of a look, moved `back` to where their carrier was when it was described."""
+    moved = back.at(cloud.points[chosen])
+    normals = back.turned(cloud.normals[chosen])
+    return Sighting(moved, normals, cloud.deviation[chosen], cKDTree(moved))
+
+
+def refine(
+    screw: Screw,
+    positions: Float[np.ndarray, " looks"],
+    seen: Sequence[Sighting | None],
+    ways: Sequence[Float[np.ndarray, "times 3"]],
+) -> Estimate:
+    """The joint that explains what was seen of its part, from a first guess.
+
+    Looks in which a part was not seen have None, and keep their position. The position in the first
+    look with the part stays as it is: it says where the joint's zero is.
+    """
+    pairs = _pairs(positions, seen)
+    used = sorted({look for pair in pairs for look in pair})
+    random = np.random.default_rng(0)
+    chosen = {look: _subset(seen[look], random) for look in used}
+    column = {look: AXES + number for number, look in enumerate(used[1:])}
+    middle = np.mean([way.mean(axis=0) for way in ways], axis=0) if ways else screw.point
+    screw, positions = screw.near(middle), np.array(positions, float)
+    unknown = AXES + len(column)
+    # what nothing says anything of stays as it is; where a slide's axis is, nothing can say
+    prior = np.full(unknown, 1e-2)
+    prior[:2], prior[2:AXES] = 1.0, 1.0 if screw.joint == "revolute" else 1e6
+    sums = _Sums(unknown)
+    for number in range(ROUNDS):
+        sums = _Sums(unknown)
+        for pair in pairs:
+            _add_pair(sums, screw, positions, pair, seen, chosen, column, NEAR[number < COARSE])
+        for way in ways:
+            _add_way(sums, screw, way)
+        change = -np.linalg.solve(sums.information + np.diag(prior), sums.slope)
+        change[:2] = np.clip(change[:2], -0.3, 0.3)
+        change[2:AXES] = np.clip(change[2:AXES], -0.2, 0.2)
+        screw = screw.varied(change[:AXES]).near(middle)
+        for look, place in column.items():
+            positions[look] += np.clip(change[place], -0.3, 0.3)
+        if number > COARSE and np.abs(change[:AXES]).max() < 1e-5:
+            break
+    inverse = np.linalg.inv(sums.information + np.diag(prior))
+    covariance = inverse @ (sums.scatter + np.diag(prior)) @ inverse
+    return Estimate(screw, positions, covariance[:AXES, :AXES], sums.misfit, sums.independent)
+
+
+class _Sums:
+    """The normal equations, the scatter of patches that errors are estimated from, the misfit."""
+
+    def __init__(self, unknown: int) -> None:
+        self.information, self.scatter = np.zeros((2, unknown, unknown))
+        self.slope = np.zeros(unknown)
+        self.misfit = self.independent = 0.0
+
+    def add(self, rows: np.ndarray, standard: np.ndarray, weight: np.ndarray) -> None:
+        """Rows of slopes and residuals, whitened, with the weights of robust least squares."""
+        weighted = weight[:, None] * rows
+        self.information += rows.T @ weighted
+        self.slope += weighted.T @ standard
+
+
+def _add_pair(
+    sums: _Sums,
+    screw: Screw,
+    positions: Float[np.ndarray, " looks"],
+    pair: tuple[int, int],
+    seen: Sequence[Sighting | None],
+    chosen: dict[int, np.ndarray],
+    column: dict[int, int],
+    near: float,
+) -> None:
+    """Points of one look against the surface in another."""
+    first, second = pair
+    one, other, own = seen[first], seen[second], chosen[first]
+    assert one is not None  # by `_pairs`
+    assert other is not None
+    turn = positions[second] - positions[first]
+    pose = screw.pose(turn)
+    source, turned = pose.at(one.points[own]), pose.turned(one.normals[own])
+    reach = near + 3.0 * float(np.median(other.deviation))
+    distance, index = other.tree.query(source, distance_upper_bound=reach)
+    met = np.isfinite(distance)
+    index = np.where(met, index, 0)
+    met &= np.sum(other.normals[index] * turned, axis=1) > ALIKE
+    lost = CUTOFF**2 / 3.0  # of a point that meets nothing
+    if met.sum() < FEWEST:
+        patches = _patches(source)
+        sums.misfit += lost * (patches.max() + 1)
+        return
+    missing = int((~met).sum())
+    start, source, index = one.points[own][met], source[met], index[met]
+    normal = turned[met] + other.normals[index]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    deviation = one.deviation[own][met] ** 2 + other.deviation[index] ** 2 + MODEL_ERROR**2
+    scale = np.sqrt(deviation)
+    standard = np.sum(normal * (source - other.points[index]), axis=1) / scale
+    rows = np.zeros((len(source), len(sums.slope)))
+    for axis in range(AXES):
+        varied = screw.varied(STEP * np.eye(AXES)[axis])
+        rows[:, axis] = np.sum(normal * (varied.pose(turn).at(start) - source), axis=1) / STEP
+    velocity = screw.axis
+    if screw.joint == "revolute":
+        velocity = np.cross(screw.axis, source - screw.point)
+    along = np.sum(normal * velocity, axis=1)
+    for look, sign in ((second, 1.0), (first, -1.0)):
+        if look in column:
+            rows[:, column[look]] = sign * along
+    rows /= scale[:, None]
+    weight = np.clip(1.0 - (standard / CUTOFF) ** 2, 0.0, None) ** 2
+    sums.add(rows, standard, weight)
+    patches = _patches(source)
+    by_patch = np.zeros((patches.max() + 1, len(sums.slope)))
+    np.add.at(by_patch, patches, (weight * standard)[:, None] * rows)
+    sums.scatter += by_patch.T @ by_patch
+    share = len(by_patch) / len(source)
+    sums.misfit += share * (float(np.sum(_biweight(standard))) + lost * missing)
+    sums.independent += len(by_patch)
+
+
+def _add_way(sums: _Sums, screw: Screw, way: Float[np.ndarray, "times 3"]) -> None:
+    """The way of a hand, whose errors are whitened: there the information is the scatter."""
+    slopes, standard = _whitened(screw, way)
+    rows = np.zeros((len(standard), len(sums.slope)))
+    rows[:, :AXES] = slopes
+    sums.add(rows, standard, np.ones(len(standard)))
+    sums.scatter += rows.T @ rows
+    sums.misfit += float(standard @ standard)
+    sums.independent += len(standard)
+
+
+def _whitened(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes and residuals of a hand's way: a random walk, white noise, an offset not known."""
+    way = way[np.unique(np.linspace(0, len(way) - 1, MOMENTS).astype(int))]
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    walk = CREEP**2 / CREEP_TRAVEL * np.minimum.outer(gone, gone)
+    root = np.linalg.cholesky(walk + HAND**2 * np.eye(len(way)) + 1.0)
+    base = screw.strays(way)
+    varied = [screw.varied(STEP * one).strays(way) - base for one in np.eye(AXES)]
+    white = np.linalg.solve(root, np.concatenate([base, *varied], axis=1))
+    standard, *slopes = np.split(white, AXES + 1, axis=1)
+    return np.stack([one.T.ravel() / STEP for one in slopes], axis=1), standard.T.ravel()
+
+
+def way_information(screw: Screw, way: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "4 4"]:
+    """What one more way of a hand would say of a joint's four numbers (Fisher information)."""
+    rows, _ = _whitened(screw, way)
+    return rows.T @ rows
+
+
+def _pairs(
+    positions: Float[np.ndarray, " looks"], seen: Sequence[Sighting | None]
+) -> list[tuple[int, int]]:
+    """Looks to compare: neighbours among those in which the part is at different places."""
+    known = [look for look, one in enumerate(seen) if one is not None and len(one.points) >= FEWEST]
+    distinct: list[int] = []
+    for look in sorted(known, key=lambda look: positions[look]):
+        if not distinct or positions[look] - positions[distinct[-1]] > LEAST:
+            distinct.append(look)
+    found = [*itertools.pairwise(distinct), *zip(distinct, distinct[2:], strict=False)]
+    if len(distinct) > 3:
+        found.append((distinct[0], distinct[-1]))
+    return found[:PAIRS]
+
+
+def _subset(seen: Sighting | None, random: np.random.Generator) -> Int[np.ndarray, " n"]:
+    assert seen is not None
+    count = len(seen.points)
+    return np.sort(random.choice(count, min(count, POINTS), replace=False))
+
+
+def _patches(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """The patch that each point is in."""
+    cells = np.floor(points / PATCH).astype(int)
+    return np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+
+
+def _biweight(standard: np.ndarray) -> np.ndarray:
+    """Twice the loss of Tukey's biweight: squares near zero, and constant far away."""
+    return CUTOFF**2 / 3.0 * (1.0 - np.clip(1.0 - (standard / CUTOFF) ** 2, 0.0, None) ** 3)

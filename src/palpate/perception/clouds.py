@@ -1,0 +1,161 @@
+"""Depth images as one cloud of points with normals, and what can be said of points that are not it.
+
+A look is one or more depth images of one moment. Its cloud has a point for each cell of a grid in
+space, the mean of the pixels in it, which is less noisy than they are. Whether a point of space is
+on a surface, in front of one (free) or behind (hidden) is looked up in the images.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial import cKDTree
+
+from palpate.errors import PalpateError
+from palpate.numerics.pinhole import DepthImage
+
+CELL = 0.012  # m, of the grid
+EDGE = 0.03  # of the depth, between neighbouring pixels: they are on two sides of an edge
+MOST = 20_000  # points of a cloud, about: more say little more and take longer
+FEWEST = 200  # points of which anything can be said
+FLOOR = 0.04  # m: what is no higher above it is the floor
+NEIGHBOURS = 24  # that give a normal
+NOISE = 1.2e-3, 1.9e-3  # m: at 0.4 m, and its growth with the square of what is further
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points of one look: `normals` are unit vectors towards the camera that saw them.
+
+    `deviation` (m) is how far they are from their surface as a rule, along the normal, and `source`
+    the image, row and column of a pixel in each.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    normals: Float[np.ndarray, "points 3"]
+    deviation: Float[np.ndarray, " points"]
+    source: Int[np.ndarray, "points 3"]
+    images: Sequence[DepthImage]
+    nearest: Sequence[Float[np.ndarray, "height width"]]  # depth in each pixel's neighbourhood
+    furthest: Sequence[Float[np.ndarray, "height width"]]
+    tree: cKDTree
+
+    def surfaces(
+        self, points: Float[np.ndarray, "n 3"], tolerance: float
+    ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Whether each point is on a surface that was seen, and whether it is in the open.
+
+        In the open is what some camera looks through at what is behind it. Neither: hidden, or
+        where no camera looks. `tolerance` is in standard deviations of depth.
+        """
+        on, free = np.zeros(len(points), bool), np.zeros(len(points), bool)
+        for image, near, far in zip(self.images, self.nearest, self.furthest, strict=True):
+            pixels, depth = image.pinhole.project(points)
+            inside = depth > 0.05
+            pixels = np.where(inside[:, None], pixels, -1.0)
+            column, row = np.rint(pixels).astype(int).T
+            inside &= (column >= 0) & (row >= 0)
+            inside &= (column < image.pinhole.width) & (row < image.pinhole.height)
+            column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+            least, most = near[row, column], far[row, column]
+            room = tolerance * noise_at(depth)
+            on |= inside & (depth > least - room) & (depth < most + room)
+            free |= inside & (depth < least - room)
+        return on & ~free, free
+
+
+def noise_at(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Standard deviation (m) of a depth (m) as depth cameras have it, Nguyen et al. 2012, eq. 4."""
+    return np.asarray(NOISE[0] + NOISE[1] * np.maximum(depth - 0.4, 0.0) ** 2)
+
+
+def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
+    """The cloud of depth images of one moment.
+
+    Raises `PalpateError` where too little was seen.
+    """
+    seen, depths, source = [], [], []
+    nearest, furthest = [], []
+    for number, image in enumerate(images):
+        depth = np.where(image.depth > 0.0, image.depth, np.nan)
+        near = minimum_filter(np.where(np.isfinite(depth), depth, np.inf), 3)
+        far = maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
+        row, column = np.nonzero(np.isfinite(depth) & (far - near < EDGE * near))
+        pixels = np.stack([column, row], axis=1)
+        seen.append(image.pinhole.back_project(pixels, depth[row, column]))
+        depths.append(depth[row, column])
+        source.append(np.stack([np.full(len(row), number), row, column], axis=1))
+        # where nothing was seen, nothing is said
+        nearest.append(np.where(np.isfinite(depth), near, -np.inf))
+        furthest.append(np.where(np.isfinite(depth), far, -np.inf))
+    points, depth = np.concatenate(seen), np.concatenate(depths)
+    if len(points) < FEWEST:
+        raise PalpateError(
+            f"the depth images show {len(points)} points on surfaces: expected {FEWEST} or more, "
+            "with depths in m"
+        )
+    above = points[:, 2] > _floor(points) + FLOOR + 2.0 * noise_at(depth)
+    points, depth, source = points[above], depth[above], np.concatenate(source)[above]
+    # noisier points in larger cells, so that a normal is as good far away as it is near by
+    size = max(cell, 1.5 * float(np.median(noise_at(depth))))
+    members, means = _cells(points, size)
+    if len(means) > MOST:
+        members, means = _cells(points, size * np.sqrt(len(means) / MOST))
+    points = means
+    first = np.unique(members, return_index=True)[1]
+    count = np.bincount(members)
+    deviation = np.bincount(members, noise_at(depth)) / count
+    tree = cKDTree(points)
+    centres = np.array([image.pinhole.position for image in images])
+    sources = source[first]
+    normals, kept = _normals(points, tree, centres[sources[:, 0]])
+    points, normals, sources = points[kept], normals[kept], sources[kept]
+    deviation = deviation[kept] / np.sqrt(np.minimum(count[kept], 9))
+    return Cloud(
+        points, normals, deviation, sources, list(images), nearest, furthest, cKDTree(points)
+    )
+
+
+def _floor(points: Float[np.ndarray, "n 3"]) -> float:
+    """The height (m) of the lowest level at which much is seen, below everything if there is none.
+
+    A level is `FLOOR` thick, and much is a tenth of all points.
+    """
+    level = np.floor(points[:, 2] / FLOOR).astype(int)
+    lowest = level.min()
+    many = np.flatnonzero(np.bincount(level - lowest) > 0.1 * len(points))
+    return float(lowest + many[0] + 0.5) * FLOOR if len(many) else -np.inf
+
+
+def _cells(
+    points: Float[np.ndarray, "n 3"], size: float
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "cells 3"]]:
+    """The cell of a grid that each point is in, and the mean of the points in each cell."""
+    place = np.floor((points - points.min(0)) / size).astype(np.int64)
+    extent = place.max(0) + 1
+    flat = (place[:, 0] * extent[1] + place[:, 1]) * extent[2] + place[:, 2]
+    _, members = np.unique(flat, return_inverse=True)
+    count = np.bincount(members)
+    means = np.stack([np.bincount(members, points[:, axis]) / count for axis in range(3)], axis=1)
+    return members, means
+
+
+def _normals(
+    points: Float[np.ndarray, "n 3"], tree: cKDTree, viewpoints: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Of the plane through each point's neighbours, towards its camera; and which have one.
+
+    A point without a plane floats in the air, as pixels on edges do.
+    """
+    distance, neighbours = tree.query(points, min(NEIGHBOURS, len(points)))
+    around = points[neighbours] - points[neighbours].mean(axis=1, keepdims=True)
+    spread = np.einsum("nki,nkj->nij", around, around) / neighbours.shape[1]
+    values, vectors = np.linalg.eigh(spread)
+    normals = vectors[:, :, 0]
+    toward = np.sum(normals * (viewpoints - points), axis=1)
+    normals = normals * np.where(toward < 0.0, -1.0, 1.0)[:, None]
+    reach = distance[:, -1]
+    flat = values[:, 0] < 0.35 * values[:, 1]
+    return normals, flat & (reach < 4.0 * np.median(reach))

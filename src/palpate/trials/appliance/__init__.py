@@ -1,0 +1,1 @@
+"""Appliances that are handled, and what is believed of them meanwhile."""

@@ -1,0 +1,34 @@
+"""An agent that handles an appliance until it knows its joints."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from palpate.identification.interactive.twin import Twin
+from palpate.learning.active import Choice
+from palpate.perception.clouds import cloud_of
+from palpate.trials.appliance.hand import handle
+from palpate.worlds.appliance.appliance import ApplianceWorld
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """After a push: the twin, and how long it took to re-estimate it (s)."""
+
+    twin: Twin
+    seconds: float
+
+
+def interact(world: ApplianceWorld, choose: Choice, pushes: int, seed: int) -> Iterator[Step]:
+    """Look, choose a push and do it, explain what happened; again and again."""
+    random = np.random.default_rng([seed, 7])
+    twin = Twin()
+    twin.look(cloud_of(world.look()))
+    for _ in range(pushes):
+        handling = handle(world, choose(twin, random), twin.looks[-1])
+        began = time.perf_counter()
+        twin.observe(handling)
+        twin.look(cloud_of(world.look()))
+        yield Step(twin, time.perf_counter() - began)

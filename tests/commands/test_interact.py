@@ -1,0 +1,36 @@
+"""`palpate interact`: what it says, what it leaves, and what it refuses."""
+
+import json
+
+from palpate.cli import main
+from palpate.models.articulated.assembly import assembled
+from palpate.models.articulated.urdf import read_urdf
+from palpate.worlds.descriptions import refusal
+
+
+def test_a_microwave_is_handled_and_its_twin_is_taken_by_mujoco(tmp_path, capsys):
+    out = tmp_path / "twin"
+    assert main(["interact", "microwave", "--seed", "3", "--pushes", "3", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.count("push ") == 3
+    assert "part 1: " in said
+    assert "degrees" in said
+    for file in ("twin.urdf", "twin.xml"):
+        assert refusal(out / file) == ""
+    assert len(assembled(read_urdf(out / "twin.urdf")).links) >= 1
+    assert (out / "twin.png").stat().st_size > 10_000
+    figures = {one["name"] for one in json.loads((out / "result.json").read_text())["figures"]}
+    assert {"recall", "axis_deg", "miou"} <= figures
+    # finished, it is only read
+    assert main(["interact", "microwave", "--seed", "3", "--pushes", "3", "--out", str(out)]) == 0
+    assert "push " not in capsys.readouterr().out
+
+
+def test_what_cannot_be_is_refused(tmp_path, capsys):
+    for words, sentence in (
+        (["microwve"], "unknown category 'microwve'; did you mean 'microwave'?"),
+        (["oven", "--pushes", "0"], "--pushes is 1 or greater, not 0"),
+        (["oven", "--views", "9"], "1 to 4 cameras, not 9"),
+    ):
+        assert main(["interact", *words, "--out", str(tmp_path / "twin")]) == 2
+        assert sentence in capsys.readouterr().err

@@ -1,0 +1,52 @@
+"""The figures of `twin-interactive` from what its stages keep."""
+
+import numpy as np
+import pytest
+
+from palpate.experiments.appliance.twin_interactive import figures, several_parts
+from palpate.worlds.appliance.categories import CATEGORIES, draw_design
+
+
+def kept(found, degrees, centimetres, near, extra=0):
+    """What a stage keeps of an appliance, as JSON has it: None for what is not known."""
+    score = {
+        "found": found,
+        "type_right": [1.0 if one else None for one in found],
+        "degrees": degrees,
+        "centimetres": centimetres,
+        "iou": [0.9 if one else None for one in found],
+        "parent_right": [1.0 if one else None for one in found],
+        "inside": [[1.0, 0.5] if one else [None, None] for one in found],
+        "extra": extra,
+    }
+    return {"score": score, "pushes_to_near": near, "seconds": [1.0, 2.0]}
+
+
+FOUND = {
+    ("box", 1, "information"): kept([1.0], [0.5], [0.2], 2),
+    ("oven", 1, "information"): kept([1.0, 0.0], [1.5, None], [None, None], 4, extra=1),
+    ("oven", 1, "random"): kept([1.0, 1.0], [1.5, 0.1], [None, 0.3], 8),
+}
+
+
+def test_parts_are_pooled_and_categories_stand_by_themselves():
+    values = {figure.name: figure.value for figure in figures(FOUND)}
+    assert values["recall"] == pytest.approx(2 / 3)
+    assert values["precision"] == pytest.approx(2 / 3)
+    assert values["axis_deg"] == pytest.approx(1.0)
+    assert values["axis_cm"] == pytest.approx(0.2)
+    assert values["axis_deg_worst_category"] == 1.5
+    assert values["axis_cm_worst_category"] == pytest.approx(0.2)
+    assert values["tree_accuracy"] == 0.5
+    assert values["axis_coverage_90"] == 0.75
+    assert values["oven.recall"] == 0.5
+    assert values["pushes_to_2deg_over_random"] == 0.5
+    assert 1.0 < values["interaction_s_p95"] <= 2.0
+
+
+def test_only_appliances_with_several_parts_are_handled_at_random_too():
+    chosen = several_parts(0, 10)
+    assert all(len(draw_design(name.replace("-", " "), seed).parts) > 1 for name, seed in chosen)
+    count = [sum(name == one.replace(" ", "-") for name, _ in chosen) for one in CATEGORIES]
+    assert np.max(count) <= 5
+    assert np.min(count) >= 1

@@ -1,0 +1,72 @@
+"""Clouds of depth images of scenes whose surfaces are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.numerics.pinhole import DepthImage, Pinhole
+from palpate.perception.clouds import cloud_of, noise_at
+
+CAMERA = Pinhole.looking_at((0.0, 0.0, 1.0), (0.0, -1.5, 1.0), 160, 120, math.radians(60))
+
+
+def wall(offset: float = 0.0, slope: float = 0.0, noise: float = 0.0, seed: int = 0) -> DepthImage:
+    """A wall at y = offset + slope x, with a hole in the picture."""
+    columns, rows = np.meshgrid(np.arange(160), np.arange(120))
+    rays = CAMERA.directions(np.stack([columns, rows], axis=-1))
+    depth = (1.5 + offset) / (rays[..., 1] - slope * rays[..., 0])
+    random = np.random.default_rng(seed)
+    depth = depth + noise * noise_at(depth) * random.standard_normal(depth.shape)
+    depth[:10, :10] = np.nan
+    return DepthImage(0.0, CAMERA, depth)
+
+
+def test_points_are_on_the_surface_and_normals_towards_the_camera():
+    cloud = cloud_of([wall(slope=0.3)])
+    x, y, _ = cloud.points.T
+    assert np.abs(y - 0.3 * x).max() < 5e-3
+    expected = np.array([0.3, -1.0, 0.0]) / math.hypot(0.3, 1.0)
+    assert (cloud.normals @ expected > 0.999).mean() > 0.95
+
+
+def test_points_are_as_noisy_as_they_say():
+    cloud = cloud_of([wall(noise=1.0)])
+    inner = np.abs(cloud.points[:, 0]) < 0.5
+    seen = np.std(cloud.points[inner, 1])
+    assert 0.7 < seen / np.median(cloud.deviation[inner]) < 1.4
+
+
+def test_what_is_before_a_surface_is_free_and_what_is_behind_is_hidden():
+    cloud = cloud_of([wall()])
+    points = np.array([[0.0, 0.0, 1.0], [0.0, -0.2, 1.0], [0.0, 0.2, 1.0], [5.0, 0.0, 1.0]])
+    on, free = cloud.surfaces(points, 3.0)
+    assert on.tolist() == [True, False, False, False]
+    assert free.tolist() == [False, True, False, False]
+
+
+def test_nothing_is_said_of_what_no_camera_sees():
+    cloud = cloud_of([wall()])
+    corner = CAMERA.back_project(np.array([[3, 3]]), np.array([1.0]))  # where the picture has none
+    behind = np.array([[0.0, -2.0, 1.0]])
+    for points in (corner, behind):
+        on, free = cloud.surfaces(points, 3.0)
+        assert not on.any()
+        assert not free.any()
+
+
+def test_two_cameras_see_more_than_one():
+    other = Pinhole.looking_at((0.0, 0.0, 1.0), (1.0, -1.5, 1.2), 160, 120, math.radians(60))
+    columns, rows = np.meshgrid(np.arange(160), np.arange(120))
+    rays = other.directions(np.stack([columns, rows], axis=-1))
+    second = DepthImage(0.0, other, 1.5 / rays[..., 1])
+    one, both = cloud_of([wall()]), cloud_of([wall(), second])
+    assert np.ptp(both.points[:, 0]) > np.ptp(one.points[:, 0]) + 0.2
+    assert set(both.source[:, 0]) == {0, 1}
+
+
+@pytest.mark.parametrize("fill", [np.nan, 0.0, -1.0])
+def test_an_image_that_shows_nothing_is_refused(fill):
+    with pytest.raises(PalpateError, match="show 0 points on surfaces: expected 200 or more"):
+        cloud_of([DepthImage(0.0, CAMERA, np.full((120, 160), fill))])

@@ -95,9 +95,8 @@ class Camera:
     def _measured(self, depth: np.ndarray, random: np.random.Generator) -> np.ndarray:
         chosen = random.integers(len(depth), size=depth.shape[1:])
         seen = np.take_along_axis(depth, chosen[None], axis=0)[0]
-        deviation = 1.2e-3 + 1.9e-3 * np.maximum(seen - 0.4, 0) ** 2
         noise = self.sensor.depth_noise * random.standard_normal(seen.shape)
-        seen = seen + np.where(np.isfinite(seen), deviation * noise, 0.0)
+        seen = seen + np.where(np.isfinite(seen), depth_deviation(seen) * noise, 0.0)
         edge = ~(depth.max(0) - depth.min(0) < 0.1)
         lost = edge & (random.uniform(size=seen.shape) < self.sensor.edge_loss)
         return np.where(np.isfinite(seen) & ~lost, seen, np.nan).astype(np.float32)
@@ -142,6 +141,11 @@ class Camera:
             surface = still.model.geom_rgba[geoms[hit], :3] * (1 - 0.12 * squares[:, None])
             colour[hit], depth[hit] = _lit(surface, normals[hit]), distance[hit]
         return colour.reshape(rays.shape), depth.reshape(rays.shape[:2])
+
+
+def depth_deviation(depth: np.ndarray) -> np.ndarray:
+    """Standard deviation (m) of a depth (m), as `Sensor` says."""
+    return 1.2e-3 + 1.9e-3 * np.maximum(depth - 0.4, 0.0) ** 2
 
 
 class _Still:

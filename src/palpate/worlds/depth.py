@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from palpate.numerics.pinhole import DepthImage, Pinhole
-from palpate.worlds.camera import cast
+from palpate.worlds.camera import cast, depth_deviation
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def measured(
     flies = edge & (chance < sensor.flying) & (far < sensor.farthest)
     seen = np.where(flies, near + share * (far - near), depth)
     steep = np.clip(np.arccos(np.clip(cosine, 0.0, 1.0)), 0.0, sensor.steepest)
-    deviation = 1.2e-3 + 1.9e-3 * np.maximum(seen - 0.4, 0.0) ** 2
+    deviation = depth_deviation(seen)
     # the same paper's lateral term: a steep surface is noisier, sharply so near the end
     deviation *= 1.0 + 0.1 * steep**2 / (0.5 * np.pi - np.minimum(steep, 1.5)) ** 2
     seen = seen + sensor.noise * deviation * random.standard_normal(depth.shape)

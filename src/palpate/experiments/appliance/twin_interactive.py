@@ -25,7 +25,7 @@ FIRST, FIRST_QUICK = 510_000, 490_000  # seed of the first appliance
 OBJECTS, PAIRED, QUICK = 20, 5, 1  # of each category
 EACH, MORE = 3, 3  # pushes for each moving part, and in all
 NEAR = 2.0  # degrees that every axis is known to
-MINUTES = {"by information": 60, "at random": 20}
+MINUTES = {"by information": 30, "at random": 10}
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
@@ -34,7 +34,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     Raises `PalpateError` when `out` holds other runs.
     """
     experiment, count = Experiment(NAME, out, quick, seed), QUICK if quick else OBJECTS
-    experiment.announce({"by information": 3} if quick else MINUTES)
+    experiment.announce({"by information": 1} if quick else MINUTES)
     first = experiment.uses(FIRST_QUICK if quick else FIRST, count)
     grid = [
         (category.replace(" ", "-"), number, "information")

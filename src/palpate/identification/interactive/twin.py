@@ -2,7 +2,7 @@
 
 What moves together is a part, and how it moves is its joint. Handling after handling is explained:
 by the joints that are known, or by a part that is new, which is split off what stood still or off a
-part that carries it. A part that explains nothing vanishes.
+part that carries it.
 """
 
 import dataclasses

@@ -14,7 +14,7 @@ from palpate.identification.interactive.labels import evidence, smoothed
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.twin import Twin
-from palpate.learning.active import at_random, most_informative, surfaces
+from palpate.learning.active import at_random, most_informative
 from palpate.models.articulated.assembly import assembled
 from palpate.models.articulated.urdf import read_urdf, write_urdf
 from palpate.perception.clouds import Cloud, cloud_of
@@ -91,6 +91,50 @@ def test_the_order_of_points_does_not_matter(handled):
     assert gap < 0.2
 
 
+def test_a_part_that_is_pushed_back_is_the_same_one(handled):
+    _, twin, handling, _ = handled
+    twin = _copy(twin)
+    twin.observe(handling)
+    back = dataclasses.replace(
+        handling,
+        before=handling.after,
+        after=_shuffled(handling.before, 1),
+        points=handling.points[::-1],
+        push=dataclasses.replace(handling.push, point=handling.points[-1]),
+    )
+    twin.observe(back)
+    assert len(twin.parts) == 1
+    assert len(twin.parts[0].ways) == 2
+    assert [part for part, _ in twin.held] == [0, 0]
+    positions = twin.parts[0].positions
+    assert positions[2] == pytest.approx(positions[0], abs=0.03)
+    assert abs(positions[1] - positions[0]) > 0.3
+
+
+def test_a_part_that_explains_nothing_is_not_kept(handled):
+    _, twin, handling, _ = handled
+    twin = _copy(twin)
+    away = dataclasses.replace(handling, points=handling.points + np.array([0.0, 0.0, 3.0]))
+    # the hand went its way above the appliance, where nothing was seen to move
+    twin.observe(dataclasses.replace(away, after=_shuffled(handling.before, 2)))
+    assert not twin.parts
+    assert twin.held == [(-1, 0)]
+
+
+def test_a_part_that_goes_leaves_the_others_as_they_are(handled):
+    _, twin, handling, _ = handled
+    twin = _copy(twin)
+    twin.observe(handling)
+    part = twin.parts[0]
+    twin.parts += [dataclasses.replace(part, parent=0), dataclasses.replace(part, parent=1)]
+    twin.labels = [np.array([-1, 0, 1, 2])]
+    twin.held = [(2, 0), (1, 0)]
+    twin._remove(1, 0)
+    assert [one.parent for one in twin.parts] == [-1, 0]
+    assert twin.labels[0].tolist() == [-1, 0, 0, 1]
+    assert twin.held == [(1, 0), (0, 0)]
+
+
 def test_nothing_moved_adds_nothing(handled):
     _, twin, handling, _ = handled
     twin = _copy(twin)
@@ -145,17 +189,6 @@ def test_a_refined_joint_is_nearer_than_its_first_guess(handled):
     assert angle < 1.5 < math.degrees(math.hypot(0.05, 0.04))
     assert gap < 1.0
     assert np.all(np.linalg.eigvalsh(found.covariance) > 0.0)
-
-
-def test_flat_surfaces_are_flat_and_face_what_saw_them(handled):
-    cloud = handled[2].before
-    found = surfaces(cloud, np.full(len(cloud.points), -1), np.random.default_rng(0))
-    assert len(found) >= 3
-    for surface in found:
-        away = (cloud.points[surface.members] - surface.centre) @ surface.normal
-        assert np.sqrt(np.mean(away**2)) < 0.012
-    members = np.concatenate([surface.members for surface in found])
-    assert len(np.unique(members)) == len(members)
 
 
 def test_every_choice_points_at_something_that_was_seen(handled):

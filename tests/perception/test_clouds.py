@@ -68,5 +68,14 @@ def test_two_cameras_see_more_than_one():
 
 @pytest.mark.parametrize("fill", [np.nan, 0.0, -1.0])
 def test_an_image_that_shows_nothing_is_refused(fill):
-    with pytest.raises(PalpateError, match="show 0 points on surfaces: expected 200 or more"):
+    with pytest.raises(PalpateError, match=r"show 0 points on surfaces, .*: expected 200 or more"):
         cloud_of([DepthImage(0.0, CAMERA, np.full((120, 160), fill))])
+
+
+def test_a_floor_alone_is_refused():
+    camera = Pinhole.looking_at((0.0, 0.4, 0.0), (0.0, 0.0, 1.5), 160, 120, math.radians(40))
+    columns, rows = np.meshgrid(np.arange(160), np.arange(120))
+    rays = camera.directions(np.stack([columns, rows], axis=-1))
+    depth = -1.5 / rays[..., 2]
+    with pytest.raises(PalpateError, match="of which 0 are above the floor"):
+        cloud_of([DepthImage(0.0, camera, depth)])

@@ -91,12 +91,12 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
         nearest.append(np.where(np.isfinite(depth), near, -np.inf))
         furthest.append(np.where(np.isfinite(depth), far, -np.inf))
     points, depth = np.concatenate(seen), np.concatenate(depths)
-    if len(points) < FEWEST:
-        raise PalpateError(
-            f"the depth images show {len(points)} points on surfaces: expected {FEWEST} or more, "
-            "with depths in m"
-        )
     above = points[:, 2] > _floor(points) + FLOOR + 2.0 * noise_at(depth)
+    if above.sum() < FEWEST:
+        raise PalpateError(
+            f"the depth images show {len(points)} points on surfaces, of which {above.sum()} are "
+            f"above the floor: expected {FEWEST} or more, with depths in m and z upwards"
+        )
     points, depth, source = points[above], depth[above], np.concatenate(source)[above]
     # noisier points in larger cells, so that a normal is as good far away as it is near by
     size = max(cell, 1.5 * float(np.median(noise_at(depth))))
@@ -123,6 +123,8 @@ def _floor(points: Float[np.ndarray, "n 3"]) -> float:
 
     A level is `FLOOR` thick, and much is a tenth of all points.
     """
+    if not len(points):
+        return -np.inf
     level = np.floor(points[:, 2] / FLOOR).astype(int)
     lowest = level.min()
     many = np.flatnonzero(np.bincount(level - lowest) > 0.1 * len(points))

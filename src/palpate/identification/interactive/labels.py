@@ -22,6 +22,10 @@ ROUNDS = 40
 STANDS = 1.0  # how much likelier a point is to stand still, before anything is seen (logarithm)
 MOST_EVIDENCE = 6.0  # of all looks together: their errors are not independent
 
+OTHERS = 6  # looks that a look is held against
+LEAST_MOTION = 0.02  # rad or m: less is none
+TELLING = 0.3  # rad or m of a part: to be further away tells no more
+
 Scores = Float[np.ndarray, "labels points"]
 
 
@@ -64,6 +68,30 @@ def scores(
     found = np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
     found[0] += STANDS
     return found
+
+
+def telling(places: Float[np.ndarray, "parts looks"], look: int) -> list[int]:
+    """The looks that tell labels from each other: where one has moved and the other has not.
+
+    `places` are positions of joints, rad or m. What has moved may have shown another side: then
+    only a look in which the others would have had to be seen says that it is none of them.
+    """
+    count = places.shape[1]
+    moved = np.minimum(np.abs(places - places[:, look, None]), TELLING)
+    moved = np.concatenate([np.zeros((1, count)), moved])  # what stands still
+    # of each pair of labels, how far the first moves where the second stands still, or moves
+    alone = moved[:, None] * (moved[None] < LEAST_MOTION)
+    value = np.concatenate([alone, 0.5 * np.minimum(moved[:, None], moved[None])])
+    covered, chosen = np.zeros(value.shape[:2]), []
+    while len(chosen) < OTHERS:
+        gain = np.maximum(value - covered[..., None], 0.0).sum((0, 1))
+        gain[[look, *chosen]] = -1.0
+        best = int(np.argmax(gain))
+        if gain[best] < LEAST_MOTION:
+            break
+        chosen.append(best)
+        covered = np.maximum(covered, value[..., best])
+    return chosen or [other for other in range(count) if other != look][-1:]
 
 
 def smoothed(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels points"]:

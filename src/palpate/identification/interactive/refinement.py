@@ -7,6 +7,7 @@ on one circle or line. Far outliers have no say (Tukey's biweight).
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,6 +27,9 @@ MODEL_ERROR = 1e-3  # m: of surfaces that are no planes, and of their normals
 POINTS = 700  # of a pair of looks
 PAIRS = 14
 AXES = 4  # numbers of a screw
+# What errors of labels add, as factors of standard deviations of directions and places: such that
+# 90 % intervals held the truth of appliances of seeds 600000 to 600019.
+INFLATION = 2.5, 2.5, 5.0, 5.0
 FEWEST = 20  # points that say anything
 LEAST = 1e-3  # rad or m between two places
 ROUNDS, COARSE = 8, 3  # of Gauss-Newton, and those first ones that look further
@@ -49,7 +53,8 @@ class Estimate:
     """A joint, its position in each look, and how far to trust it.
 
     `covariance` is of the screw's four numbers (`Screw.varied`) at its point; `misfit` is twice the
-    negative logarithm of the likelihood, `independent` how many observations it stands on.
+    negative logarithm of the likelihood, less that of points which meet nothing, and `independent`
+    how many observations it stands on.
     """
 
     screw: Screw
@@ -57,6 +62,12 @@ class Estimate:
     covariance: Float[np.ndarray, "4 4"]
     misfit: float
     independent: float
+
+    @property
+    def criterion(self) -> float:
+        """Of Bayesian information, less what is the same for both kinds of joint."""
+        numbers = 4.0 if self.screw.joint == "revolute" else 2.0
+        return self.misfit + numbers * math.log(max(self.independent, 2.0))
 
     @property
     def intervals(self) -> tuple[float, float]:
@@ -111,7 +122,8 @@ def refine(
             break
     inverse = np.linalg.inv(sums.information + np.diag(prior))
     covariance = inverse @ (sums.scatter + np.diag(prior)) @ inverse
-    return Estimate(screw, positions, covariance[:AXES, :AXES], sums.misfit, sums.independent)
+    covariance = covariance[:AXES, :AXES] * np.outer(INFLATION, INFLATION)
+    return Estimate(screw, positions, covariance, sums.misfit, sums.independent)
 
 
 class _Sums:
@@ -152,12 +164,8 @@ def _add_pair(
     met = np.isfinite(distance)
     index = np.where(met, index, 0)
     met &= np.sum(other.normals[index] * turned, axis=1) > ALIKE
-    lost = CUTOFF**2 / 3.0  # of a point that meets nothing
     if met.sum() < FEWEST:
-        patches = _patches(source)
-        sums.misfit += lost * (patches.max() + 1)
         return
-    missing = int((~met).sum())
     start, source, index = one.points[own][met], source[met], index[met]
     normal = turned[met] + other.normals[index]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -168,10 +176,7 @@ def _add_pair(
     for axis in range(AXES):
         varied = screw.varied(STEP * np.eye(AXES)[axis])
         rows[:, axis] = np.sum(normal * (varied.pose(turn).at(start) - source), axis=1) / STEP
-    velocity = screw.axis
-    if screw.joint == "revolute":
-        velocity = np.cross(screw.axis, source - screw.point)
-    along = np.sum(normal * velocity, axis=1)
+    along = np.sum(normal * screw.velocity(source), axis=1)
     for look, sign in ((second, 1.0), (first, -1.0)):
         if look in column:
             rows[:, column[look]] = sign * along
@@ -183,7 +188,7 @@ def _add_pair(
     np.add.at(by_patch, patches, (weight * standard)[:, None] * rows)
     sums.scatter += by_patch.T @ by_patch
     share = len(by_patch) / len(source)
-    sums.misfit += share * (float(np.sum(_biweight(standard))) + lost * missing)
+    sums.misfit += share * float(np.sum(_biweight(standard)))
     sums.independent += len(by_patch)
 
 
@@ -245,5 +250,5 @@ def _patches(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
 
 def _biweight(standard: np.ndarray) -> np.ndarray:
-    """Twice the loss of Tukey's biweight: squares near zero, and constant far away."""
-    return CUTOFF**2 / 3.0 * (1.0 - np.clip(1.0 - (standard / CUTOFF) ** 2, 0.0, None) ** 3)
+    """Twice the loss of Tukey's biweight, less that of what is far away, or meets nothing."""
+    return -(CUTOFF**2) / 3.0 * np.clip(1.0 - (standard / CUTOFF) ** 2, 0.0, None) ** 3

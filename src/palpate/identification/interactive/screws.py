@@ -77,6 +77,12 @@ class Screw:
         turned = np.arctan2(away @ second, away @ first) - angle
         return np.unwrap(np.concatenate([[0.0], (turned + np.pi) % (2.0 * np.pi) - np.pi]))[1:]
 
+    def velocity(self, points: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
+        """Of points that it carries, m/s, while the joint goes at 1 rad/s or m/s."""
+        if self.joint == "prismatic":
+            return np.broadcast_to(self.axis, points.shape)
+        return np.cross(self.axis, points - self.point)
+
     def strays(self, points: Points) -> Float[np.ndarray, "n 2"]:
         """How far (m) points of one way are from a circle about the axis, or a line along it."""
         first, second = _frame(self.axis)

@@ -12,44 +12,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import evidence, scores, smoothed
+from palpate.identification.interactive.labels import evidence, scores, smoothed, telling
+from palpate.identification.interactive.part import Part, support_of
 from palpate.identification.interactive.refinement import Estimate, Sighting, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.perception.clouds import Cloud
 
 FEWEST = 40  # points of a part in a look
-SUPPORT = 300  # points that a position is looked for with
-OTHERS = 4  # looks that a look is held against
-TELLING = 0.3  # rad or m of a part: to be further away tells no more
+BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
+FOLLOWS = 0.006  # m (rms) that a hand may stray from the way of the joint that it moves
+SHORT = 0.05  # m that a hand went: a way so short fits many joints
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 WITHIN = 0.6  # share of a part's points that make it a part of another
 NOT_MOVED = 4.0  # of evidence, for each hundred points: how much better a new position has to be
-
-
-@dataclasses.dataclass(eq=False)
-class Part:
-    """A part, what carries it (-1: what stands still), and its joint as it was described.
-
-    All parts are described in one configuration, in which every joint is at zero: the one in which
-    each was found. `positions` has one for each look.
-    """
-
-    parent: int
-    estimate: Estimate
-    positions: list[float]
-    seen: dict[int, np.ndarray]  # by look: which of its points
-    ways: list[tuple[int, np.ndarray]]  # a look before, and the way of a hand after it
-    support: tuple[np.ndarray, np.ndarray]  # points and normals, as described
-
-    @property
-    def screw(self) -> Screw:
-        """Its joint."""
-        return self.estimate.screw
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """The least and the greatest position that was seen."""
-        return min(self.positions), max(self.positions)
 
 
 class Twin:
@@ -60,6 +35,7 @@ class Twin:
         self.parts: list[Part] = []
         self.labels: list[Int[np.ndarray, " points"]] = []  # of each look, -1: stands still
         self.handled: list[Handling] = []
+        self.held: list[tuple[int, int]] = []  # by each: the part, and the look before
 
     # --- kinematics ---------------------------------------------------------------------------
 
@@ -96,11 +72,10 @@ class Twin:
         before = self._add_look(handling.before)
         after = self._add_look(handling.after)
         self.handled.append(handling)
-        self._locate(before, after, handling)
-        if handling.moved and not self._explained(before, after, handling):
-            self._discover(before, after, handling)
+        self.held.append((self._held(before, after, handling), before))
         for look in (before, after):
             self.relabel(look)
+        self._drop(before, after)
         self.refit()
 
     def look(self, cloud: Cloud) -> None:
@@ -143,34 +118,60 @@ class Twin:
         if value(best) > value(last) + NOT_MOVED * len(points) / 100.0:
             one.positions[look] = float(best)
 
-    def _locate(self, before: int, after: int, handling: Handling) -> None:
-        """Start from where the hand has taken the part that it held."""
+    def _held(self, before: int, after: int, handling: Handling) -> int:
+        """The part that the hand held, which is a new one if it moved as none does; -1: no part."""
         if not handling.moved:
-            return
-        part = self._held_part(before, handling)
+            return int(self.labels[before][self.looks[before].tree.query(handling.push.point)[1]])
+        part = self._known(before, after, handling)
         if part < 0:
-            return
-        screw = self.screw(part, before)
+            part = self._explained(before, after, handling)
+        return part if part >= 0 else self._discover(before, after, handling)
+
+    def _known(self, before: int, after: int, handling: Handling) -> int:
+        """The part whose joint is what the hand's way follows, or -1: then none that is known.
+
+        It is looked for where the hand has taken it, and has one way more. A short way fits many
+        joints, and is then only that of the part that the hand was put to.
+        """
         start = handling.points[:3].mean(axis=0)
-        gone = screw.position_of(start, handling.points[3:])[-3:].mean()
-        old = self.parts[part].positions[before]
-        self._find(part, after, around=old + float(gone))
+        near = self._near(before, handling.push.point)
+        for part in near[: None if handling.travel > SHORT else 1]:
+            if part < 0:
+                continue
+            screw, one = self.screw(part, before), self.parts[part]
+            room = FOLLOWS + handling.travel * math.radians(one.estimate.intervals[0])
+            if np.sqrt(np.mean(screw.strays(handling.points) ** 2)) > room:
+                continue
+            gone = float(screw.position_of(start, handling.points)[-3:].mean())
+            self._find(part, after, around=one.positions[before] + gone)
+            went = one.positions[after] - one.positions[before]
+            arm = 1.0
+            if screw.joint == "revolute":
+                arm = float(np.linalg.norm(np.cross(start - screw.point, screw.axis)))
+            if abs(went - gone) * arm < EXPLAINED[0] + 2.0 * EXPLAINED[1] * handling.travel:
+                back = self.pose(one.parent, before).inverse
+                one.ways.append((before, back.at(handling.points)))
+                return part
+        return -1
 
-    def _held_part(self, look: int, handling: Handling) -> int:
-        """The part that a hand takes hold of, by what is around its point."""
-        near = self.looks[look].tree.query(handling.push.point, 15)[1]
-        values, count = np.unique(self.labels[look][near], return_counts=True)
-        return int(values[np.argmax(count)]) if len(self.labels[look]) else -1
+    def _near(self, look: int, point: np.ndarray) -> list[int]:
+        """The labels of what a hand may have hold of, that of most points around it first."""
+        chosen = self.looks[look].tree.query_ball_point(point, BESIDE)
+        values, count = np.unique(self.labels[look][chosen], return_counts=True)
+        return [int(one) for one in values[np.argsort(-count)]]
 
-    def _explained(self, before: int, after: int, handling: Handling) -> bool:
-        """Whether some known part has moved as the hand has; it then has one way more."""
+    def _explained(self, before: int, after: int, handling: Handling) -> int:
+        """The part that the clouds show to have moved as the hand has, or -1.
+
+        It has one way more, if nothing that carries it moved meanwhile.
+        """
         start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
         misses = [
             float(np.linalg.norm(self.motion(part, before, after).at(start[None])[0] - end))
             for part in range(len(self.parts))
         ]
         if not misses or min(misses) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
-            return False
+            return -1
         part = int(np.argmin(misses))
         if all(
             abs(one.positions[before] - one.positions[after]) < 1e-3
@@ -179,7 +180,7 @@ class Twin:
         ):
             back = self.pose(self.parts[part].parent, before).inverse
             self.parts[part].ways.append((before, back.at(handling.points)))
-        return True
+        return part
 
     def _carriers(self, part: int) -> list[int]:
         """What carries a part, one after the other."""
@@ -200,7 +201,8 @@ class Twin:
         """
         if len(self.looks) < 2:
             return np.ones((1, len(self.looks[look].points)))
-        others = self._telling(look) if extra is None else [extra[2] + extra[3] - look]
+        places = np.array([one.positions for one in self.parts]).reshape(-1, len(self.looks))
+        others = telling(places, look) if extra is None else [extra[2] + extra[3] - look]
         motions = [[NOWHERE] * len(others)]
         motions += [
             [self.motion(part, look, other) for other in others] for part in range(len(self.parts))
@@ -219,29 +221,10 @@ class Twin:
             mine = np.flatnonzero(self.labels[look] == number)
             part.seen[look] = mine
 
-    def _telling(self, look: int) -> list[int]:
-        """The looks in which most is elsewhere, and of those the ones that differ."""
-        if not self.parts:
-            return [other for other in range(len(self.looks)) if other != look][-1:]
-        places = np.array(
-            [[one.positions[other] for one in self.parts] for other in range(len(self.looks))]
-        )
-        moved = np.minimum(np.abs(places - places[look]), TELLING)
-        covered, chosen = np.zeros(len(self.parts)), []
-        while len(chosen) < OTHERS:
-            gain = np.sum(np.maximum(moved - covered, 0.0), axis=1)
-            gain[[look, *chosen]] = -1.0
-            best = int(np.argmax(gain))
-            if gain[best] < 0.02:
-                break
-            chosen.append(best)
-            covered = np.maximum(covered, moved[best])
-        return chosen or [other for other in range(len(self.looks)) if other != look][-1:]
-
     # --- new parts ----------------------------------------------------------------------------
 
-    def _discover(self, before: int, after: int, handling: Handling) -> None:
-        """A part that is not known has moved with the hand."""
+    def _discover(self, before: int, after: int, handling: Handling) -> int:
+        """The number of a new part, which moved with the hand; -1 if too little of it was seen."""
         found = []
         for screw in screws_of_way(handling.points):
             start = handling.points[:3].mean(axis=0)
@@ -254,19 +237,20 @@ class Twin:
                     np.flatnonzero(self.probabilities(look, extra).argmax(0) == len(self.parts) + 1)
                     for look in (before, after)
                 ]
-                if min(map(len, masks)) < FEWEST:
+                if max(map(len, masks)) < FEWEST:
                     break
                 seen = [
-                    sighting(self.looks[look], mask, NOWHERE)
+                    sighting(self.looks[look], mask, NOWHERE) if len(mask) >= FEWEST else None
                     for look, mask in zip((before, after), masks, strict=True)
                 ]
                 estimate = refine(estimate.screw, estimate.positions, seen, [handling.points])
-            if min(map(len, masks)) >= FEWEST:
+            if max(map(len, masks)) >= FEWEST:
                 found.append((estimate, masks))
         if not found:
-            return
-        estimate, masks = min(found, key=lambda one: _criterion(one[0]))
+            return -1
+        estimate, masks = min(found, key=lambda one: one[0].criterion)
         self._insert(before, after, estimate, masks, handling)
+        return len(self.parts) - 1
 
     def _insert(
         self,
@@ -280,13 +264,15 @@ class Twin:
         labels = self.labels[before]
         mask = np.zeros(len(labels), bool)
         mask[masks[0]] = True
-        parent, carried = -1, []
-        for number in range(len(self.parts)):
+        parent, carried, same = -1, [], []
+        for number, part in enumerate(self.parts):
             own = labels == number
             if own.sum() < FEWEST:
                 continue
             shared = (mask & own).sum()
-            if shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
+            if shared > WITHIN * own.sum() and part.longest_way < SHORT:
+                same.append(number)  # too little was known of it to know it again
+            elif shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
                 carried.append(number)  # all of it has moved, and more
             elif shared > WITHIN * mask.sum():
                 parent = number
@@ -294,8 +280,9 @@ class Twin:
         back = self.pose(parent, before).inverse
         positions = [0.0] * len(self.looks)
         positions[after] = float(estimate.positions[1] - estimate.positions[0])
-        cloud = self.looks[before]
-        support = _thinned(back.at(cloud.points[masks[0]]), back.turned(cloud.normals[masks[0]]))
+        clouds = self.looks[before], self.looks[after]
+        poses = back, back @ estimate.screw.pose(positions[after]).inverse
+        support = support_of(clouds, masks, poses)
         estimate = dataclasses.replace(estimate, screw=estimate.screw.moved(back))
         ways = [(before, back.at(handling.points))]
         seen = {before: masks[0], after: masks[1]}
@@ -304,11 +291,43 @@ class Twin:
             if self.parts[child].parent == parent:
                 self.parts[child].parent = number
                 self.parts[child].positions[after] = self.parts[child].positions[before]
+        for old in sorted(same, reverse=True):
+            if self.parts[old].parent == parent:
+                self.parts[number].ways += self.parts[old].ways
+                again = self.parts[old].positions_of(estimate.screw)
+                self.parts[number].positions = [*again[:before], *positions[before:]]
+            self._remove(old, number)
+            number -= 1
+
+    def _drop(self, before: int, after: int) -> None:
+        """Take out a part that was found just now and explains nothing (section III-B d)."""
+        newest = len(self.parts) - 1
+        if newest < 0 or self.held[-1][0] != newest or len(self.parts[newest].ways) > 1:
+            return
+        if max((self.labels[look] == newest).sum() for look in (before, after)) < FEWEST:
+            self._remove(newest, -1)
+
+    def _remove(self, part: int, heir: int) -> None:
+        """Take a part out of the tree; what it carries and what was found of it goes to its heir,
+        -1 if it has none."""
+        moved = np.arange(-1, len(self.parts))  # by label, from -1 on: the new one
+        moved[part + 1] = heir
+        moved[moved > part] -= 1
+        del self.parts[part]
+        for one in self.parts:
+            one.parent = int(moved[one.parent + 1])
+        self.labels = [moved[labels + 1] for labels in self.labels]
+        self.held = [(int(moved[held + 1]), look) for held, look in self.held]
 
     # --- joints -------------------------------------------------------------------------------
 
     def refit(self) -> None:
-        """Every joint anew from all looks, from root to leaf."""
+        """Every joint anew from all looks, from root to leaf.
+
+        Of the part that was handled last, the line and the circle of its longest way stand against
+        the joint that it had.
+        """
+        last = self.held[-1][0] if self.held and self.handled[-1].moved else -1
         for number in self.ordered():
             part = self.parts[number]
             seen: list[Sighting | None] = [None] * len(self.looks)
@@ -318,16 +337,19 @@ class Twin:
                         self.looks[look], chosen, self.pose(part.parent, look).inverse
                     )
             ways = [way for _, way in part.ways]
-            part.estimate = refine(part.screw, np.array(part.positions), seen, ways)
+            found = [refine(part.screw, np.array(part.positions), seen, ways)]
+            if number == last and len(ways) > 1:
+                found += self._others(part, seen, ways)
+            part.estimate = min(found, key=lambda one: one.criterion)
             part.positions = [float(one) for one in part.estimate.positions]
 
-
-def _criterion(estimate: Estimate) -> float:
-    """Of Bayesian information, less what is the same for both kinds of joint."""
-    numbers = 4.0 if estimate.screw.joint == "revolute" else 2.0
-    return estimate.misfit + numbers * math.log(max(estimate.independent, 2.0))
-
-
-def _thinned(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    step = max(1, len(points) // SUPPORT)
-    return points[::step], normals[::step]
+    def _others(
+        self, part: Part, seen: list[Sighting | None], ways: list[np.ndarray]
+    ) -> list[Estimate]:
+        """What the longest way of a part says of its joint, where that is of another kind."""
+        longest = max(ways, key=lambda way: float(np.linalg.norm(way[-1] - way[0])))
+        return [
+            refine(screw, np.array(part.positions_of(screw)), seen, ways)
+            for screw in screws_of_way(longest)
+            if screw.joint != part.screw.joint
+        ]

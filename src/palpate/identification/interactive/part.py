@@ -1,0 +1,64 @@
+"""A part of an appliance as it is believed to be: its joint, and where it was in each look."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from palpate.identification.interactive.refinement import Estimate
+from palpate.identification.interactive.screws import Pose, Screw
+from palpate.perception.clouds import Cloud
+
+SUPPORT = 200  # points of a look that a position is looked for with
+
+Support = tuple[Float[np.ndarray, "support 3"], Float[np.ndarray, "support 3"]]
+
+
+@dataclasses.dataclass(eq=False)
+class Part:
+    """A part, what carries it (-1: what stands still), and its joint as it was described.
+
+    All parts are described in one configuration, in which every joint is at zero: the one in which
+    each was found. `positions` has one for each look.
+    """
+
+    parent: int
+    estimate: Estimate
+    positions: list[float]
+    seen: dict[int, np.ndarray]  # by look: which of its points
+    ways: list[tuple[int, np.ndarray]]  # a look before, and the way of a hand after it
+    support: Support  # points and normals, as described
+
+    @property
+    def screw(self) -> Screw:
+        """Its joint."""
+        return self.estimate.screw
+
+    @property
+    def longest_way(self) -> float:
+        """How far a hand has taken it at most, m."""
+        return max((float(np.linalg.norm(way[-1] - way[0])) for _, way in self.ways), default=0.0)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The least and the greatest position that was seen."""
+        return min(self.positions), max(self.positions)
+
+    def positions_of(self, screw: Screw) -> list[float]:
+        """Where another joint has to be for the part to be where it was, in each look."""
+        place = self.support[0].mean(axis=0)
+        was = np.array([self.screw.pose(one).at(place[None])[0] for one in self.positions])
+        return screw.position_of(place, was).tolist()
+
+
+def support_of(
+    clouds: Sequence[Cloud], masks: Sequence[Int[np.ndarray, " _"]], poses: Sequence[Pose]
+) -> Support:
+    """Points and normals of a part in several looks, which may show two sides of it, each moved."""
+    found = []
+    for cloud, mask, pose in zip(clouds, masks, poses, strict=True):
+        chosen = mask[:: max(1, len(mask) // SUPPORT)]
+        found.append((pose.at(cloud.points[chosen]), pose.turned(cloud.normals[chosen])))
+    points, normals = zip(*found, strict=True)
+    return np.concatenate(points), np.concatenate(normals)

@@ -1,0 +1,108 @@
+"""What is believed of a surface: whether it moves, about or along what, and how hard it goes.
+
+A surface stands still, or it turns about one of the edges of its rectangle, or slides along its
+normal or a side of it. How likely it is to move is told by how it stands in the scene; what a hand
+found that pulled at it, and felt it stand still or go, weighs the joints anew (Bayes).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from palpate.perception.surfaces import Surface
+
+# Logarithm of the odds that a surface moves, linear in its features: logistic regression on the
+# first looks at 240 appliances of the six categories (seeds 700000 to 700039).
+WEIGHTS = {
+    "": -4.09,
+    "faces the cameras": 2.59,
+    "free before it": 1.76,
+    "free behind it": 2.31,
+    "goes on beside it": 1.60,
+    "of the scene before it": -2.49,
+    "has a handle": 0.99,
+}
+# The same of a surface of a part that is known, to move on that part too (seeds to 700079).
+WEIGHTS_ON_PART = {
+    "": -2.41,
+    "faces the cameras": 1.5,
+    "free behind it": 2.2,
+    "goes on beside it": -3.04,
+    "is the largest of its part": -3.73,
+}
+# Shares of the joints: each of four, of one, and each of two.
+HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
+# Share of what moves that goes both ways, only the way of the axis or only against it: along the
+# normal that is outwards, as what is closed goes.
+SENSES_OUT, SENSES_SIDE = (0.45, 0.5, 0.05), (0.3, 0.35, 0.35)
+RESISTANCE = 0.05, 0.7  # of a hand's force at the best place: least and most that moves a part
+STRAYED = 0.05  # probability that something else went with the hand
+
+Chances = Float[np.ndarray, " hypotheses"]
+
+
+class Pull(NamedTuple):
+    """Where a hand pulled and which way, whether that moved something, and whether it ended."""
+
+    point: Float[np.ndarray, "3"]
+    direction: Float[np.ndarray, "3"]
+    moved: bool
+    ended: bool  # before the hand had gone as far as it would
+
+
+def probability(features: dict[str, float], *, on_part: bool, largest: bool) -> float:
+    """That a surface moves by itself, before it was tried.
+
+    `on_part` is of one on a part that is known, `largest` of the largest one on it.
+    """
+    weights = WEIGHTS_ON_PART if on_part else WEIGHTS
+    known = features | {"": 1.0, "is the largest of its part": float(largest)}
+    return 1.0 / (1.0 + math.exp(-sum(weight * known[name] for name, weight in weights.items())))
+
+
+def prior(chance: float) -> Chances:
+    """Of standing still, and of each joint and sense, given the probability to move."""
+    joints = np.array([HINGE] * 4 + [ALONG_NORMAL] + [ALONG_SIDE] * 2)
+    senses = np.array([SENSES_OUT] * 5 + [SENSES_SIDE] * 2)
+    moving = chance * (joints[:, None] * senses).ravel()
+    return np.concatenate([[1.0 - moving.sum()], moving])
+
+
+def _forces(surface: Surface, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Share of each pull's force that turns or slides each joint (n, 7), signed."""
+    place = (points - surface.centre) @ surface.sides.T
+    extent = np.maximum(surface.high - surface.low, 1e-3)
+    share = np.clip((place - surface.low) / extent, 0.0, 1.0)  # of the way to the upper edges
+    out = (directions @ surface.normal)[:, None]
+    levers = np.concatenate([share, 1.0 - share], axis=1)
+    return np.concatenate([out * levers, out, directions @ surface.sides.T], axis=1)
+
+
+def moves(
+    surface: Surface, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n hypotheses"]:
+    """Probability that each pull moves the surface, under each hypothesis of `prior`."""
+    forces = _forces(surface, points, directions)
+    ways = np.stack([np.abs(forces), forces, -forces], axis=2).reshape(len(points), -1)
+    least, most = RESISTANCE
+    return np.pad(np.clip((ways - least) / (most - least), 0.0, 1.0), [(0, 0), (1, 0)])
+
+
+def posterior(belief: Chances, surface: Surface, pulls: Sequence[Pull]) -> Chances:
+    """After pulls at the surface. What was pulled to an end of its way can only go back."""
+    for pull in pulls:
+        point, direction = pull.point[None], pull.direction[None]
+        chance = moves(surface, point, direction)[0]
+        if pull.moved:
+            chance[0] = STRAYED
+        belief = belief * (chance if pull.moved else 1.0 - chance)
+        if pull.moved and pull.ended:
+            joints = belief[1:].reshape(-1, 3).sum(axis=1)
+            ahead = _forces(surface, point, direction)[0] > 0.0
+            back = np.stack([0.0 * joints, joints * ~ahead, joints * ahead], axis=1)
+            belief = np.concatenate([belief[:1], back.ravel()])
+        belief = belief / belief.sum()
+    return belief

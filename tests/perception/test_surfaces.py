@@ -1,0 +1,80 @@
+"""Flat pieces of clouds of boxes before a wall, whose places are known."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from palpate.numerics.pinhole import DepthImage, Pinhole
+from palpate.perception.clouds import Cloud, cloud_of
+from palpate.perception.surfaces import features, surfaces
+from palpate.worlds.depth import DepthSensor, depth_image
+
+# A wall at x = 0, a board that stands off it, and a bar before the board as a handle; all of it
+# stands high enough for no floor to be seen.
+SCENE = """
+<mujoco><worldbody><body>
+  <geom type="box" size=".02 .9 .6" pos="-.02 0 1"/>
+  <geom type="box" size=".01 .2 .15" pos=".29 .3 1.1"/>
+  <geom type="box" size=".01 .07 .012" pos=".34 .3 1.15"/>
+</body></worldbody></mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def cloud() -> Cloud:
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    random = np.random.default_rng(0)
+    images: list[DepthImage] = []
+    for side in (-0.9, 0.9):
+        camera = Pinhole.looking_at((0.0, 0.1, 1.0), (1.6, side, 1.3), 320, 240, math.radians(58))
+        images.append(depth_image(model, data, camera, DepthSensor(), random)[0])
+    return cloud_of(images)
+
+
+def found_at(cloud: Cloud, x: float):
+    every = surfaces(cloud, np.full(len(cloud.points), -1), np.random.default_rng(1))
+    facing = [one for one in every if one.normal[0] > 0.95 and abs(one.centre[0] - x) < 0.02]
+    return max(facing, key=lambda one: one.area)
+
+
+def test_a_board_is_found_where_it_is_and_as_large(cloud):
+    board = found_at(cloud, 0.3)
+    away = (cloud.points[board.members] - board.centre) @ board.normal
+    assert np.sqrt(np.mean(away**2)) < 5e-3
+    assert board.centre == pytest.approx([0.3, 0.3, 1.1], abs=0.02)
+    assert sorted(board.high - board.low) == pytest.approx([0.3, 0.4], abs=0.04)
+    assert board.sides @ board.normal == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert np.linalg.norm(board.sides, axis=1) == pytest.approx([1.0, 1.0])
+    assert board.area == pytest.approx(0.12, rel=0.35)
+
+
+def test_a_bar_is_a_handle_and_the_board_is_none(cloud):
+    board, wall = found_at(cloud, 0.3), found_at(cloud, 0.0)
+    assert len(board.handles) == 1
+    assert board.handles[0] == pytest.approx([0.34, 0.3, 1.15], abs=0.08)
+    assert abs(board.handles[0][0] - 0.34) < 0.02
+    # the board stands off the wall further than a handle
+    assert not np.all(np.abs(wall.handles - board.centre)[:, 1:] < [0.2, 0.15], axis=1).any()
+
+
+def test_surfaces_share_no_point_and_keep_to_one_label(cloud):
+    labels = np.where(cloud.points[:, 2] > 1.1, 0, -1)
+    found = surfaces(cloud, labels, np.random.default_rng(0))
+    members = np.concatenate([one.members for one in found])
+    assert len(np.unique(members)) == len(members)
+    assert {one.part for one in found} == {-1, 0}
+    assert all((labels[one.members] == one.part).all() for one in found)
+
+
+def test_features_tell_a_board_that_stands_free_from_a_wall(cloud):
+    board, wall = (features(cloud, found_at(cloud, x)) for x in (0.3, 0.0))
+    assert board["faces the cameras"] > 0.7
+    assert board["of the scene before it"] < 0.03 < wall["of the scene before it"]
+    assert board["goes on beside it"] < 0.3
+    assert board["free behind it"] > wall["free behind it"] == 0.0
+    assert board["has a handle"] == 1.0
+    assert board["free before it"] > 0.9

@@ -13,7 +13,7 @@ from palpate.models.articulated.urdf import write_urdf
 from palpate.runs.run import RESULT
 from palpate.runs.storage import read_json
 from palpate.trials.appliance.interaction import interact
-from palpate.trials.appliance.score import figures_of, score
+from palpate.trials.appliance.score import Labels, figures_of, real_labels, score
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
 TWIN, OTHER = "twin.urdf", "twin.xml"
@@ -29,8 +29,10 @@ def run(options: Interact) -> Path:
             world = ApplianceWorld(options.category, options.seed, views=options.views)
             world.reset(options.seed)
             choose, twin = CHOICES[options.choose], Twin()
+            real: dict[int, Labels] = {}
             for number, step in enumerate(interact(world, choose, options.pushes, options.seed)):
                 twin = step.twin
+                real[len(twin.looks) - 1] = real_labels(twin, world)
                 print(f"push {number + 1}: {said(twin)}", flush=True)
             description = describe(twin, options.category.replace(" ", "_"))
             write_urdf(run.path / TWIN, description)
@@ -38,7 +40,7 @@ def run(options: Interact) -> Path:
             twin.relabel(0)  # of parts that were found later, too
             show_twin(run.path / PICTURE, twin, options.category)
             lines = rows(twin)
-            folders.finish(run, figures_of([score(twin, world)]), {folders.SUMMARY: lines})
+            folders.finish(run, figures_of([score(twin, world, real)]), {folders.SUMMARY: lines})
         print("\n".join(read_json(run.path / RESULT)["settings"][folders.SUMMARY]))
         folders.hand_over(options, run, f"Twin: {options.category}")
         print(f"twin: {run.path / TWIN}")

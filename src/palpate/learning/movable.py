@@ -39,6 +39,7 @@ HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
 # normal that is outwards, as what is closed goes.
 SENSES_OUT, SENSES_SIDE = (0.45, 0.5, 0.05), (0.3, 0.35, 0.35)
 RESISTANCE = 0.05, 0.7  # of a hand's force at the best place: least and most that moves a part
+AT_END = 0.6  # probability that what stopped early is at its end, and not too hard to move on
 STRAYED = 0.05  # probability that something else went with the hand
 
 Chances = Float[np.ndarray, " hypotheses"]
@@ -92,7 +93,7 @@ def moves(
 
 
 def posterior(belief: Chances, surface: Surface, pulls: Sequence[Pull]) -> Chances:
-    """After pulls at the surface. What was pulled to an end of its way can only go back."""
+    """After pulls at the surface. What stopped early may be at its end, from where it goes back."""
     for pull in pulls:
         point, direction = pull.point[None], pull.direction[None]
         chance = moves(surface, point, direction)[0]
@@ -103,6 +104,6 @@ def posterior(belief: Chances, surface: Surface, pulls: Sequence[Pull]) -> Chanc
             joints = belief[1:].reshape(-1, 3).sum(axis=1)
             ahead = _forces(surface, point, direction)[0] > 0.0
             back = np.stack([0.0 * joints, joints * ~ahead, joints * ahead], axis=1)
-            belief = np.concatenate([belief[:1], back.ravel()])
+            belief[1:] = AT_END * back.ravel() + (1.0 - AT_END) * belief[1:]
         belief = belief / belief.sum()
     return belief

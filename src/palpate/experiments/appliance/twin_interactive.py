@@ -16,7 +16,7 @@ from palpate.experiments.experiment import Experiment, ratio
 from palpate.learning.active import CHOICES
 from palpate.runs import Figure, Result
 from palpate.trials.appliance.interaction import interact
-from palpate.trials.appliance.score import Score, figures_of, score
+from palpate.trials.appliance.score import Labels, Score, figures_of, real_labels, score
 from palpate.worlds.appliance.appliance import ApplianceWorld
 from palpate.worlds.appliance.categories import CATEGORIES, draw_design
 
@@ -71,10 +71,12 @@ def of_appliance(experiment: Experiment, name: str, number: int, choose: str) ->
         world.reset(number)
         pushes = EACH * len(world.design.parts) + MORE
         near, seconds, last = pushes + 1, [], None
+        real: dict[int, Labels] = {}
         began = time.perf_counter()
         for step, state in enumerate(interact(world, CHOICES[choose], pushes, number)):
             seconds.append(state.seconds)
-            last = score(state.twin, world)
+            last = score(state.twin, world, real)
+            real[len(state.twin.looks) - 1] = real_labels(state.twin, world)
             known = last.degrees[np.isfinite(last.degrees)]
             if len(known) == len(last.found) and (known <= NEAR).all():
                 near = min(near, step + 1)

@@ -12,7 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import evidence, scores, smoothed, telling
+from palpate.identification.interactive.labels import (
+    LEAST_MOTION,
+    evidence,
+    scores,
+    smoothed,
+    telling,
+)
 from palpate.identification.interactive.part import Part, support_of
 from palpate.identification.interactive.refinement import Estimate, Sighting, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
@@ -21,6 +27,7 @@ from palpate.perception.clouds import Cloud
 FEWEST = 40  # points of a part in a look
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 FOLLOWS = 0.006  # m (rms) that a hand may stray from the way of the joint that it moves
+TELLS = 0.02  # m that a hand has to go to tell of a joint that is not known
 SHORT = 0.05  # m that a hand went: a way so short fits many joints
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 WITHIN = 0.6  # share of a part's points that make it a part of another
@@ -125,7 +132,9 @@ class Twin:
         part = self._known(before, after, handling)
         if part < 0:
             part = self._explained(before, after, handling)
-        return part if part >= 0 else self._discover(before, after, handling)
+        if part >= 0 or handling.travel < TELLS:
+            return part
+        return self._discover(before, after, handling)
 
     def _known(self, before: int, after: int, handling: Handling) -> int:
         """The part whose joint is what the hand's way follows, or -1: then none that is known.
@@ -135,7 +144,8 @@ class Twin:
         """
         start = handling.points[:3].mean(axis=0)
         near = self._near(before, handling.push.point)
-        for part in near[: None if handling.travel > SHORT else 1]:
+        others = [part for part in range(len(self.parts)) if part not in near]
+        for part in [*near, *others] if handling.travel > SHORT else near[:1]:
             if part < 0:
                 continue
             screw, one = self.screw(part, before), self.parts[part]
@@ -274,7 +284,7 @@ class Twin:
                 same.append(number)  # too little was known of it to know it again
             elif shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
                 carried.append(number)  # all of it has moved, and more
-            elif shared > WITHIN * mask.sum():
+            elif shared > WITHIN * mask.sum() and self._carries(number, before, after, masks[0]):
                 parent = number
         number = len(self.parts)
         back = self.pose(parent, before).inverse
@@ -298,6 +308,21 @@ class Twin:
                 self.parts[number].positions = [*again[:before], *positions[before:]]
             self._remove(old, number)
             number -= 1
+
+    def _carries(self, part: int, before: int, after: int, mask: np.ndarray) -> bool:
+        """Whether these points of a look went where a part went, rather than stood still.
+
+        Where no look tells, what was taken for a piece of the part is.
+        """
+        cloud, places = self.looks[before], np.array([one.positions for one in self.parts])
+        points, normals = cloud.points[mask], cloud.normals[mask]
+        gain = 0.0
+        for look in telling(places, before):
+            pose = self.motion(part, before, look)
+            if look != after and abs(places[part, look] - places[part, before]) > LEAST_MOTION:
+                gone = evidence(self.looks[look], pose.at(points), pose.turned(normals))
+                gain += float(np.sum(gone - evidence(self.looks[look], points, normals)))
+        return gain >= 0.0
 
     def _drop(self, before: int, after: int) -> None:
         """Take out a part that was found just now and explains nothing (section III-B d)."""

@@ -2,10 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from palpate.identification.interactive.screws import Screw
@@ -13,7 +13,10 @@ from palpate.identification.interactive.twin import Twin
 from palpate.runs import Figure
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
+FEWEST = 20  # points of a part that a look shows
 MATCH = 0.25  # IoU of a part that was found with the one that it is
+
+Labels = Int[np.ndarray, " points"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,18 +45,32 @@ class Score:
         )
 
 
-def score(twin: Twin, world: ApplianceWorld) -> Score:
-    """Compare; the world is as it was in the twin's last look."""
+def real_labels(twin: Twin, world: ApplianceWorld) -> Labels:
+    """Which part each point of the twin's last look is of; the world is as it was then."""
+    seen = world.truth().labels
+    source = twin.looks[-1].source
+    return np.array([seen[image][row, column] for image, row, column in source])
+
+
+def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | None = None) -> Score:
+    """Compare; the world is as it was in the twin's last look.
+
+    Points of a part are compared in that look, or where it is hidden then in the last of the
+    `earlier` looks, with their `real_labels`, that show it.
+    """
     truth, look = world.truth(), len(twin.looks) - 1
     parts = truth.design.parts
-    source = twin.looks[look].source
-    real = np.array([truth.labels[image][row, column] for image, row, column in source])
-    masks = [twin.labels[look] == number for number in range(len(twin.parts))]
-    overlap = np.zeros((len(parts), len(masks)))
+    known = dict(sorted((earlier or {}).items(), reverse=True))
+    real = {look: real_labels(twin, world)} | known
+    overlap = np.zeros((len(parts), len(twin.parts)))
+    labels: dict[int, Labels] = {look: twin.labels[look]}
     for one in range(len(parts)):
-        for other, mask in enumerate(masks):
-            union = np.sum((real == one) | mask)
-            overlap[one, other] = np.sum((real == one) & mask) / max(union, 1)
+        shown = next((at for at, own in real.items() if (own == one).sum() >= FEWEST), look)
+        if shown not in labels:
+            labels[shown] = twin.probabilities(shown).argmax(axis=0) - 1
+        for other in range(len(twin.parts)):
+            own, mask = real[shown] == one, labels[shown] == other
+            overlap[one, other] = np.sum(own & mask) / max(np.sum(own | mask), 1)
     nothing = np.full(len(parts), np.nan)
     found, right, degrees, centimetres, iou, parent = (nothing.copy() for _ in range(6))
     inside = np.full((len(parts), 2), np.nan)
@@ -75,7 +92,9 @@ def score(twin: Twin, world: ApplianceWorld) -> Score:
         degrees[one], apart = difference(screw, truth.axis[one], truth.anchor[one])
         centimetres[one] = apart if own.joint == "revolute" else np.nan
         inside[one] = _inside(twin, other, screw, truth.axis[one], truth.anchor[one])
-    return Score(found, right, degrees, centimetres, iou, parent, inside, len(masks) - len(pairs))
+    return Score(
+        found, right, degrees, centimetres, iou, parent, inside, len(twin.parts) - len(pairs)
+    )
 
 
 def difference(screw: Screw, axis: np.ndarray, anchor: np.ndarray) -> tuple[float, float]:

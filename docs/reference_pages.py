@@ -54,6 +54,7 @@ STAGES = {
     ],
     "learning": [
         "learning.active",
+        "learning.movable",
         *("learning.self_supervised", "learning.closed_loop", "learning.dagger"),
         *("learning.loss_monitor", "networks.policy", "networks.controller", "networks.channels"),
         *("learning.off_policy.loop", "learning.off_policy.agent", "learning.off_policy.buffer"),
@@ -106,7 +107,7 @@ STAGES = {
     ],
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),
-        *("perception.rope.marker_observer", "perception.clouds"),
+        *("perception.rope.marker_observer", "perception.clouds", "perception.surfaces"),
     ],
     "trials": [
         *("trials.trial", "trials.controller", "trials.audit", "trials.adversaries"),

@@ -301,7 +301,9 @@ class Twin:
             if self.parts[child].parent == parent:
                 self.parts[child].parent = number
                 self.parts[child].positions[after] = self.parts[child].positions[before]
-        for old in sorted(same, reverse=True):
+        # what carries the carrier stays: a part cannot hang on what hangs on it
+        above = self._carriers(number)
+        for old in sorted(set(same).difference(above), reverse=True):
             if self.parts[old].parent == parent:
                 self.parts[number].ways += self.parts[old].ways
                 again = self.parts[old].positions_of(estimate.screw)
@@ -330,7 +332,7 @@ class Twin:
         if newest < 0 or self.held[-1][0] != newest or len(self.parts[newest].ways) > 1:
             return
         if max((self.labels[look] == newest).sum() for look in (before, after)) < FEWEST:
-            self._remove(newest, -1)
+            self._remove(newest, self.parts[newest].parent)
 
     def _remove(self, part: int, heir: int) -> None:
         """Take a part out of the tree; what it carries and what was found of it goes to its heir,

@@ -46,6 +46,7 @@ STAGES = {
         *("identification.interactive.twin", "identification.interactive.handling"),
         *("identification.interactive.screws", "identification.interactive.labels"),
         *("identification.interactive.refinement", "identification.interactive.description"),
+        *("identification.interactive.resistance", "identification.interactive.dynamics"),
         *("identification.samplers.draws", "identification.samplers.target"),
         *("identification.samplers.hamiltonian", "identification.samplers.metropolis"),
         *("identification.samplers.local_global", "identification.samplers.tempered"),
@@ -115,6 +116,7 @@ STAGES = {
         *("trials.rope.learned", "trials.rope.baselines", "trials.rope.planners"),
         *("trials.furniture.namo_episode", "trials.furniture.cart_trials"),
         *("trials.appliance.hand", "trials.appliance.interaction", "trials.appliance.score"),
+        "trials.appliance.motion",
     ],
     "deployment": [
         *("deployment.deployment", "deployment.supervisor", "deployment.intake"),

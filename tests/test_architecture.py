@@ -54,7 +54,7 @@ TRUTH_FILES = {
     *("experiments/rope/bound.py", "experiments/rope/swing.py"),
     "experiments/furniture/one_shot.py",
     *("families/rope/robot.py", "families/contact/robot.py"),
-    "trials/appliance/score.py",
+    *("trials/appliance/score.py", "trials/appliance/motion.py"),
     "families/contact/path_picture.py",  # which draws what happened
     "families/contact/probes.py",  # which asks what happened next
 }

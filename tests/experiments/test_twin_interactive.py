@@ -11,6 +11,7 @@ def kept(found, degrees, centimetres, near, extra=0):
     """What a stage keeps of an appliance, as JSON has it: None for what is not known."""
     score = {
         "found": found,
+        "part": [float(number) if one else None for number, one in enumerate(found)],
         "type_right": [1.0 if one else None for one in found],
         "degrees": degrees,
         "centimetres": centimetres,
@@ -22,8 +23,18 @@ def kept(found, degrees, centimetres, near, extra=0):
     return {"score": score, "pushes_to_near": near, "seconds": [1.0, 2.0]}
 
 
+MOVED = {
+    "motions": [
+        {"error": 0.02, "still": 0.4, "covered": 1.0, "inside": [True, True, False]},
+        {"error": 0.1, "still": 0.5, "covered": 0.5, "inside": [True, False, False]},
+        {"error": 0.03, "still": 0.3, "covered": 0.9, "inside": [True, True, True]},
+    ],
+    "urdf_s": 0.5,
+}
+
+
 FOUND = {
-    ("box", 1, "information"): kept([1.0], [0.5], [0.2], 2),
+    ("box", 1, "information"): kept([1.0], [0.5], [0.2], 2) | MOVED,
     ("oven", 1, "information"): kept([1.0, 0.0], [1.5, None], [None, None], 4, extra=1),
     ("oven", 1, "random"): kept([1.0, 1.0], [1.5, 0.1], [None, 0.3], 8),
 }
@@ -42,6 +53,10 @@ def test_parts_are_pooled_and_categories_stand_by_themselves():
     assert values["oven.recall"] == 0.5
     assert values["pushes_to_2deg_over_random"] == 0.5
     assert 1.0 < values["interaction_s_p95"] <= 2.0
+    assert values["motion_rmse_share_of_range"] == 0.03
+    assert values["motion_coverage_90"] == pytest.approx(0.8)
+    assert values["parameter_coverage_90"] == pytest.approx(2 / 3)
+    assert values["cloud_to_urdf_s_p95"] == 0.5
 
 
 def test_only_appliances_with_several_parts_are_handled_at_random_too():

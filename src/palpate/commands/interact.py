@@ -4,8 +4,10 @@ from pathlib import Path
 
 from palpate.commands import folders
 from palpate.commands.options import Interact
+from palpate.errors import PalpateError
 from palpate.families.appliance.twin_picture import PICTURE, show_twin
 from palpate.identification.interactive.description import describe
+from palpate.identification.interactive.dynamics import Felt, felt
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated.mjcf import write_mjcf
@@ -35,11 +37,18 @@ def run(options: Interact) -> Path:
                 real[len(twin.looks) - 1] = real_labels(twin, world)
                 print(f"push {number + 1}: {said(twin)}", flush=True)
             description = describe(twin, options.category.replace(" ", "_"))
+            lines = rows(twin)
+            try:
+                known = felt(twin)
+            except PalpateError as error:
+                lines.append(f"masses and resistance are guesses: {error}")
+            else:
+                description = known.described(description)
+                lines += [*resistances(known), *(f"warning: {one}" for one in known.warnings)]
             write_urdf(run.path / TWIN, description)
             write_mjcf(run.path / OTHER, description)
             twin.relabel(0)  # of parts that were found later, too
             show_twin(run.path / PICTURE, twin, options.category)
-            lines = rows(twin)
             folders.finish(run, figures_of([score(twin, world, real)]), {folders.SUMMARY: lines})
         print("\n".join(read_json(run.path / RESULT)["settings"][folders.SUMMARY]))
         folders.hand_over(options, run, f"Twin: {options.category}")
@@ -70,5 +79,21 @@ def rows(twin: Twin) -> list[str]:
         found.append(
             f"part {number + 1}: {part.screw.joint}{on}, axis ({x:.3f}, {y:.3f}, {z:.3f}) to "
             f"{angle:.1f} degrees{at} (90 %)"
+        )
+    return found
+
+
+def resistances(known: Felt) -> list[str]:
+    """What resists at each joint with 90 % intervals, a line each; of parts that were moved."""
+    found = []
+    for part, own, inertia in zip(known.parts, known.resistance, known.inertia, strict=True):
+        if own is None:
+            continue
+        share, damping, friction, *_ = 1.645 * own.deviation
+        heavy = 100.0 * share / own.mass_share
+        found.append(
+            f"part {part + 1}: inertia {inertia:.3g} kg m^2 or kg to {heavy:.0f} %, friction "
+            f"{own.friction:.2g} +- {friction:.1g} N m or N, damping {own.damping:.2g} +- "
+            f"{damping:.1g} N m s or N s/m (90 %)"
         )
     return found

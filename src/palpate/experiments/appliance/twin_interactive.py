@@ -2,20 +2,29 @@
 
 Of each of six categories some are drawn, and handled as often as three times for each moving part
 and three times more, where most is expected to be learnt. Of those with two parts or more, some are
-handled at random, too.
+handled at random, too. The first few of each are then pulled at by forces that they have not felt,
+and so is what the twin believes of them.
 """
 
+import dataclasses
+import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, ratio
+from palpate.identification.interactive.description import describe
+from palpate.identification.interactive.dynamics import felt
+from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
+from palpate.models.articulated.urdf import write_urdf
 from palpate.runs import Figure, Result
 from palpate.trials.appliance.interaction import interact
+from palpate.trials.appliance.motion import motions
 from palpate.trials.appliance.score import Labels, Score, figures_of, real_labels, score
 from palpate.worlds.appliance.appliance import ApplianceWorld
 from palpate.worlds.appliance.categories import CATEGORIES, draw_design
@@ -25,7 +34,7 @@ FIRST, FIRST_QUICK = 510_000, 490_000  # seed of the first appliance
 OBJECTS, PAIRED, QUICK = 20, 5, 1  # of each category
 EACH, MORE = 3, 3  # pushes for each moving part, and in all
 NEAR = 2.0  # degrees that every axis is known to
-MINUTES = {"by information": 30, "at random": 10}
+MINUTES = {"by information": 35, "at random": 10}
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
@@ -82,11 +91,39 @@ def of_appliance(experiment: Experiment, name: str, number: int, choose: str) ->
                 near = min(near, step + 1)
         assert last is not None
         listed = {key: _plain(np.asarray(value).tolist()) for key, value in vars(last).items()}
-        whole = time.perf_counter() - began
-        return {"score": listed, "pushes_to_near": near, "seconds": seconds, "whole_s": whole}
+        found = {"score": listed, "pushes_to_near": near, "seconds": seconds}
+        if moves:
+            found |= moved(state.twin, world, last, number)
+        return found | {"whole_s": time.perf_counter() - began}
 
+    first = experiment.seed + (FIRST_QUICK if experiment.quick else FIRST)
+    moves = choose == "information" and number < first + PAIRED
     about = {"category": name, "number": number, "choose": choose}
     return experiment.found(f"{name}-{number}-{choose}", about, work)
+
+
+def moved(twin: Twin, world: ApplianceWorld, found: Score, number: int) -> dict[str, Any]:
+    """How the twin moves beside the appliance, and the seconds until its URDF is written.
+
+    `parts` are those that were found with their kind of joint, `unmoved` those of them that no
+    force within the hand's moves far enough.
+    """
+    began = time.perf_counter()
+    try:
+        known = felt(twin)
+        description = known.described(describe(twin, "twin"))
+    except PalpateError as error:
+        return {"motions": [], "unfelt": str(error)}
+    with tempfile.TemporaryDirectory() as folder:
+        write_urdf(Path(folder) / "twin.urdf", description)
+    seconds = time.perf_counter() - began
+    listed = motions(twin, known, world, found, number)
+    return {
+        "urdf_s": seconds,
+        "warnings": known.warnings,
+        "unmoved": sum(one is None for one in listed),
+        "motions": [dataclasses.asdict(one) for one in listed if one is not None],
+    }
 
 
 def figures(found: Mapping[tuple[str, int, str], Mapping[str, Any]]) -> list[Figure]:
@@ -116,10 +153,32 @@ def figures(found: Mapping[tuple[str, int, str], Mapping[str, Any]]) -> list[Fig
     ]
     if others:
         listed += compared(own, others)
+    listed += of_motions([each for each in own.values() if "motions" in each])
     for name, each in by_category.items():
         prefix = name.replace("-", "_")
         listed += [Figure(f"{prefix}.{one.name}", one.value, one.unit) for one in each]
     return listed
+
+
+def of_motions(found: Sequence[Mapping[str, Any]]) -> list[Figure]:
+    """How twins move under forces that they have not felt, over parts; None where none moved."""
+    moves = [one for each in found for one in each["motions"]]
+
+    def of(name: str, average: Callable[[Any], Any]) -> float | None:
+        return float(average([one[name] for one in moves])) if moves else None
+
+    still = of("still", np.median)
+    seconds = [each["urdf_s"] for each in found if "urdf_s" in each]
+    return [
+        Figure("motion_rmse_share_of_range", of("error", np.median), "", 0.05,
+               rival=None if still is None else f"standing still {still:.3g}"),
+        Figure("motion_rmse_mean", of("error", np.mean), ""),
+        Figure("motion_coverage_90", of("covered", np.mean), "", better="higher"),
+        Figure("parameter_coverage_90", of("inside", np.mean), "", better="higher"),
+        Figure("motions", float(len(moves)), "", better="higher"),
+        Figure("cloud_to_urdf_s_p95", float(np.quantile(seconds, 0.95)) if seconds else None, "s",
+               10.0),
+    ]  # fmt: skip
 
 
 def compared(

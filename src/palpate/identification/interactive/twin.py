@@ -186,13 +186,13 @@ class Twin:
         if all(
             abs(one.positions[before] - one.positions[after]) < 1e-3
             for number, one in enumerate(self.parts)
-            if number in self._carriers(part)
+            if number in self.carriers(part)
         ):
             back = self.pose(self.parts[part].parent, before).inverse
             self.parts[part].ways.append((before, back.at(handling.points)))
         return part
 
-    def _carriers(self, part: int) -> list[int]:
+    def carriers(self, part: int) -> list[int]:
         """What carries a part, one after the other."""
         found = []
         while (part := self.parts[part].parent) >= 0:
@@ -302,7 +302,7 @@ class Twin:
                 self.parts[child].parent = number
                 self.parts[child].positions[after] = self.parts[child].positions[before]
         # what carries the carrier stays: a part cannot hang on what hangs on it
-        above = self._carriers(number)
+        above = self.carriers(number)
         for old in sorted(set(same).difference(above), reverse=True):
             if self.parts[old].parent == parent:
                 self.parts[number].ways += self.parts[old].ways

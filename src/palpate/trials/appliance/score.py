@@ -23,12 +23,14 @@ Labels = Int[np.ndarray, " points"]
 class Score:
     """How a twin compares with the truth, part by part; NaN of a part that was not found.
 
-    Errors of axes are sign-free: `degrees` between the directions, `centimetres` between the lines
-    of hinges. `inside` says whether 90 % intervals of both directions (and of both places) held the
-    truth. `extra` counts parts that are none.
+    `part` is the number of the twin's part that each real one is. Errors of axes are sign-free:
+    `degrees` between the directions, `centimetres` between the lines of hinges. `inside` says
+    whether 90 % intervals of both directions (and of both places) held the truth. `extra` counts
+    parts that are none.
     """
 
     found: Float[np.ndarray, " parts"]
+    part: Float[np.ndarray, " parts"]
     type_right: Float[np.ndarray, " parts"]
     degrees: Float[np.ndarray, " parts"]
     centimetres: Float[np.ndarray, " parts"]
@@ -72,7 +74,7 @@ def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | Non
             own, mask = real[shown] == one, labels[shown] == other
             overlap[one, other] = np.sum(own & mask) / max(np.sum(own | mask), 1)
     nothing = np.full(len(parts), np.nan)
-    found, right, degrees, centimetres, iou, parent = (nothing.copy() for _ in range(6))
+    found, number, right, degrees, centimetres, iou, parent = (nothing.copy() for _ in range(7))
     inside = np.full((len(parts), 2), np.nan)
     found[:] = 0.0
     pairs = {
@@ -83,7 +85,7 @@ def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | Non
     for one, other in pairs.items():
         screw = twin.screw(other, look)
         own = parts[one]
-        found[one], iou[one] = 1.0, overlap[one, other]
+        found[one], number[one], iou[one] = 1.0, other, overlap[one, other]
         right[one] = float(screw.joint == own.joint)
         wanted = pairs.get(own.parent, -2) if own.parent >= 0 else -1
         parent[one] = float(twin.parts[other].parent == wanted)
@@ -93,8 +95,9 @@ def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | Non
         centimetres[one] = apart if own.joint == "revolute" else np.nan
         inside[one] = _inside(twin, other, screw, truth.axis[one], truth.anchor[one])
     return Score(
-        found, right, degrees, centimetres, iou, parent, inside, len(twin.parts) - len(pairs)
-    )
+        found, number, right, degrees, centimetres, iou, parent, inside,
+        len(twin.parts) - len(pairs),
+    )  # fmt: skip
 
 
 def difference(screw: Screw, axis: np.ndarray, anchor: np.ndarray) -> tuple[float, float]:

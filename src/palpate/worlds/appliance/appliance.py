@@ -57,6 +57,7 @@ class ApplianceTruth(NamedTuple):
     design: Design
     position: Float[np.ndarray, " parts"]  # rad or m
     velocity: Float[np.ndarray, " parts"]
+    inertia: Float[np.ndarray, " parts"]  # kg m^2 or kg that each joint moves, all closed
     axis: Float[np.ndarray, "parts 3"]  # now
     anchor: Float[np.ndarray, "parts 3"]  # m, a point of each axis, now
     rotation: Float[np.ndarray, "parts 3 3"]  # world from the appliance's frame on each part, now
@@ -165,6 +166,7 @@ class ApplianceWorld(World):
             self.design,
             data.qpos.copy(),
             data.qvel.copy(),
+            self.model.dof_M0.copy(),
             data.xaxis.copy(),
             data.xanchor.copy(),
             data.xmat[FIRST : FIRST + parts].reshape(-1, 3, 3).copy(),

@@ -75,12 +75,11 @@ def regress(actions: Sequence[Moments]) -> Resistance | None:
     numbers are to be trusted is told by how they change when a tenth of the windows is left out
     (jackknife of blocks: Kuensch 1989, Annals of Statistics 17:3).
     """
-    rows = [row for action in actions for row in _rows(action)]
-    if len(rows) < FEWEST:
-        return None
-    table = np.array(rows)
+    table = np.array([row for action in actions for row in _rows(action)]).reshape(-1, 6)
     speed = np.abs(table[:, 1])
-    table = table[speed > MOVES * speed.max()]
+    table = table[speed > MOVES * speed.max(initial=0.0)]
+    if len(table) < FEWEST:
+        return None
     # acts = share (inertia acceleration - weight) + damping velocity + friction sign
     #        + stiffness position - pull
     plain, sprung = [0, 1, 2], [0, 1, 2, 3, 4]
@@ -123,7 +122,7 @@ def _rows(action: Moments) -> list[np.ndarray]:
         position = action.positions[part]
         gone = position - position.mean()
         quarters = np.diff(position[np.linspace(0, moments - 1, 5).astype(int)])
-        if np.abs(quarters).min() < MOVES * np.abs(quarters).mean() or np.ptp(np.sign(quarters)):
+        if np.abs(quarters).min() <= MOVES * np.abs(quarters).mean() or np.ptp(np.sign(quarters)):
             continue  # it may have stuck, and friction is then anything
         velocity = -float(first @ gone) / period
         found.append(np.array([

@@ -1,0 +1,197 @@
+"""What a hand felt: the regression on joints that are known, and a twin beside its appliance."""
+
+import dataclasses
+import math
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from palpate.errors import PalpateError
+from palpate.identification.interactive.description import describe
+from palpate.identification.interactive.dynamics import (
+    FORCE,
+    POSITION,
+    _Action,
+    _upright,
+    felt,
+)
+from palpate.identification.interactive.resistance import Moments, regress
+from palpate.identification.interactive.twin import Twin
+from palpate.learning.active import CHOICES
+from palpate.models.articulated import ArticulatedState
+from palpate.models.articulated.assembly import assembled
+from palpate.parameters import parameters_of
+from palpate.perception.clouds import cloud_of
+from palpate.trials.appliance.interaction import interact
+from palpate.trials.appliance.motion import motions
+from palpate.trials.appliance.score import score
+from palpate.worlds.appliance.appliance import ApplianceWorld
+
+PERIOD = 0.02
+INERTIA, DAMPING, FRICTION = 0.4, 0.3, 0.9
+
+
+def moments(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3, seed=0):
+    """A joint that a torque drives one way, by small steps; the inertia was guessed as half."""
+    steps = 20
+    random = np.random.default_rng(seed)
+    position = velocity = 0.0
+    times = PERIOD * np.arange(110)
+    acts = sign * (1.6 + 0.8 * np.sin(2.0 * math.pi * times / 0.8))
+    found = []
+    for act in acts:
+        found.append(position)
+        for _ in range(steps):
+            resists = DAMPING * velocity + stiffness * (position - rest) - weight
+            free = velocity + PERIOD / steps * (act - resists) / INERTIA
+            stops = PERIOD / steps * FRICTION / INERTIA
+            velocity = math.copysign(max(abs(free) - stops, 0.0), free)
+            position += PERIOD / steps * velocity
+    # an act holds for the period after its moment: at the moment it is the mean of two
+    acts[1:] = 0.5 * (acts[1:] + acts[:-1])
+    seen = np.array(found) + noise * random.standard_normal(len(found))
+    gravity = np.full(len(times), 0.5 * weight)
+    return Moments(times, seen, acts, gravity, guess)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_regression_tells_inertia_damping_and_friction_apart(sign):
+    known = regress([moments(sign), moments(sign, seed=1)])
+    assert known is not None
+    assert known.mass_share * 0.2 == pytest.approx(INERTIA, rel=0.06)
+    assert known.damping == pytest.approx(DAMPING, rel=0.15)
+    assert known.friction == pytest.approx(FRICTION, rel=0.06)
+    assert known.stiffness == 0.0
+    truth = [INERTIA / 0.2, DAMPING, FRICTION]
+    assert np.all(np.abs(np.array(known[:3]) - truth) < 3.0 * known.deviation[:3])
+    assert known.deviation[2] < 0.3 * FRICTION
+
+
+def test_a_spring_is_found_only_where_there_is_one():
+    spring = {"stiffness": 0.5, "rest": 0.4}
+    known = regress([moments(sign, seed=seed, **spring) for sign in (1.0, -1.0) for seed in (0, 1)])
+    assert known is not None
+    assert known.stiffness == pytest.approx(0.5, rel=0.15)
+    assert known.pull / known.stiffness == pytest.approx(0.4, abs=0.1)
+    assert known.friction == pytest.approx(FRICTION, rel=0.1)
+
+
+def test_what_a_part_weighs_is_no_friction():
+    known = regress([moments(weight=0.6, seed=seed) for seed in range(2)])
+    assert known is not None
+    assert known.mass_share == pytest.approx(2.0, rel=0.1)
+    assert known.friction == pytest.approx(FRICTION, rel=0.12)
+
+
+def test_a_joint_that_rests_tells_nothing():
+    still = moments()
+    assert regress([]) is None
+    assert regress([still._replace(positions=np.zeros(len(still.times)))]) is None
+
+
+def test_draws_spread_as_far_as_is_known_and_nothing_is_negative():
+    known = regress([moments()])
+    assert known is not None
+    drawn = known.draws(4000, np.random.default_rng(0))
+    assert np.all(drawn[:, :4] >= 0.0)
+    assert drawn[:, 2].mean() == pytest.approx(known.friction, abs=0.1 * known.deviation[2])
+    assert drawn[:, 2].std() == pytest.approx(known.deviation[2], rel=0.1)
+
+
+def test_axes_are_made_upright_only_within_their_interval():
+    tilted = np.array([math.cos(0.02), 0.0, math.sin(0.02)])
+    assert _upright(tilted, 0.03) == pytest.approx([1.0, 0.0, 0.0])
+    assert _upright(tilted, 0.01) == pytest.approx(tilted)
+    assert _upright(-tilted[::-1], 0.03) == pytest.approx([0.0, 0.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def known():
+    """A microwave that was handled until its door is known."""
+    world = ApplianceWorld("microwave", 600009)
+    world.reset(600009)
+    *_, last = interact(world, CHOICES["information"], 4, 600009)
+    return world, last.twin, felt(last.twin)
+
+
+def test_a_door_is_felt_as_it_is(known):
+    world, _, found = known
+    (own,) = found.resistance
+    real = world.design.parts[0].resistance
+    assert own.friction == pytest.approx(real.friction, rel=0.2)
+    assert abs(own.damping - real.damping) < 2.0 * own.deviation[1]
+    assert found.inertia[0] == pytest.approx(world.truth().inertia[0], rel=0.15)
+    assert found.warnings == []
+
+
+def test_the_recording_is_what_the_model_takes(known):
+    _, twin, found = known
+    for trial in found.recording.trials:
+        positions, forces = trial[POSITION], trial[FORCE]
+        assert positions.unit == "rad"
+        assert positions.values.shape[1:] == found.model.observation_shape
+        assert forces.values.shape[1:] == found.model.action_shape
+        assert np.linalg.norm(forces.values[:, 0, 1:4], axis=1).max() < 41.5
+    assert not parameters_of(found.model)["friction"].fixed
+    # the point of the link that is held is where the hand was
+    handling = twin.handled[0]
+    rotation, origin = found.model.link_poses(jnp.asarray(positions.values[0], jnp.float32))
+    hold = np.asarray(rotation[0]) @ forces.values[0, 0, 4:] + np.asarray(origin[0])
+    assert hold == pytest.approx(handling.points[0], abs=0.02)
+
+
+def test_a_force_of_a_period_is_half_a_period_late(known):
+    """As a moment's force it would delay it, and inertia would look like damping."""
+    _, twin, found = known
+    action = next(one for one in map(partial(_Action, twin), range(len(twin.held)))
+                  if one.part == 0 and one.handling.moved)  # fmt: skip
+    acts = action.moments(assembled(describe(twin, "door")).links, found.parts).acts
+    trial = action.trial(slice(0, len(acts)), found.parts)
+    forces = trial[FORCE].values[:, 0, 1:4]
+    along = action.screw.velocity(action.handling.points[1 : len(acts) - 1])
+    wanted = 0.5 * np.sum((forces[:-1] + forces[1:]) * along, axis=1)
+    assert acts[1:-1] == pytest.approx(wanted, abs=1e-6)
+
+
+def test_the_twin_moves_as_the_appliance_does(known):
+    world, twin, found = known
+    (one,) = motions(twin, found, world, score(twin, world), 600009)
+    assert one is not None
+    assert one.still > 0.2
+    assert one.error < 0.1 * one.still
+    assert one.covered > 0.5
+    heavier = dataclasses.replace(
+        found,
+        model=dataclasses.replace(found.model, friction=3.0 * found.model.friction),
+    )
+    (other,) = motions(twin, heavier, world, score(twin, world), 600009)
+    assert other is not None
+    assert other.error > 3.0 * one.error
+
+
+def test_the_file_has_what_was_felt(known):
+    _, twin, found = known
+    link = assembled(found.described(describe(twin, "door"))).links[0]
+    (own,) = found.resistance
+    assert (link.damping, link.friction) == (own.damping, own.friction)
+    still = ArticulatedState(jnp.zeros(1), jnp.zeros(1))
+    assert link.mass == pytest.approx(float(found.model.mass[0]), rel=1e-5)
+    push = jnp.zeros((1, 7)).at[0, 0].set(1.0)
+    resting = dataclasses.replace(found.model, gravity=jnp.zeros(3))
+    gains = float(resting.acceleration(still, push)[0])
+    assert 1.0 / gains == pytest.approx(found.inertia[0], rel=1e-3)
+
+
+def test_without_an_action_nothing_is_felt():
+    with pytest.raises(PalpateError, match="no part was found"):
+        felt(_looked())
+
+
+def _looked() -> Twin:
+    world = ApplianceWorld("microwave", 1)
+    world.reset(1)
+    twin = Twin()
+    twin.look(cloud_of(world.look()))
+    return twin

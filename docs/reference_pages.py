@@ -17,12 +17,14 @@ STAGES = {
         *("families.world_options", "families.contact.maze_options"),
         *("families.contact.navigation_options", "families.contact.skill_options"),
         *("families.contact.touch_options", "families.gymnasium.options"),
+        "families.appliance.options",
     ],
     "recordings": [
         *("recordings.recording", "recordings.trial", "recordings.channel", "recordings.facts"),
         *("recordings.alignment", "recordings.files", "recordings.npz", "recordings.csv"),
         *("recordings.columns", "recordings.markers", "recordings.lerobot", "recordings.rerun"),
         *("recordings.rosbag.bag", "families.rope.recording", "families.furniture.recording"),
+        "families.appliance.recording",
     ],
     "models": [
         *("models.model", "models.contract", "models.files", "models.python_files", "parameters"),

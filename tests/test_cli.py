@@ -154,17 +154,17 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "identify rpoe R.npz",
             "unknown family 'rpoe'; did you mean 'rope'? there are: "
-            "contact, furniture, rope, FILE.py:CLASS",
+            "appliance, contact, furniture, rope, FILE.py:CLASS",
         ),
         (
             "identify",
             "palpate identify needs a family first; there are: "
-            "contact, furniture, rope, FILE.py:CLASS",
+            "appliance, contact, furniture, rope, FILE.py:CLASS",
         ),
         (
             "identify --seed 1 rope",
             "palpate identify needs a family first; there are: "
-            "contact, furniture, rope, FILE.py:CLASS",
+            "appliance, contact, furniture, rope, FILE.py:CLASS",
         ),
         (
             "train rope-stabilisation",

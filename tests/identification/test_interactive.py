@@ -135,6 +135,20 @@ def test_a_part_that_goes_leaves_the_others_as_they_are(handled):
     assert twin.held == [(1, 0), (0, 0)]
 
 
+def test_an_action_is_kept_although_it_takes_a_part_out(handled):
+    _, seen, handling, _ = handled
+
+    class Merging(Twin):
+        def _held(self, before, after, handling):
+            self.held = list(self.held)  # as a part that is taken out does
+            return -1
+
+    twin = Merging()
+    twin.look(seen.looks[0])
+    twin.observe(handling)
+    assert len(twin.held) == len(twin.handled) == 1
+
+
 def test_nothing_moved_adds_nothing(handled):
     _, twin, handling, _ = handled
     twin = _copy(twin)

@@ -175,7 +175,7 @@ def test_the_file_has_what_was_felt(known):
     _, twin, found = known
     link = assembled(found.described(describe(twin, "door"))).links[0]
     (own,) = found.resistance
-    assert (link.damping, link.friction) == (own.damping, own.friction)
+    assert (link.damping, link.friction) == pytest.approx((own.damping, own.friction))
     still = ArticulatedState(jnp.zeros(1), jnp.zeros(1))
     assert link.mass == pytest.approx(float(found.model.mass[0]), rel=1e-5)
     push = jnp.zeros((1, 7)).at[0, 0].set(1.0)

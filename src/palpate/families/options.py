@@ -65,6 +65,11 @@ class Record(Options, ABC):
     duration: float = 5.0
     """Seconds of each."""
 
+    @property
+    def lasting(self) -> str:
+        """How long each trial is, in words."""
+        return f"{self.duration:g} s"
+
     @abstractmethod
     def record(self) -> Recording:
         """Run the world and keep what its sensors showed."""
@@ -264,6 +269,9 @@ class Identify(Options, ABC):
     def sufficient(self, model: Model, recordings: Sequence[Recording]) -> Model:
         """The model without what cannot show in these recordings, for less work."""
         return model
+
+    def leave(self, folder: Path, model: Model, recordings: Sequence[Recording]) -> None:
+        """Write what else the family has of what was identified into the folder; here nothing."""
 
     def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:
         """Rows for `result.json` of what follows from parameters, "derived" in each.

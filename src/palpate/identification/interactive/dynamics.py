@@ -100,26 +100,25 @@ class Felt:
             },
         )
 
-    def described(self, description: Description) -> Description:
-        """A twin's description with the masses and resistance that were felt."""
-        of = dict(zip(self.parts, self.resistance, strict=True))
+    def described(self, description: Description, model: Articulated | None = None) -> Description:
+        """A twin's description with what was felt, or with what the `model` was identified as."""
+        model = model or self.model
         links, joints = list(description.links), list(description.joints)
-        for number, joint in enumerate(joints):
-            own = of[number]
+        place = {link.name: number for number, link in enumerate(links)}
+        for link, (part, own) in enumerate(zip(self.parts, self.resistance, strict=True)):
             if own is None:
-                continue
-            joints[number] = dataclasses.replace(joint, damping=own.damping, friction=own.friction)
-            place = next(i for i, link in enumerate(links) if link.name == joint.child)
-            inertial = links[place].inertial
-            assert inertial is not None  # of a description without faults
-            links[place] = dataclasses.replace(
-                links[place],
-                inertial=dataclasses.replace(
-                    inertial,
-                    mass=inertial.mass * own.mass_share,
-                    inertia=inertial.inertia * own.mass_share,
-                ),
+                continue  # nobody knows more than what was seen
+            joints[part] = dataclasses.replace(
+                joints[part],
+                damping=float(model.damping[link]),
+                friction=float(model.friction[link]),
             )
+            number = place[joints[part].child]
+            seen = links[number].inertial
+            assert seen is not None  # of a description without faults
+            mass = float(model.mass[link])
+            inertial = dataclasses.replace(seen, mass=mass, inertia=seen.inertia * mass / seen.mass)
+            links[number] = dataclasses.replace(links[number], inertial=inertial)
         return dataclasses.replace(description, links=tuple(links), joints=tuple(joints))
 
 

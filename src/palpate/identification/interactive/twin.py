@@ -79,7 +79,8 @@ class Twin:
         before = self._add_look(handling.before)
         after = self._add_look(handling.after)
         self.handled.append(handling)
-        self.held.append((self._held(before, after, handling), before))
+        part = self._held(before, after, handling)  # may take parts out, and put `held` anew
+        self.held.append((part, before))
         for look in (before, after):
             self.relabel(look)
         self._drop(before, after)

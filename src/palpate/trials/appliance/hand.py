@@ -19,10 +19,12 @@ PATIENCE = 0.6  # s without motion after which it is at the end
 LONGEST = 10.0  # s
 
 
-def handle(world: ApplianceWorld, push: Push, before: Cloud | None = None) -> Handling:
+def handle(
+    world: ApplianceWorld, push: Push, before: Cloud | None = None, longest: float = LONGEST
+) -> Handling:
     """Do it, look before and while the hand still holds on at the end, and let go.
 
-    `before` is what was seen last, if nothing has moved since.
+    `before` is what was seen last, if nothing has moved since. It lasts `longest` s at most.
     """
     before = cloud_of(world.look()) if before is None else before
     times, points, forces = [], [], []
@@ -30,7 +32,7 @@ def handle(world: ApplianceWorld, push: Push, before: Cloud | None = None) -> Ha
     force, start = np.zeros(3), push.point
     wanted = last = waited = furthest = 0.0
     period = world.control_period
-    for number in range(round(LONGEST / period)):
+    for number in range(round(longest / period)):
         seen = world.step(HandAction(does, push.point, force))
         if not seen.holding:
             break

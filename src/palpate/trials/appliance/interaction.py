@@ -9,7 +9,7 @@ import numpy as np
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import Choice
 from palpate.perception.clouds import cloud_of
-from palpate.trials.appliance.hand import handle
+from palpate.trials.appliance.hand import LONGEST, handle
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
 
@@ -21,13 +21,15 @@ class Step:
     seconds: float
 
 
-def interact(world: ApplianceWorld, choose: Choice, pushes: int, seed: int) -> Iterator[Step]:
-    """Look, choose a push and do it, explain what happened; again and again."""
+def interact(
+    world: ApplianceWorld, choose: Choice, pushes: int, seed: int, longest: float = LONGEST
+) -> Iterator[Step]:
+    """Look, choose a push and do it for `longest` s at most, explain what happened; and again."""
     random = np.random.default_rng([seed, 7])
     twin = Twin()
     twin.look(cloud_of(world.look()))
     for _ in range(pushes):
-        handling = handle(world, choose(twin, random), twin.looks[-1])
+        handling = handle(world, choose(twin, random), twin.looks[-1], longest)
         began = time.perf_counter()
         twin.observe(handling)
         twin.look(cloud_of(world.look()))

@@ -1,0 +1,128 @@
+"""Options of the commands that record appliances and identify them, and what they do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from palpate.errors import PalpateError
+from palpate.families.options import Identify, Record
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from palpate.families.appliance.recording import Handled
+    from palpate.models.model import Model
+    from palpate.recordings import Aligned, Recording
+
+TWIN = "twin.urdf"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordAppliance(Record):
+    """Record actions on a simulated appliance: what depth cameras see, and what a hand feels.
+
+    The world is MuJoCo: an appliance of a category that is drawn by the seed. A hand pulls at
+    places that the cameras show, where it tells the most. Each action in which it got hold of
+    something is a trial, as `palpate identify appliance` takes it.
+
+    1. A microwave, six actions:                palpate record appliance --category microwave
+                                                    --out R.npz
+    2. Another one:                             palpate record appliance --category microwave
+                                                    --seed 3 --out R3.npz
+    """
+
+    family: ClassVar[str] = "appliance"
+
+    category: Literal["box", "door", "microwave", "oven", "refrigerator", "storage furniture"] = (
+        "microwave"
+    )
+    """What it is."""
+    trials: int = 6
+    """Actions; those that get no hold are not in the recording."""
+    duration: float = 10.0
+    """Seconds of each, at most."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1.0 <= self.duration < 60.0:
+            raise PalpateError(f"an action lasts 1 to 60 s at most, not {self.duration:g}")
+
+    @property
+    def lasting(self) -> str:
+        return f"at most {self.duration:g} s"
+
+    def record(self) -> Recording:
+        """Actions on one appliance."""
+        from palpate.families.appliance.recording import recorded
+        from palpate.learning.active import CHOICES
+        from palpate.trials.appliance.interaction import interact
+        from palpate.worlds.appliance.appliance import ApplianceWorld
+
+        world = ApplianceWorld(self.category, self.seed)
+        world.reset(self.seed)
+        choose = CHOICES["information"]
+        *_, step = interact(world, choose, self.trials, self.seed, self.duration)
+        about = {"world": "appliance", "category": self.category, "seed": self.seed}
+        return recorded(step.twin.handled, step.twin.looks[-1], about)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyAppliance(Identify):
+    """Identify an appliance: its parts and joints, what they weigh and what resists at them.
+
+    A recording has an action in each trial: depth images before it and at its end with the cameras'
+    intrinsics and poses, and the position (m) and force (N) of a hand that held on to something
+    meanwhile. What moved together is a part, how it moved is its joint; from the forces come mass,
+    friction and damping. The run holds the twin as URDF, too.
+
+    1. A recording of palpate:                  palpate identify appliance R.npz
+    2. Draws of a posterior:                    palpate identify appliance R.npz --method nuts
+    """
+
+    family: ClassVar[str] = "appliance"
+    observation: ClassVar[str] = "joint position"
+    held_out: ClassVar[float] = 0.0  # parts that only one action moved would be lost
+
+    def check(self) -> None:
+        if self.validate:
+            raise PalpateError(
+                "--validate is not for appliances: each recording makes a twin of its own, whose "
+                "joints are not those of another; name all recordings of one appliance together"
+            )
+
+    def prepare(self, recording: Recording) -> Recording:
+        """Joint positions and forces on links, of the twin that the actions make."""
+        from palpate.families.appliance.recording import handled
+
+        return handled(recording)
+
+    def action(self, recording: Recording) -> str:
+        return "force on links"
+
+    def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Model:
+        """The twin, with what a regression of its forces says."""
+        return self._handled(recordings).felt.model
+
+    def leave(self, folder: Path, model: Model, recordings: Sequence[Recording]) -> None:
+        """The twin as URDF with the masses, damping and friction of the model, and a picture."""
+        from palpate.families.appliance.twin_picture import PICTURE, show_twin
+        from palpate.identification.interactive.description import describe
+        from palpate.models.articulated.articulated import Articulated
+        from palpate.models.articulated.urdf import write_urdf
+
+        known = self._handled(recordings)
+        assert isinstance(model, Articulated)  # by `reference`
+        description = known.felt.described(describe(known.twin, "appliance"), model)
+        write_urdf(folder / TWIN, description)
+        known.twin.relabel(0)
+        show_twin(folder / PICTURE, known.twin, "appliance")
+        print(f"twin: {folder / TWIN}")
+
+    def _handled(self, recordings: Sequence[Recording]) -> Handled:
+        from palpate.families.appliance.recording import Handled
+
+        (known,) = recordings
+        assert isinstance(known, Handled)  # by `prepare`
+        return known

@@ -1,0 +1,101 @@
+"""Actions on an appliance as a recording, and the twin that is made of it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from palpate.commands import identify
+from palpate.errors import PalpateError
+from palpate.families.appliance.options import TWIN, IdentifyAppliance, RecordAppliance
+from palpate.families.appliance.recording import FORCE, HAND, Handled, handled
+from palpate.identification.interactive.dynamics import POSITION
+from palpate.models.articulated.urdf import read_urdf
+from palpate.models.files import load_model
+from palpate.recordings import Recording
+from palpate.recordings.files import read_recording, write_recording
+from palpate.worlds.appliance.categories import draw_design
+
+SEED = 600009  # of a microwave with one door
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return RecordAppliance(category="microwave", seed=SEED, trials=2).record()
+
+
+@pytest.fixture(scope="module")
+def known(recording) -> Handled:
+    return handled(recording)
+
+
+def spoilt(recording, **changes):
+    """The recording with a first trial whose parts are exchanged."""
+    first = dataclasses.replace(recording.trials[0], **changes)
+    return dataclasses.replace(recording, trials=(first, *recording.trials[1:]))
+
+
+def changed(trial, name, **changes):
+    return trial.channels | {name: dataclasses.replace(trial[name], **changes)}
+
+
+def test_a_recording_makes_the_twin_that_was_handled(recording, known, tmp_path):
+    (part,) = known.twin.parts
+    assert part.screw.joint == "revolute"
+    assert known.trials[0][POSITION].unit == "rad"
+    (own,) = known.felt.resistance
+    real = draw_design("microwave", SEED).parts[0].resistance
+    assert own.friction == pytest.approx(real.friction, rel=0.2)
+    write_recording(tmp_path / "R.npz", recording)
+    again = handled(read_recording(tmp_path / "R.npz"))
+    assert again.twin.parts[0].screw.axis == pytest.approx(part.screw.axis, abs=1e-4)
+    assert again.felt.resistance[0].friction == pytest.approx(own.friction, rel=1e-2)
+
+
+def test_what_is_missing_is_named(recording):
+    trial = recording.trials[0]
+    with pytest.raises(PalpateError, match="has no depth images: expected events 'depth 1'"):
+        handled(spoilt(recording, events={}))
+    with pytest.raises(PalpateError, match="'depth 1' without a fact 'camera 1'"):
+        handled(spoilt(recording, facts={}))
+    with pytest.raises(PalpateError, match=f"no channel '{HAND}'"):
+        handled(spoilt(recording, channels={FORCE: trial[FORCE]}))
+    values = trial[HAND].values.copy()
+    values[3, 1] = np.nan
+    with pytest.raises(PalpateError, match="moments that are NaN"):
+        handled(spoilt(recording, channels=changed(trial, HAND, values=values)))
+    far = 1e3 * trial[HAND].values
+    with pytest.raises(PalpateError, match="are the positions in m"):
+        handled(spoilt(recording, channels=changed(trial, HAND, values=far)))
+    with pytest.raises(PalpateError, match=r"expected x, y and z in N"):
+        handled(spoilt(recording, channels=changed(trial, FORCE, unit="kgf")))
+    late = trial[FORCE].time + 0.5
+    with pytest.raises(PalpateError, match="different time stamps"):
+        handled(spoilt(recording, channels=changed(trial, FORCE, time=late)))
+    events = {
+        name: dataclasses.replace(one, time=one.time[:1], values=one.values[:1])
+        for name, one in trial.events.items()
+    }
+    with pytest.raises(PalpateError, match="one before the action, one at its end"):
+        handled(spoilt(recording, events=events))
+
+
+def test_options_refuse_what_cannot_be():
+    with pytest.raises(PalpateError, match="--validate is not for appliances"):
+        IdentifyAppliance(recordings=(), validate=("R.npz",)).check()  # type: ignore[arg-type]
+    with pytest.raises(PalpateError, match="1 to 60 s"):
+        RecordAppliance(duration=0.1)
+
+
+def test_the_command_leaves_a_model_and_a_twin(recording, tmp_path, capsys):
+    write_recording(tmp_path / "R.npz", recording)
+    options = IdentifyAppliance(
+        recordings=(tmp_path / "R.npz",), out=tmp_path / "out", iterations=(1, 1, 2)
+    )
+    folder = identify.run(options)
+    model, _ = load_model(folder / "model.json")
+    link = next(one for one in read_urdf(folder / TWIN).links if one.name != "body")
+    assert link.inertial is not None
+    assert link.inertial.mass == pytest.approx(float(model.mass[0]), rel=1e-4)
+    assert (folder / "twin.png").is_file()
+    assert "friction" in capsys.readouterr().out

@@ -8,7 +8,7 @@ import pytest
 from palpate.commands import identify
 from palpate.errors import PalpateError
 from palpate.families.appliance.options import TWIN, IdentifyAppliance, RecordAppliance
-from palpate.families.appliance.recording import FORCE, HAND, Handled, handled
+from palpate.families.appliance.recording import FORCE, HAND, ApplianceTwin, twin_of
 from palpate.identification.interactive.dynamics import POSITION
 from palpate.models.articulated.urdf import read_urdf
 from palpate.models.files import load_model
@@ -25,8 +25,8 @@ def recording() -> Recording:
 
 
 @pytest.fixture(scope="module")
-def known(recording) -> Handled:
-    return handled(recording)
+def known(recording) -> ApplianceTwin:
+    return twin_of(recording)
 
 
 def spoilt(recording, **changes):
@@ -43,41 +43,41 @@ def test_a_recording_makes_the_twin_that_was_handled(recording, known, tmp_path)
     (part,) = known.twin.parts
     assert part.screw.joint == "revolute"
     assert known.trials[0][POSITION].unit == "rad"
-    (own,) = known.felt.resistance
+    (own,) = known.dynamics.resistance
     real = draw_design("microwave", SEED).parts[0].resistance
     assert own.friction == pytest.approx(real.friction, rel=0.2)
     write_recording(tmp_path / "R.npz", recording)
-    again = handled(read_recording(tmp_path / "R.npz"))
+    again = twin_of(read_recording(tmp_path / "R.npz"))
     assert again.twin.parts[0].screw.axis == pytest.approx(part.screw.axis, abs=1e-4)
-    assert again.felt.resistance[0].friction == pytest.approx(own.friction, rel=1e-2)
+    assert again.dynamics.resistance[0].friction == pytest.approx(own.friction, rel=1e-2)
 
 
 def test_what_is_missing_is_named(recording):
     trial = recording.trials[0]
     with pytest.raises(PalpateError, match="has no depth images: expected events 'depth 1'"):
-        handled(spoilt(recording, events={}))
+        twin_of(spoilt(recording, events={}))
     with pytest.raises(PalpateError, match="'depth 1' without a fact 'camera 1'"):
-        handled(spoilt(recording, facts={}))
+        twin_of(spoilt(recording, facts={}))
     with pytest.raises(PalpateError, match=f"no channel '{HAND}'"):
-        handled(spoilt(recording, channels={FORCE: trial[FORCE]}))
+        twin_of(spoilt(recording, channels={FORCE: trial[FORCE]}))
     values = trial[HAND].values.copy()
     values[3, 1] = np.nan
     with pytest.raises(PalpateError, match="moments that are NaN"):
-        handled(spoilt(recording, channels=changed(trial, HAND, values=values)))
+        twin_of(spoilt(recording, channels=changed(trial, HAND, values=values)))
     far = 1e3 * trial[HAND].values
     with pytest.raises(PalpateError, match="are the positions in m"):
-        handled(spoilt(recording, channels=changed(trial, HAND, values=far)))
+        twin_of(spoilt(recording, channels=changed(trial, HAND, values=far)))
     with pytest.raises(PalpateError, match=r"expected x, y and z in N"):
-        handled(spoilt(recording, channels=changed(trial, FORCE, unit="kgf")))
+        twin_of(spoilt(recording, channels=changed(trial, FORCE, unit="kgf")))
     late = trial[FORCE].time + 0.5
     with pytest.raises(PalpateError, match="different time stamps"):
-        handled(spoilt(recording, channels=changed(trial, FORCE, time=late)))
+        twin_of(spoilt(recording, channels=changed(trial, FORCE, time=late)))
     events = {
         name: dataclasses.replace(one, time=one.time[:1], values=one.values[:1])
         for name, one in trial.events.items()
     }
     with pytest.raises(PalpateError, match="one before the action, one at its end"):
-        handled(spoilt(recording, events=events))
+        twin_of(spoilt(recording, events=events))
 
 
 def test_options_refuse_what_cannot_be():

@@ -15,9 +15,9 @@ from palpate.identification.interactive.dynamics import (
     POSITION,
     _Action,
     _upright,
-    felt,
+    dynamics_of,
 )
-from palpate.identification.interactive.resistance import Moments, regress
+from palpate.identification.interactive.resistance import JointMotion, regress
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated import ArticulatedState
@@ -33,7 +33,7 @@ PERIOD = 0.02
 INERTIA, DAMPING, FRICTION = 0.4, 0.3, 0.9
 
 
-def moments(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3, seed=0):
+def motion(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3, seed=0):
     """A joint that a torque drives one way, by small steps; the inertia was guessed as half."""
     steps = 20
     random = np.random.default_rng(seed)
@@ -53,12 +53,12 @@ def moments(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3
     acts[1:] = 0.5 * (acts[1:] + acts[:-1])
     seen = np.array(found) + noise * random.standard_normal(len(found))
     gravity = np.full(len(times), 0.5 * weight)
-    return Moments(times, seen, acts, gravity, guess)
+    return JointMotion(times, seen, acts, gravity, guess)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_regression_tells_inertia_damping_and_friction_apart(sign):
-    known = regress([moments(sign), moments(sign, seed=1)])
+    known = regress([motion(sign), motion(sign, seed=1)])
     assert known is not None
     assert known.mass_share * 0.2 == pytest.approx(INERTIA, rel=0.06)
     assert known.damping == pytest.approx(DAMPING, rel=0.15)
@@ -71,7 +71,7 @@ def test_regression_tells_inertia_damping_and_friction_apart(sign):
 
 def test_a_spring_is_found_only_where_there_is_one():
     spring = {"stiffness": 0.5, "rest": 0.4}
-    known = regress([moments(sign, seed=seed, **spring) for sign in (1.0, -1.0) for seed in (0, 1)])
+    known = regress([motion(sign, seed=seed, **spring) for sign in (1.0, -1.0) for seed in (0, 1)])
     assert known is not None
     assert known.stiffness == pytest.approx(0.5, rel=0.15)
     assert known.pull / known.stiffness == pytest.approx(0.4, abs=0.1)
@@ -79,20 +79,20 @@ def test_a_spring_is_found_only_where_there_is_one():
 
 
 def test_what_a_part_weighs_is_no_friction():
-    known = regress([moments(weight=0.6, seed=seed) for seed in range(2)])
+    known = regress([motion(weight=0.6, seed=seed) for seed in range(2)])
     assert known is not None
     assert known.mass_share == pytest.approx(2.0, rel=0.1)
     assert known.friction == pytest.approx(FRICTION, rel=0.12)
 
 
 def test_a_joint_that_rests_tells_nothing():
-    still = moments()
+    still = motion()
     assert regress([]) is None
     assert regress([still._replace(positions=np.zeros(len(still.times)))]) is None
 
 
 def test_draws_spread_as_far_as_is_known_and_nothing_is_negative():
-    known = regress([moments()])
+    known = regress([motion()])
     assert known is not None
     drawn = known.draws(4000, np.random.default_rng(0))
     assert np.all(drawn[:, :4] >= 0.0)
@@ -113,7 +113,7 @@ def known():
     world = ApplianceWorld("microwave", 600009)
     world.reset(600009)
     *_, last = interact(world, CHOICES["information"], 4, 600009)
-    return world, last.twin, felt(last.twin)
+    return world, last.twin, dynamics_of(last.twin)
 
 
 def test_a_door_is_felt_as_it_is(known):
@@ -147,7 +147,7 @@ def test_a_force_of_a_period_is_half_a_period_late(known):
     _, twin, found = known
     action = next(one for one in map(partial(_Action, twin), range(len(twin.held)))
                   if one.part == 0 and one.handling.moved)  # fmt: skip
-    acts = action.moments(assembled(describe(twin, "door")).links, found.parts).acts
+    acts = action.motion(assembled(describe(twin, "door")).links, found.parts).effort
     trial = action.trial(slice(0, len(acts)), found.parts)
     forces = trial[FORCE].values[:, 0, 1:4]
     along = action.screw.velocity(action.handling.points[1 : len(acts) - 1])
@@ -173,7 +173,7 @@ def test_the_twin_moves_as_the_appliance_does(known):
 
 def test_the_file_has_what_was_felt(known):
     _, twin, found = known
-    link = assembled(found.described(describe(twin, "door"))).links[0]
+    link = assembled(found.describe_with(describe(twin, "door"))).links[0]
     (own,) = found.resistance
     assert (link.damping, link.friction) == pytest.approx((own.damping, own.friction))
     still = ArticulatedState(jnp.zeros(1), jnp.zeros(1))
@@ -186,7 +186,7 @@ def test_the_file_has_what_was_felt(known):
 
 def test_without_an_action_nothing_is_felt():
     with pytest.raises(PalpateError, match="no part was found"):
-        felt(_looked())
+        dynamics_of(_looked())
 
 
 def _looked() -> Twin:

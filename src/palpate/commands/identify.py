@@ -90,7 +90,7 @@ def run(options: Identify) -> Path:
                 run=run,
             )
             hypotheses = dataclasses.replace(hypotheses, models=models)
-            options.leave(run.path, found.model, data.shown)
+            options.write_products(run.path, found.model, data.shown)
             write = _write_fit if options.fits else _write_draws
             write(run, options, data, hypotheses, found)
         result = read_result(run.path / RESULT)

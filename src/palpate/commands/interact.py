@@ -7,7 +7,7 @@ from palpate.commands.options import Interact
 from palpate.errors import PalpateError
 from palpate.families.appliance.twin_picture import PICTURE, show_twin
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.dynamics import Felt, felt
+from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated.mjcf import write_mjcf
@@ -39,11 +39,11 @@ def run(options: Interact) -> Path:
             description = describe(twin, options.category.replace(" ", "_"))
             lines = rows(twin)
             try:
-                known = felt(twin)
+                known = dynamics_of(twin)
             except PalpateError as error:
                 lines.append(f"masses and resistance are guesses: {error}")
             else:
-                description = known.described(description)
+                description = known.describe_with(description)
                 lines += [*resistances(known), *(f"warning: {one}" for one in known.warnings)]
             write_urdf(run.path / TWIN, description)
             write_mjcf(run.path / OTHER, description)
@@ -83,7 +83,7 @@ def rows(twin: Twin) -> list[str]:
     return found
 
 
-def resistances(known: Felt) -> list[str]:
+def resistances(known: Dynamics) -> list[str]:
     """What resists at each joint with 90 % intervals, a line each; of parts that were moved."""
     found = []
     for part, own, inertia in zip(known.parts, known.resistance, known.inertia, strict=True):

@@ -38,7 +38,7 @@ def run(options: Record) -> Path:
         count = len(read_result(run.path / RESULT).settings["trial_names"])
         path = folders.deliver(options, run, folders.RECORDING)
     trials = "1 trial" if count == 1 else f"{count} trials"
-    print(f"recording: {path} ({trials} of {options.lasting})")
+    print(f"recording: {path} ({trials} of {options.duration_in_words})")
     return path
 
 

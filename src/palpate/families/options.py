@@ -66,7 +66,7 @@ class Record(Options, ABC):
     """Seconds of each."""
 
     @property
-    def lasting(self) -> str:
+    def duration_in_words(self) -> str:
         """How long each trial is, in words."""
         return f"{self.duration:g} s"
 
@@ -270,7 +270,7 @@ class Identify(Options, ABC):
         """The model without what cannot show in these recordings, for less work."""
         return model
 
-    def leave(self, folder: Path, model: Model, recordings: Sequence[Recording]) -> None:
+    def write_products(self, folder: Path, model: Model, recordings: Sequence[Recording]) -> None:
         """Write what else the family has of what was identified into the folder; here nothing."""
 
     def meanings(self, models: Model, prior: Model) -> list[dict[str, Any]]:

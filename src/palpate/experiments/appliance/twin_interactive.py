@@ -18,7 +18,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, ratio
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.dynamics import felt
+from palpate.identification.interactive.dynamics import dynamics_of
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated.urdf import write_urdf
@@ -93,7 +93,7 @@ def of_appliance(experiment: Experiment, name: str, number: int, choose: str) ->
         listed = {key: _plain(np.asarray(value).tolist()) for key, value in vars(last).items()}
         found = {"score": listed, "pushes_to_near": near, "seconds": seconds}
         if moves:
-            found |= moved(state.twin, world, last, number)
+            found |= motion_of(state.twin, world, last, number)
         return found | {"whole_s": time.perf_counter() - began}
 
     first = experiment.seed + (FIRST_QUICK if experiment.quick else FIRST)
@@ -102,7 +102,7 @@ def of_appliance(experiment: Experiment, name: str, number: int, choose: str) ->
     return experiment.found(f"{name}-{number}-{choose}", about, work)
 
 
-def moved(twin: Twin, world: ApplianceWorld, found: Score, number: int) -> dict[str, Any]:
+def motion_of(twin: Twin, world: ApplianceWorld, found: Score, number: int) -> dict[str, Any]:
     """How the twin moves beside the appliance, and the seconds until its URDF is written.
 
     `parts` are those that were found with their kind of joint, `unmoved` those of them that no
@@ -110,10 +110,10 @@ def moved(twin: Twin, world: ApplianceWorld, found: Score, number: int) -> dict[
     """
     began = time.perf_counter()
     try:
-        known = felt(twin)
-        description = known.described(describe(twin, "twin"))
+        known = dynamics_of(twin)
+        description = known.describe_with(describe(twin, "twin"))
     except PalpateError as error:
-        return {"motions": [], "unfelt": str(error)}
+        return {"motions": [], "unknown": str(error)}
     with tempfile.TemporaryDirectory() as folder:
         write_urdf(Path(folder) / "twin.urdf", description)
     seconds = time.perf_counter() - began

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from palpate.families.appliance.recording import Handled
+    from palpate.families.appliance.recording import ApplianceTwin
     from palpate.models.model import Model
     from palpate.recordings import Aligned, Recording
 
@@ -50,12 +50,12 @@ class RecordAppliance(Record):
             raise PalpateError(f"an action lasts 1 to 60 s at most, not {self.duration:g}")
 
     @property
-    def lasting(self) -> str:
+    def duration_in_words(self) -> str:
         return f"at most {self.duration:g} s"
 
     def record(self) -> Recording:
         """Actions on one appliance."""
-        from palpate.families.appliance.recording import recorded
+        from palpate.families.appliance.recording import recording_of
         from palpate.learning.active import CHOICES
         from palpate.trials.appliance.interaction import interact
         from palpate.worlds.appliance.appliance import ApplianceWorld
@@ -65,7 +65,7 @@ class RecordAppliance(Record):
         choose = CHOICES["information"]
         *_, step = interact(world, choose, self.trials, self.seed, self.duration)
         about = {"world": "appliance", "category": self.category, "seed": self.seed}
-        return recorded(step.twin.handled, step.twin.looks[-1], about)
+        return recording_of(step.twin.handled, step.twin.looks[-1], about)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,35 +94,35 @@ class IdentifyAppliance(Identify):
 
     def prepare(self, recording: Recording) -> Recording:
         """Joint positions and forces on links, of the twin that the actions make."""
-        from palpate.families.appliance.recording import handled
+        from palpate.families.appliance.recording import twin_of
 
-        return handled(recording)
+        return twin_of(recording)
 
     def action(self, recording: Recording) -> str:
         return "force on links"
 
     def reference(self, recordings: Sequence[Recording], aligned: Aligned) -> Model:
         """The twin, with what a regression of its forces says."""
-        return self._handled(recordings).felt.model
+        return self._twin(recordings).dynamics.model
 
-    def leave(self, folder: Path, model: Model, recordings: Sequence[Recording]) -> None:
+    def write_products(self, folder: Path, model: Model, recordings: Sequence[Recording]) -> None:
         """The twin as URDF with the masses, damping and friction of the model, and a picture."""
         from palpate.families.appliance.twin_picture import PICTURE, show_twin
         from palpate.identification.interactive.description import describe
         from palpate.models.articulated.articulated import Articulated
         from palpate.models.articulated.urdf import write_urdf
 
-        known = self._handled(recordings)
+        known = self._twin(recordings)
         assert isinstance(model, Articulated)  # by `reference`
-        description = known.felt.described(describe(known.twin, "appliance"), model)
+        description = known.dynamics.describe_with(describe(known.twin, "appliance"), model)
         write_urdf(folder / TWIN, description)
         known.twin.relabel(0)
         show_twin(folder / PICTURE, known.twin, "appliance")
         print(f"twin: {folder / TWIN}")
 
-    def _handled(self, recordings: Sequence[Recording]) -> Handled:
-        from palpate.families.appliance.recording import Handled
+    def _twin(self, recordings: Sequence[Recording]) -> ApplianceTwin:
+        from palpate.families.appliance.recording import ApplianceTwin
 
         (known,) = recordings
-        assert isinstance(known, Handled)  # by `prepare`
+        assert isinstance(known, ApplianceTwin)  # by `prepare`
         return known

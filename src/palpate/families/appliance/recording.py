@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.identification.interactive.dynamics import Felt, felt
+from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import DepthImage, Pinhole
@@ -27,23 +27,25 @@ LARGEST = 5.0  # m: a hand that goes further is in another unit
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Handled(Recording):
+class ApplianceTwin(Recording):
     """Joint positions and forces of a twin that was made of actions, with the twin."""
 
     twin: Twin
-    felt: Felt
+    dynamics: Dynamics
 
     @property
     def notes(self) -> tuple[str, ...]:
-        return (*super().notes, *self.felt.warnings)
+        return (*super().notes, *self.dynamics.warnings)
 
 
-def recorded(handled: Sequence[Handling], last: Cloud, about: dict[str, str | int]) -> Recording:
+def recording_of(
+    handlings: Sequence[Handling], last: Cloud, about: dict[str, str | int]
+) -> Recording:
     """Actions as a recording; `last` is what was seen after them.
 
     Those without a hold are left out: nothing was felt. Raises `PalpateError` where none had one.
     """
-    kept = [one for one in handled if one.held]
+    kept = [one for one in handlings if one.held]
     if not kept:
         raise PalpateError("no hand got hold of anything: nothing was felt; try another seed")
     trials = []
@@ -76,7 +78,7 @@ def recorded(handled: Sequence[Handling], last: Cloud, about: dict[str, str | in
     return Recording(tuple(trials), about)
 
 
-def handled(recording: Recording) -> Handled:
+def twin_of(recording: Recording) -> ApplianceTwin:
     """The twin that a recording's actions make, and what was felt of its joints.
 
     Raises `PalpateError` for a recording that lacks what this module describes, in which no part
@@ -90,9 +92,9 @@ def handled(recording: Recording) -> Handled:
         twin.observe(_handling(trial, before, after))
         if released:
             twin.look(released[0])
-    known = felt(twin)
+    known = dynamics_of(twin)
     about = {**recording.provenance, "parts": len(twin.parts)}
-    return Handled(known.recording.trials, about, twin, known)
+    return ApplianceTwin(known.recording.trials, about, twin, known)
 
 
 def _handling(trial: Trial, before: Cloud, after: Cloud) -> Handling:

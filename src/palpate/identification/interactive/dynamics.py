@@ -17,7 +17,7 @@ from jaxtyping import Float
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.resistance import Moments, Resistance, regress
+from palpate.identification.interactive.resistance import JointMotion, Resistance, regress
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.articulated import ACTION, Articulated
@@ -40,7 +40,7 @@ UNKNOWN = Resistance(1.0, 0.5, 2.0, 0.0, 0.0, np.diag([1.0, 0.5, 2.0, 0.0, 0.0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Felt:
+class Dynamics:
     """What a twin's actions say of its dynamics.
 
     `recording` has the channels `POSITION` (links,), NaN of what moved unseen, and `FORCE`
@@ -100,7 +100,9 @@ class Felt:
             },
         )
 
-    def described(self, description: Description, model: Articulated | None = None) -> Description:
+    def describe_with(
+        self, description: Description, model: Articulated | None = None
+    ) -> Description:
         """A twin's description with what was felt, or with what the `model` was identified as."""
         model = model or self.model
         links, joints = list(description.links), list(description.joints)
@@ -122,7 +124,7 @@ class Felt:
         return dataclasses.replace(description, links=tuple(links), joints=tuple(joints))
 
 
-def felt(twin: Twin) -> Felt:
+def dynamics_of(twin: Twin) -> Dynamics:
     """From each action in which a hand moved a part, and nothing that carries it moved.
 
     What happens at the end of a joint, where a stop pushes, is left out; where a latch is found to
@@ -142,10 +144,10 @@ def felt(twin: Twin) -> Felt:
     latches: list[float] = []
     for part in parts:
         own = [one for one in actions if one.part == part]
-        moments = [one.moments(links, parts) for one in own]
-        known = regress([one for one in moments if len(one.times) >= SHORTEST])
+        motions = [one.motion(links, parts) for one in own]
+        known = regress([one for one in motions if len(one.times) >= SHORTEST])
         resistance.append(known)
-        inertia.append(known.mass_share * moments[0].inertia if known else 0.0)
+        inertia.append(known.mass_share * motions[0].inertia if known else 0.0)
         latches.append(max((one.latch(known) for one in own if known), default=0.0))
     trials = []
     for one in actions:
@@ -161,7 +163,7 @@ def felt(twin: Twin) -> Felt:
     period = float(f"{np.median(np.diff(trials[0][POSITION].time)):.5g}")
     recording = Recording(tuple(trials), {"source": "actions on an appliance"})
     model = _model(links, resistance, period)
-    return Felt(recording, model, parts, resistance, inertia, latches)
+    return Dynamics(recording, model, parts, resistance, inertia, latches)
 
 
 def _interval(twin: Twin, part: int) -> float:
@@ -247,18 +249,18 @@ class _Action:
         along = self.screw.velocity(self.start)
         lever = float(np.linalg.norm(along))
         loose = int(np.argmax(self.away * lever > LOOSE))
-        acts = np.abs(self.handling.forces[: max(loose - DELAY, 1)] @ along)
-        more = float(acts[-3:].mean()) - known.friction
+        effort = np.abs(self.handling.forces[: max(loose - DELAY, 1)] @ along)
+        more = float(effort[-3:].mean()) - known.friction
         return more if more > STICKS * known.friction + LIGHT * lever else 0.0
 
-    def moments(self, links: list[Link], parts: list[int]) -> Moments:
+    def motion(self, links: list[Link], parts: list[int]) -> JointMotion:
         """How the joint moved, and what acted on it."""
         twin, screw, handling = self.twin, self.screw, self.handling
         chosen = self.span(latched=False)
         # a force is the mean of the period before: at a moment it is that of the two around it
         forces = handling.forces.copy()
         forces[:-1] = 0.5 * (forces[:-1] + forces[1:])
-        acts = [f @ screw.velocity(at) for f, at in zip(forces, handling.points, strict=True)]
+        effort = [f @ screw.velocity(at) for f, at in zip(forces, handling.points, strict=True)]
         level = dataclasses.replace(screw, axis=_upright(screw.axis, _interval(twin, self.part)))
         gone = self.positions[chosen] - twin.parts[self.part].positions[self.before]
         weight, inertia = np.zeros(len(gone)), 0.0
@@ -275,8 +277,12 @@ class _Action:
                 inertia += float(axis @ np.asarray(link.inertia) @ axis)
             along = [level.velocity(level.pose(each).at(centre[None])[0]) for each in gone]
             weight += link.mass * np.array(along).reshape(-1, 3) @ np.array(GRAVITY)
-        return Moments(
-            handling.times[chosen], self.positions[chosen], np.array(acts)[chosen], weight, inertia
+        return JointMotion(
+            handling.times[chosen],
+            self.positions[chosen],
+            np.array(effort)[chosen],
+            weight,
+            inertia,
         )
 
     def trial(self, span: slice, parts: list[int]) -> Trial:

@@ -26,17 +26,17 @@ INFLATION = 2.0
 PARAMETERS = 5
 
 
-class Moments(NamedTuple):
-    """One action: where a joint was (rad or m) at `times` (s), and what acted along it.
+class JointMotion(NamedTuple):
+    """One action: where a joint was (rad or m) at `times` (s), and what acted on it.
 
-    `acts` (N m or N) is of the hand, `weight` of gravity and `inertia` (kg m^2 or kg) of the parts
-    that it moves, both for masses that are guessed.
+    `effort` (N m or N) is that of the hand and `gravity` what weight does; `inertia` (kg m^2 or kg)
+    is of the parts that it moves. The last two are for masses that are guessed.
     """
 
     times: Float[np.ndarray, " times"]
     positions: Float[np.ndarray, " times"]
-    acts: Float[np.ndarray, " times"]
-    weight: Float[np.ndarray, " times"]
+    effort: Float[np.ndarray, " times"]
+    gravity: Float[np.ndarray, " times"]
     inertia: float
 
 
@@ -68,7 +68,7 @@ class Resistance(NamedTuple):
         return found
 
 
-def regress(actions: Sequence[Moments]) -> Resistance | None:
+def regress(actions: Sequence[JointMotion]) -> Resistance | None:
     """By non-negative least squares; None where too few windows show motion.
 
     A spring is only believed where Bayes' information criterion falls by `EVIDENT`. How far the
@@ -80,7 +80,7 @@ def regress(actions: Sequence[Moments]) -> Resistance | None:
     table = table[speed > MOVES * speed.max(initial=0.0)]
     if len(table) < FEWEST:
         return None
-    # acts = share (inertia acceleration - weight) + damping velocity + friction sign
+    # effort = share (inertia acceleration - gravity) + damping velocity + friction sign
     #        + stiffness position - pull
     plain, sprung = [0, 1, 2], [0, 1, 2, 3, 4]
     evident = _fit(table, sprung)[1] < _fit(table, plain)[1] - EVIDENT
@@ -111,8 +111,8 @@ def _window(moments: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return inner**4, first, second
 
 
-def _rows(action: Moments) -> list[np.ndarray]:
-    """Integrals over each window: of what each unknown is multiplied by, and of what acts."""
+def _rows(action: JointMotion) -> list[np.ndarray]:
+    """Integrals over each window: of what each unknown is multiplied by, and of what effort."""
     moments = int(np.clip(SHARE * len(action.times), SHORT, LONG))
     value, first, second = (each / moments for each in _window(moments))
     period = float(np.median(np.diff(action.times)))
@@ -126,12 +126,12 @@ def _rows(action: Moments) -> list[np.ndarray]:
             continue  # it may have stuck, and friction is then anything
         velocity = -float(first @ gone) / period
         found.append(np.array([
-            action.inertia * float(second @ gone) / period**2 - float(value @ action.weight[part]),
+            action.inertia * float(second @ gone) / period**2 - float(value @ action.gravity[part]),
             velocity,
             np.sign(velocity) * value.sum(),
             float(value @ position),
             -value.sum(),
-            float(value @ action.acts[part]),
+            float(value @ action.effort[part]),
         ]))  # fmt: skip
     return found
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from palpate.identification.interactive.dynamics import Felt
+from palpate.identification.interactive.dynamics import Dynamics
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.articulated import ACTION, Articulated
 from palpate.models.articulated.parameters import ArticulatedState
@@ -49,7 +49,7 @@ class Motion:
 
 
 def motions(
-    twin: Twin, felt: Felt, world: ApplianceWorld, found: Score, seed: int
+    twin: Twin, dynamics: Dynamics, world: ApplianceWorld, found: Score, seed: int
 ) -> list[Motion | None]:
     """Of each real part that was found with its kind of joint; None where no force moves it so far.
 
@@ -63,14 +63,16 @@ def motions(
             continue
         seen = points[labels == real]
         result.append(
-            _motion(twin, felt, world, real, int(part), seen, random, seed) if len(seen) else None
+            _motion(twin, dynamics, world, real, int(part), seen, random, seed)
+            if len(seen)
+            else None
         )
     return result
 
 
 def _motion(
     twin: Twin,
-    felt: Felt,
+    dynamics: Dynamics,
     world: ApplianceWorld,
     real: int,
     part: int,
@@ -101,15 +103,15 @@ def _motion(
     if real_way is None:
         return None
     look = len(twin.looks) - 1
-    link = felt.parts.index(part)
+    link = dynamics.parts.index(part)
     hold = twin.pose(part, look).inverse.at(seen[chosen][None])[0] - twin.parts[part].screw.point
-    acts = np.zeros((len(times), len(felt.parts), ACTION), np.float32)
+    acts = np.zeros((len(times), len(dynamics.parts), ACTION), np.float32)
     acts[:, link, 1:4] = force * shape[:, None] * direction
     acts[:, link, 4:] = hold
-    start = np.array([twin.parts[one].positions[look] for one in felt.parts])
-    models = felt.draws(DRAWS, seed)
+    start = np.array([twin.parts[one].positions[look] for one in dynamics.parts])
+    models = dynamics.draws(DRAWS, seed)
     ways = np.asarray(_rolled(models, jnp.asarray(start), jnp.asarray(acts)))[:, :, link]
-    alone = np.asarray(_rolled(_batch(felt.model), jnp.asarray(start), jnp.asarray(acts)))[
+    alone = np.asarray(_rolled(_batch(dynamics.model), jnp.asarray(start), jnp.asarray(acts)))[
         0, :, link
     ]
     sign = 1.0 if twin.screw(part, look).axis @ axis > 0.0 else -1.0
@@ -121,7 +123,7 @@ def _motion(
         error=float(np.sqrt(np.mean(np.square(off)))),
         still=float(np.sqrt(np.mean(np.square(gone / own.range)))),
         covered=float(np.mean((gone >= low) & (gone <= high))),
-        inside=_inside(felt, link, world, real),
+        inside=_inside(dynamics, link, world, real),
     )
 
 
@@ -171,13 +173,15 @@ def _batch(model: Articulated) -> Articulated:
     )  # fmt: skip
 
 
-def _inside(felt: Felt, link: int, world: ApplianceWorld, real: int) -> tuple[bool, bool, bool]:
+def _inside(
+    dynamics: Dynamics, link: int, world: ApplianceWorld, real: int
+) -> tuple[bool, bool, bool]:
     """Whether friction, damping and inertia are in their 90 % intervals."""
-    own, resists = felt.resistance[link], world.design.parts[real].resistance
+    own, resists = dynamics.resistance[link], world.design.parts[real].resistance
     if own is None:
         return False, False, False
     wide = 1.645 * own.deviation
-    inertia = felt.inertia[link]
+    inertia = dynamics.inertia[link]
     return (
         bool(abs(own.friction - resists.friction) < wide[2]),
         bool(abs(own.damping - resists.damping) < wide[1]),

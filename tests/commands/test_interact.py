@@ -15,6 +15,10 @@ def test_a_microwave_is_handled_and_its_twin_is_taken_by_mujoco(tmp_path, capsys
     assert said.count("push ") == 3
     assert "part 1: " in said
     assert "degrees" in said
+    assert "part 1: inertia " in said
+    assert "N m s (90 %)" in said
+    joints = {joint.child: joint for joint in read_urdf(out / "twin.urdf").joints}
+    assert joints["part 1"].friction > 0.05
     for file in ("twin.urdf", "twin.xml"):
         assert refusal(out / file) == ""
     assert len(assembled(read_urdf(out / "twin.urdf")).links) >= 1

@@ -18,6 +18,7 @@ from palpate.trials.appliance.interaction import interact
 from palpate.trials.appliance.score import Labels, figures_of, real_labels, score
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
+UNITS = {"revolute": ("kg m^2", "N m", "N m s"), "prismatic": ("kg", "N", "N s/m")}
 TWIN, OTHER = "twin.urdf", "twin.xml"
 
 
@@ -44,7 +45,7 @@ def run(options: Interact) -> Path:
                 lines.append(f"masses and resistance are guesses: {error}")
             else:
                 description = known.describe_with(description)
-                lines += [*resistances(known), *(f"warning: {one}" for one in known.warnings)]
+                lines += [*resistances(twin, known), *(f"warning: {one}" for one in known.warnings)]
             write_urdf(run.path / TWIN, description)
             write_mjcf(run.path / OTHER, description)
             twin.relabel(0)  # of parts that were found later, too
@@ -83,17 +84,20 @@ def rows(twin: Twin) -> list[str]:
     return found
 
 
-def resistances(known: Dynamics) -> list[str]:
+def resistances(twin: Twin, known: Dynamics) -> list[str]:
     """What resists at each joint with 90 % intervals, a line each; of parts that were moved."""
     found = []
     for part, own, inertia in zip(known.parts, known.resistance, known.inertia, strict=True):
         if own is None:
             continue
+        kind = twin.parts[part].screw.joint
+        of_mass, of_force, of_damping = UNITS[kind]
         share, damping, friction, *_ = 1.645 * own.deviation
-        heavy = 100.0 * share / own.mass_share
+        what = "inertia" if kind == "revolute" else "mass"
         found.append(
-            f"part {part + 1}: inertia {inertia:.3g} kg m^2 or kg to {heavy:.0f} %, friction "
-            f"{own.friction:.2g} +- {friction:.1g} N m or N, damping {own.damping:.2g} +- "
-            f"{damping:.1g} N m s or N s/m (90 %)"
+            f"part {part + 1}: {what} {inertia:.3g} {of_mass} to "
+            f"{100.0 * share / own.mass_share:.0f} %, friction {own.friction:.2g} +- "
+            f"{friction:.1g} {of_force}, damping {own.damping:.2g} +- {damping:.1g} "
+            f"{of_damping} (90 %)"
         )
     return found

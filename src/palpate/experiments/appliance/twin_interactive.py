@@ -105,8 +105,8 @@ def of_appliance(experiment: Experiment, name: str, number: int, choose: str) ->
 def motion_of(twin: Twin, world: ApplianceWorld, found: Score, number: int) -> dict[str, Any]:
     """How the twin moves beside the appliance, and the seconds until its URDF is written.
 
-    `parts` are those that were found with their kind of joint, `unmoved` those of them that no
-    force within the hand's moves far enough.
+    `unmoved` counts parts that were found with their kind of joint, and are hidden in the last look
+    or moved far enough by no force of the hand; `unknown` says why nothing is known of forces.
     """
     began = time.perf_counter()
     try:

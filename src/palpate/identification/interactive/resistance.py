@@ -112,7 +112,7 @@ def _window(moments: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _rows(action: JointMotion) -> list[np.ndarray]:
-    """Integrals over each window: of what each unknown is multiplied by, and of what effort."""
+    """Integrals over each window: of what each unknown is multiplied by, and of the effort."""
     moments = int(np.clip(SHARE * len(action.times), SHORT, LONG))
     value, first, second = (each / moments for each in _window(moments))
     period = float(np.median(np.diff(action.times)))

@@ -35,7 +35,7 @@ ATTEMPTS = 20  # at taking hold
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """How far a twin's motion is off, as shares of the part's range; NaN of none.
+    """How far a twin's motion is off, as shares of the part's range.
 
     `error` and `still` are root mean squares over the motion, of the twin and of one that stands
     still. `covered` is the share of moments in which 90 % of the draws hold the truth. `inside`
@@ -51,9 +51,10 @@ class Motion:
 def motions(
     twin: Twin, dynamics: Dynamics, world: ApplianceWorld, found: Score, seed: int
 ) -> list[Motion | None]:
-    """Of each real part that was found with its kind of joint; None where no force moves it so far.
+    """Of each real part that was found with its kind of joint.
 
-    The world is as it was in the twin's last look, and is left as it is.
+    None of one that no force of the hand moves by `LEAST` of its range, or that is hidden. The
+    world is as it was in the twin's last look, and is left as it is.
     """
     random = np.random.default_rng([seed, 11])
     labels, points = real_labels(twin, world), twin.looks[-1].points

@@ -88,7 +88,8 @@ STAGES = {
         *("worlds.arm.maze", "worlds.arm.panda", "worlds.arm.control", "worlds.arm.joints"),
         *("worlds.contact.plates", "worlds.contact.touching"),
         *("worlds.appliance.appliance", "worlds.appliance.categories", "worlds.appliance.design"),
-        *("worlds.appliance.fittings", "worlds.depth"),
+        *("worlds.appliance.fittings", "worlds.appliance.foreign", "worlds.depth"),
+        *("worlds.appliance.generated", "worlds.appliance.scene", "families.appliance.foreign"),
         *(
             "safety.impedance",
             "safety.self_tuning",

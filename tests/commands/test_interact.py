@@ -35,6 +35,23 @@ def test_what_cannot_be_is_refused(tmp_path, capsys):
         (["microwve"], "unknown category 'microwve'; did you mean 'microwave'?"),
         (["oven", "--pushes", "0"], "--pushes is 1 or greater, not 0"),
         (["oven", "--views", "9"], "1 to 4 cameras, not 9"),
+        (["oven", "--body", "door"], "--body is of a file, and oven is none"),
+        (["none.urdf"], "cannot read none.urdf"),
     ):
         assert main(["interact", *words, "--out", str(tmp_path / "twin")]) == 2
         assert sentence in capsys.readouterr().err
+
+
+def test_a_file_of_yours_is_handled(tmp_path, capsys):
+    file, out = tmp_path / "chest.urdf", tmp_path / "twin"
+    file.write_text(
+        "<robot name='chest'><link name='base'><visual><geometry><box size='.4 .3 .2'/></geometry>"
+        "</visual></link><link name='lid'><visual><origin xyz='.2 0 0'/><geometry>"
+        "<box size='.4 .3 .02'/></geometry></visual></link><joint name='lift' type='revolute'>"
+        "<parent link='base'/><child link='lid'/><origin xyz='-.2 0 .12'/><axis xyz='0 -1 0'/>"
+        "<limit lower='0' upper='1.2'/></joint></robot>"
+    )
+    assert main(["interact", str(file), "--pushes", "4", "--out", str(out)]) == 0
+    assert "part 1: revolute" in capsys.readouterr().out
+    (joint,) = [one for one in read_urdf(out / "twin.urdf").joints if one.kind == "revolute"]
+    assert abs(abs(joint.axis[1]) - 1.0) < 1e-3

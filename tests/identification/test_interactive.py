@@ -72,7 +72,7 @@ def test_the_door_is_found_with_its_axis_and_its_points(handled):
         (mine == 0) | (twin.labels[1] == 0)
     )
     assert overlap > 0.8
-    assert world.design.parts[0].joint == "revolute"
+    assert world.parts[0].joint == "revolute"
 
 
 def test_the_order_of_points_does_not_matter(handled):

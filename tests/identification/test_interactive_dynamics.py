@@ -119,7 +119,7 @@ def known():
 def test_a_door_is_felt_as_it_is(known):
     world, _, found = known
     (own,) = found.resistance
-    real = world.design.parts[0].resistance
+    real = world.parts[0]
     assert own.friction == pytest.approx(real.friction, rel=0.2)
     assert abs(own.damping - real.damping) < 2.0 * own.deviation[1]
     assert found.inertia[0] == pytest.approx(world.truth().inertia[0], rel=0.15)

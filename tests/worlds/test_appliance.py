@@ -62,10 +62,10 @@ def test_a_positive_position_opens_outwards(category):
 def test_every_part_opens_under_the_force_of_a_hand_at_its_edge(category):
     for seed in range(4):
         world = ApplianceWorld(category, seed, sensor=CLEAN)
-        closed = np.zeros(len(world.design.parts))
+        closed = np.zeros(len(world.source.parts))
         world.reset(seed, position=closed)
         start = world.truth().position
-        for number, part in enumerate(world.design.parts):
+        for number, part in enumerate(world.source.parts):
             force = EASY * MOST_FORCE * part.lever
             world.reset(seed, position=closed)
             for _ in range(400):
@@ -75,7 +75,7 @@ def test_every_part_opens_under_the_force_of_a_hand_at_its_edge(category):
 
 def _advance(world, joint, torque):
     """A time step with a torque at one joint, beside the latch."""
-    for index, part in enumerate(world.design.parts):
+    for index, part in enumerate(world.source.parts):
         resistance = part.resistance
         pull = resistance.latch * math.exp(-max(world.data.qpos[index], 0.0) / resistance.reach)
         world.data.qfrc_applied[index] = -pull + (torque if index == joint else 0.0)

@@ -5,6 +5,7 @@ from pathlib import Path
 from palpate.commands import folders
 from palpate.commands.options import Interact
 from palpate.errors import PalpateError
+from palpate.families.appliance.foreign import read_scene
 from palpate.families.appliance.twin_picture import PICTURE, show_twin
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
@@ -25,11 +26,13 @@ TWIN, OTHER = "twin.urdf", "twin.xml"
 def run(options: Interact) -> Path:
     """Handle the appliance, say what was found, and return where the twin is.
 
-    Raises `PalpateError` for a category that there is not and where nothing was found to move.
+    Raises `PalpateError` for a category that there is not, for a file as `read_scene`, and where
+    nothing was found to move.
     """
     with folders.begin(options, "interact") as run:
         if not run.finished:
-            world = ApplianceWorld(options.category, options.seed, views=options.views)
+            source = read_scene(options.file, options.body) if options.file else options.world
+            world = ApplianceWorld(source, options.seed, views=options.views)
             world.reset(options.seed)
             choose, twin = CHOICES[options.choose], Twin()
             real: dict[int, Labels] = {}
@@ -37,22 +40,22 @@ def run(options: Interact) -> Path:
                 twin = step.twin
                 real[len(twin.looks) - 1] = real_labels(twin, world)
                 print(f"push {number + 1}: {said(twin)}", flush=True)
-            description = describe(twin, options.category.replace(" ", "_"))
+            description = describe(twin, options.name)
             lines = rows(twin)
             try:
-                known = dynamics_of(twin)
+                felt = dynamics_of(twin)
             except PalpateError as error:
                 lines.append(f"masses and resistance are guesses: {error}")
             else:
-                description = known.describe_with(description)
-                lines += [*resistances(twin, known), *(f"warning: {one}" for one in known.warnings)]
+                description = felt.describe_with(description)
+                lines += [*resistances(twin, felt), *(f"warning: {one}" for one in felt.warnings)]
             write_urdf(run.path / TWIN, description)
             write_mjcf(run.path / OTHER, description)
             twin.relabel(0)  # of parts that were found later, too
-            show_twin(run.path / PICTURE, twin, options.category)
+            show_twin(run.path / PICTURE, twin, options.name)
             folders.finish(run, figures_of([score(twin, world, real)]), {folders.SUMMARY: lines})
         print("\n".join(read_json(run.path / RESULT)["settings"][folders.SUMMARY]))
-        folders.hand_over(options, run, f"Twin: {options.category}")
+        folders.hand_over(options, run, f"Twin: {options.name}")
         print(f"twin: {run.path / TWIN}")
         print(f"picture: {run.path / PICTURE}")
         return run.path / TWIN

@@ -73,19 +73,24 @@ class Check:
 
 @dataclass(frozen=True, kw_only=True)
 class Interact(Options):
-    """Handle a simulated appliance until its parts and joints are known, and write its twin.
+    """Handle an appliance until its parts and joints are known, and write its twin.
 
     A hand pulls at places that depth cameras show, one after the other: where it tells the most.
     What moves together is a part, how it moves is its joint. The run holds the twin as URDF and
-    MJCF, a picture of it, and how well it fits the appliance that was drawn.
+    MJCF, a picture of it, and how well it fits what was handled: an appliance of a category, drawn
+    by the seed, or a URDF or MJCF file of yours that MuJoCo takes.
 
     1. A microwave, six pushes:                 palpate interact microwave --out RUN
     2. Another one, seen by one camera:         palpate interact microwave --views 1 --seed 1
     3. Pushing anywhere, to compare:            palpate interact microwave --choose random
+    4. One of your own:                         palpate interact cabinet.urdf
+    5. One object of a scene:                   palpate interact kitchen.xml --body microwave
     """
 
-    category: Positional[Annotated[str, arg(metavar="CATEGORY", help_behavior_hint="")]]
-    """box, door, microwave, oven, refrigerator or "storage furniture"."""
+    world: Positional[Annotated[str, arg(metavar="CATEGORY_OR_FILE", help_behavior_hint="")]]
+    """box, door, microwave, oven, refrigerator or "storage furniture"; or a file."""
+    body: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: all)")] = None
+    """What of an MJCF file is handled: this body and what hangs on it, without all else."""
     pushes: int = 6
     """How often the hand takes hold of something."""
     views: Annotated[
@@ -99,6 +104,21 @@ class Interact(Options):
         super().__post_init__()
         if self.pushes < 1:
             raise PalpateError(f"--pushes is 1 or greater, not {self.pushes}")
+        if self.body is not None and self.file is None:
+            raise PalpateError(f"--body is of a file, and {self.world} is none")
+
+    @property
+    def file(self) -> Path | None:
+        """The file that is handled; None of a category."""
+        path = Path(self.world)
+        return path if path.suffix.lower() in (".urdf", ".xml", ".mjcf") else None
+
+    @property
+    def name(self) -> str:
+        """What is handled, in a word."""
+        path = self.file
+        name = self.body or (self.world if path is None else path.stem)
+        return name.replace(" ", "_")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,7 +78,7 @@ def of_appliance(experiment: Experiment, name: str, number: int, choose: str) ->
     def work() -> dict[str, Any]:
         world = ApplianceWorld(name.replace("-", " "), number)
         world.reset(number)
-        pushes = EACH * len(world.design.parts) + MORE
+        pushes = EACH * len(world.parts) + MORE
         near, seconds, last = pushes + 1, [], None
         real: dict[int, Labels] = {}
         began = time.perf_counter()
@@ -90,7 +90,7 @@ def of_appliance(experiment: Experiment, name: str, number: int, choose: str) ->
             if len(known) == len(last.found) and (known <= NEAR).all():
                 near = min(near, step + 1)
         assert last is not None
-        listed = {key: _plain(np.asarray(value).tolist()) for key, value in vars(last).items()}
+        listed = {key: plain(np.asarray(value).tolist()) for key, value in vars(last).items()}
         found = {"score": listed, "pushes_to_near": near, "seconds": seconds}
         if moves:
             found |= motion_of(state.twin, world, last, number)
@@ -214,8 +214,8 @@ def read_score(listed: Mapping[str, Any]) -> Score:
     return Score(**rows, extra=extra)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """With None, as JSON has it, for what is not known."""
     if isinstance(value, list):
-        return [_plain(one) for one in value]
+        return [plain(one) for one in value]
     return None if value != value else value

@@ -13,5 +13,6 @@ FAMILY = Family(
     experiments={
         "articulated-model": "palpate.experiments.appliance.articulated_model:reproduce",
         "twin-interactive": "palpate.experiments.appliance.twin_interactive:reproduce",
+        "twin-foreign": "palpate.experiments.appliance.twin_foreign:reproduce",
     },
 )

@@ -87,7 +87,7 @@ def refine(
     screw: Screw,
     positions: Float[np.ndarray, " looks"],
     seen: Sequence[Sighting | None],
-    ways: Sequence[Float[np.ndarray, "times 3"]],
+    ways: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> Estimate:
     """The joint that explains what was seen of its part, from a first guess.
 

@@ -81,14 +81,14 @@ def _motion(
     random: np.random.Generator,
     seed: int,
 ) -> Motion | None:
-    truth, own = world.truth(), world.design.parts[real]
+    truth, own = world.truth(), world.parts[real]
     axis, anchor = truth.axis[real], truth.anchor[real]
     along = np.broadcast_to(axis, seen.shape)
     if own.joint == "revolute":
         along = np.cross(axis, seen - anchor)
     lever = np.linalg.norm(along, axis=1)
     chosen = random.choice(np.flatnonzero(lever >= np.quantile(lever, 0.7)))
-    open_share = truth.position[real] / own.range
+    open_share = (truth.position[real] - own.low) / own.range
     opens = 1.0 if open_share < 0.5 else -1.0
     far = random.uniform(LEAST, max(min(MOST, ROOM * max(open_share, 1.0 - open_share)), LEAST))
     direction = opens * along[chosen] / lever[chosen]
@@ -138,7 +138,7 @@ def _real(
     seed: int,
 ) -> Float[np.ndarray, " times"] | None:
     """How far a part of the same appliance moves under forces at a point; None without a hold."""
-    other = ApplianceWorld(world.design, sensor=world.sensor, views=len(world.cameras))
+    other = ApplianceWorld(world.source, sensor=world.sensor, views=len(world.cameras))
     other.reset(seed, position=position)
     other.cameras = world.cameras
     for _ in range(ATTEMPTS):
@@ -178,7 +178,7 @@ def _inside(
     dynamics: Dynamics, link: int, world: ApplianceWorld, real: int
 ) -> tuple[bool, bool, bool]:
     """Whether friction, damping and inertia are in their 90 % intervals."""
-    own, resists = dynamics.resistance[link], world.design.parts[real].resistance
+    own, resists = dynamics.resistance[link], world.parts[real]
     if own is None:
         return False, False, False
     wide = 1.645 * own.deviation

@@ -61,7 +61,7 @@ def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | Non
     `earlier` looks, with their `real_labels`, that show it.
     """
     truth, look = world.truth(), len(twin.looks) - 1
-    parts = truth.design.parts
+    parts = truth.parts
     known = dict(sorted((earlier or {}).items(), reverse=True))
     real = {look: real_labels(twin, world)} | known
     overlap = np.zeros((len(parts), len(twin.parts)))

@@ -12,7 +12,8 @@ from palpate.errors import PalpateError
 from palpate.numerics.pinhole import DepthImage, Pinhole
 from palpate.worlds.appliance.categories import draw_design
 from palpate.worlds.appliance.design import MOST_FORCE, Design
-from palpate.worlds.appliance.scene import FIRST, TIME_STEP, appliance_scene
+from palpate.worlds.appliance.generated import generated_scene
+from palpate.worlds.appliance.scene import MovingPart, Scene, labels_of
 from palpate.worlds.depth import DepthSensor, depth_image
 from palpate.worlds.world import DivergedError, OffscreenCamera, World
 
@@ -29,6 +30,7 @@ STILL = 0.5  # share of the parts that begin closed
 SETTLING = 1.0  # s before the first observation
 WIDTH, HEIGHT = 320, 240  # pixels
 FIELD_OF_VIEW = math.radians(58.0)
+LEVEL, HIGH = (0.15, 0.6), (0.7, 1.1)  # rad: from how high cameras look
 
 
 class HandAction(NamedTuple):
@@ -54,7 +56,7 @@ class HandObservation(NamedTuple):
 class ApplianceTruth(NamedTuple):
     """The hidden state and constants, for experiments and tests alone; world axes throughout."""
 
-    design: Design
+    parts: tuple[MovingPart, ...]
     position: Float[np.ndarray, " parts"]  # rad or m
     velocity: Float[np.ndarray, " parts"]
     inertia: Float[np.ndarray, " parts"]  # kg m^2 or kg that each joint moves, all closed
@@ -67,29 +69,40 @@ class ApplianceTruth(NamedTuple):
 
 
 class ApplianceWorld(World):
-    """An appliance of a category, drawn by a seed, or a design of one's own.
+    """An appliance of a category that is drawn by a seed, one of a design, or any scene.
 
     `step` takes a `HandAction` and gives a `HandObservation`; `look` takes a depth image from each
     of the cameras, one to four, which stand before it. Where it stands, how far its parts are open,
     its cameras and all noise are drawn by the seed of `reset`.
 
-    Raises `PalpateError` for an action that is none, and `DivergedError`.
+    Raises `PalpateError` for an action that is none and `DivergedError`.
     """
 
     def __init__(
         self,
-        design: Design | str = "microwave",
+        source: Design | Scene | str = "microwave",
         seed: int = 0,
         *,
         views: int | None = None,
         sensor: DepthSensor | None = None,
     ):
-        self.design = draw_design(design, seed) if isinstance(design, str) else design
+        self.source = draw_design(source, seed) if isinstance(source, str) else source
+        self.scene = self._scene(0.0)
         self.sensor, self._views = sensor or DepthSensor(), views
         if views is not None and not 1 <= views <= 4:
             raise PalpateError(f"an appliance is seen by 1 to 4 cameras, not {views}")
         self._camera: OffscreenCamera | None = None
         self._ready = False
+
+    @property
+    def parts(self) -> tuple[MovingPart, ...]:
+        """What moves; for experiments and tests alone, as `truth` is."""
+        return self.scene.parts
+
+    def _scene(self, yaw: float) -> Scene:
+        if isinstance(self.source, Scene):
+            return self.source
+        return generated_scene(self.source, yaw)
 
     @property
     def control_period(self) -> float:
@@ -99,12 +112,17 @@ class ApplianceWorld(World):
         """Draw where it stands and how far it is open; `position` (parts,) sets that instead."""
         self._random = random = np.random.default_rng([seed, 0])
         self._sensor_random = np.random.default_rng([seed, 1])
-        self.model = appliance_scene(self.design, float(random.uniform(-0.6, 0.6)))
+        self.scene = self._scene(float(random.uniform(-0.6, 0.6)))
+        self.model = self.scene.model
         self.data = mujoco.MjData(self.model)
-        ranges = np.array([part.range for part in self.design.parts])
-        open_share = random.uniform(size=len(ranges)) * (random.uniform(size=len(ranges)) > STILL)
+        self._steps = max(1, round(CONTROL_PERIOD / self.model.opt.timestep))
+        self._label_of = labels_of(self.model, self.scene.bodies)
+        count = len(self.parts)
+        open_share = random.uniform(size=count) * (random.uniform(size=count) > STILL)
         position = options.get("position")
-        self.data.qpos[:] = open_share * ranges if position is None else position
+        if position is None:
+            position = self.scene.closed + open_share * self.scene.travel
+        self.data.qpos[self.scene.addresses] = position
         self.cameras = self._draw_cameras(random)
         self._offset = HAND_OFFSET * random.standard_normal(3)
         self._held: tuple[int, np.ndarray, np.ndarray] | None = None  # body, point and normal on it
@@ -113,7 +131,7 @@ class ApplianceWorld(World):
         self._crept = np.zeros(3)
         self._labels: list[np.ndarray] = []
         self._ready = True
-        for _ in range(round(SETTLING / TIME_STEP)):
+        for _ in range(round(SETTLING / self.model.opt.timestep)):
             self._advance(np.zeros(3))
         self.data.time = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -140,13 +158,13 @@ class ApplianceWorld(World):
             self._held = self._grasp(np.asarray(action.point, float), action.does)
             self._last, self._crept = None, np.zeros(3)
         given = np.zeros(3)
-        for _ in range(round(CONTROL_PERIOD / TIME_STEP)):
+        for _ in range(self._steps):
             if self._held is not None and action.does == PRESS and self._slips(force):
                 self._held = None
             applied = force if self._held is not None else np.zeros(3)
             self._advance(applied)
             given += applied
-        return self._observation(given * TIME_STEP / CONTROL_PERIOD)
+        return self._observation(given / self._steps)
 
     def look(self) -> list[DepthImage]:
         """A depth image from each camera."""
@@ -154,23 +172,21 @@ class ApplianceWorld(World):
             depth_image(self.model, self.data, camera, self.sensor, self._sensor_random)
             for camera in self.cameras
         ]
-        self._labels = [
-            np.where(bodies < 0, -2, np.maximum(bodies - FIRST, -1)) for _, bodies in taken
-        ]
+        self._labels = [np.where(bodies < 0, -2, self._label_of[bodies]) for _, bodies in taken]
         return [image for image, _ in taken]
 
     def truth(self) -> ApplianceTruth:
-        data, parts = self.data, len(self.design.parts)
+        data, scene = self.data, self.scene
         mujoco.mj_kinematics(self.model, data)
         return ApplianceTruth(
-            self.design,
-            data.qpos.copy(),
-            data.qvel.copy(),
-            self.model.dof_M0.copy(),
-            data.xaxis.copy(),
-            data.xanchor.copy(),
-            data.xmat[FIRST : FIRST + parts].reshape(-1, 3, 3).copy(),
-            data.xpos[FIRST : FIRST + parts].copy(),
+            scene.parts,
+            data.qpos[scene.addresses],
+            data.qvel[scene.freedoms],
+            self.model.dof_M0[scene.freedoms],
+            data.xaxis[scene.joints],
+            data.xanchor[scene.joints],
+            data.xmat[scene.bodies].reshape(-1, 3, 3),
+            data.xpos[scene.bodies],
             list(self._labels),
         )
 
@@ -179,34 +195,25 @@ class ApplianceWorld(World):
             self._camera = OffscreenCamera(self.model, width, height)
         view = mujoco.MjvCamera()
         first = self.cameras[0]
-        target = self._middle()
+        target = self.scene.middle
         away = np.subtract(first.position, target)
         view.lookat, view.distance = target, float(np.linalg.norm(away))
         view.azimuth = math.degrees(math.atan2(-away[1], -away[0]))
         view.elevation = -math.degrees(math.asin(away[2] / view.distance))
         return self._camera.picture(self.data, view)
 
-    def _middle(self) -> np.ndarray:
-        low, high = self.design.bounds
-        mujoco.mj_kinematics(self.model, self.data)
-        turn = self.data.xmat[1].reshape(3, 3)
-        return self.data.xpos[1] + turn @ (0.5 * (low + high))
-
     def _draw_cameras(self, random: np.random.Generator) -> list[Pinhole]:
         """Before the appliance and above its middle, as far as it takes to see it open."""
         count = self._views or int(random.integers(1, 5))
-        low, high = self.design.bounds
-        size = float(np.linalg.norm(high - low))
-        middle, turn = self._middle(), self.data.xmat[1].reshape(3, 3)
-        above = self.design.category == "box"
+        middle, size, front = self.scene.middle, self.scene.size, self.scene.front
         spread = np.linspace(-0.9, 0.9, count + 2)[1:-1] if count > 1 else np.zeros(1)
         found = []
-        for azimuth in spread + random.uniform(-0.35, 0.35, count):
-            elevation = random.uniform(0.7, 1.1) if above else random.uniform(0.15, 0.6)
+        for azimuth in front + spread + random.uniform(-0.35, 0.35, count):
+            elevation = random.uniform(*(HIGH if self.scene.above else LEVEL))
             distance = 0.6 + 1.2 * size * random.uniform(0.95, 1.15)
             flat = math.cos(elevation) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-            away = distance * (turn @ flat + np.array([0.0, 0.0, math.sin(elevation)]))
-            aim = middle + turn @ np.array([0.15 * size, 0.0, 0.0])
+            away = distance * (flat + np.array([0.0, 0.0, math.sin(elevation)]))
+            aim = middle + 0.15 * size * np.array([math.cos(front), math.sin(front), 0.0])
             found.append(
                 Pinhole.looking_at(
                     aim.tolist(), (middle + away).tolist(), WIDTH, HEIGHT, FIELD_OF_VIEW
@@ -246,11 +253,8 @@ class ApplianceWorld(World):
 
     def _advance(self, force: np.ndarray) -> None:
         model, data = self.model, self.data
-        for index, part in enumerate(self.design.parts):
-            pull = part.resistance.latch * math.exp(
-                -max(data.qpos[index], 0.0) / part.resistance.reach
-            )
-            data.qfrc_applied[index] = -pull
+        pull = self.scene.latches.pull(data.qpos[self.scene.addresses])
+        data.qfrc_applied[self.scene.freedoms] = pull
         data.xfrc_applied[:] = 0.0
         if self._held is not None:
             body, point, _ = self._held
@@ -260,7 +264,7 @@ class ApplianceWorld(World):
         mujoco.mj_step(model, data)
         if not np.isfinite(data.qpos).all() or np.abs(data.qvel).max(initial=0.0) > 200.0:
             self._ready = False
-            raise DivergedError(f"the simulation of a {self.design.category} diverged")
+            raise DivergedError(f"the simulation of a {self.scene.name} diverged")
 
     def _observation(self, force: np.ndarray) -> HandObservation:
         noise, creep = self._random.standard_normal(6), self._random.standard_normal(3)

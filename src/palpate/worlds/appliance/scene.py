@@ -1,79 +1,97 @@
-"""A MuJoCo scene of an appliance on a floor, or on a block where it stands higher.
+"""What an appliance's world is made of: a MuJoCo model, and what moves in it."""
 
-Nothing collides: a part ends at the stops of its joint. The frames of all bodies are that of the
-appliance with its parts closed.
-"""
+import dataclasses
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
-
-from palpate.worlds.appliance.design import Design, Shape
-
-TIME_STEP = 2e-3  # s
-STOP_SOLREF = (0.02, 1.0)  # of an end stop: critically damped
-GIVES = (0.9, 0.95, 0.002, 0.5, 2.0)  # how soft an end stop is (solimp)
-COLOURS = (
-    (0.86, 0.62, 0.35), (0.36, 0.58, 0.80), (0.52, 0.71, 0.42), (0.72, 0.51, 0.72),
-    (0.88, 0.76, 0.36), (0.42, 0.71, 0.71),
-)  # fmt: skip
-FIRST = 2  # the number of the first part's body: the world is 0, what stands still is 1
+from jaxtyping import Float, Int
 
 
-def appliance_scene(design: Design, yaw: float) -> mujoco.MjModel:
-    """The scene, compiled; `yaw` (rad) turns the appliance about the vertical through its origin.
+class MovingPart(NamedTuple):
+    """A part that moves on its parent, a part before it (-1: on what stands still).
 
-    Joint i and body i + 2 are those of part i.
+    Resistance is in N m or N, and N m s or N s/m.
     """
-    spec = mujoco.MjSpec()
-    spec.modelname = design.category
-    spec.compiler.degree = False
-    spec.option.timestep = TIME_STEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.worldbody.add_light(pos=(2, -2, 4), dir=(-0.4, 0.4, -1))
-    _add(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (8.0, 8.0, 0.1), rgba=(0.8, 0.8, 0.78, 1))
-    body = spec.worldbody.add_body(
-        name="body",
-        pos=(0.0, 0.0, design.height),
-        quat=(np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)),
-    )
-    for shape in design.body:
-        _add_shape(body, shape, 500.0, (0.75, 0.74, 0.72, 1.0))
-    if design.height > 0.0:
-        low, high = design.bounds
-        half = 0.5 * (high - low) + (0.1, 0.1, 0.0)
-        centre = 0.5 * (low + high)
-        size = (half[0], half[1], 0.5 * design.height)
-        place = (centre[0], centre[1], -0.5 * design.height)
-        _add(body, mujoco.mjtGeom.mjGEOM_BOX, size, pos=place, rgba=(0.6, 0.55, 0.5, 1))
-    bodies = []
-    for number, part in enumerate(design.parts):
-        parent = body if part.parent < 0 else bodies[part.parent]
-        moving = parent.add_body(name=part.name)
-        bodies.append(moving)
-        kinds = {"revolute": mujoco.mjtJoint.mjJNT_HINGE, "prismatic": mujoco.mjtJoint.mjJNT_SLIDE}
-        joint = moving.add_joint(
-            name=part.name, type=kinds[part.joint], axis=part.axis, pos=part.position
-        )
-        joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, (0.0, part.range)
-        joint.solref_limit, joint.solimp_limit = STOP_SOLREF, GIVES
-        resistance = part.resistance
-        joint.damping[0], joint.frictionloss = resistance.damping, resistance.friction
-        joint.stiffness[0], joint.springref = resistance.stiffness, resistance.rest
-        for shape in part.shapes:
-            _add_shape(moving, shape, part.density, (*COLOURS[number], 1.0))
-    return spec.compile()
+
+    name: str
+    parent: int
+    joint: Literal["revolute", "prismatic"]
+    low: float  # rad or m, the ends of its range
+    high: float
+    friction: float
+    damping: float
+    size: float  # m, the longest edge of a box around what is seen of it
+
+    @property
+    def range(self) -> float:
+        """From one end to the other, rad or m."""
+        return self.high - self.low
 
 
-def _add_shape(body: mujoco.MjsBody, shape: Shape, density: float, rgba: tuple[float, ...]) -> None:
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(shape.rotation).ravel())
-    x, y, z = shape.size
-    if shape.kind == "box":
-        kind, size = mujoco.mjtGeom.mjGEOM_BOX, (0.5 * x, 0.5 * y, 0.5 * z)
-    else:
-        kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (x, 0.5 * z, 0.0)
-    _add(body, kind, size, pos=shape.centre, quat=quaternion, density=density, rgba=rgba)
+@dataclasses.dataclass(frozen=True)
+class Latches:
+    """What pulls parts shut: `force` at zero, and 1/e of it when open by `reach`; 0 of others."""
+
+    force: Float[np.ndarray, " parts"]  # N m or N
+    reach: Float[np.ndarray, " parts"]  # rad or m
+
+    def pull(self, position: Float[np.ndarray, " parts"]) -> Float[np.ndarray, " parts"]:
+        """What acts at each joint at these positions (rad or m), in N m or N."""
+        return -self.force * np.exp(-np.maximum(position, 0.0) / self.reach)
 
 
-def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, size: tuple[float, ...], **more) -> None:
-    body.add_geom(type=kind, size=size, contype=0, conaffinity=0, **more)
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A compiled model, and which of its joints and bodies are the parts that move.
+
+    `middle` (m) and `size` (m, a diagonal) are of what stands still, with all parts closed; cameras
+    stand in the direction `front` (rad about z, from x), or around it, and `above` it or level.
+    """
+
+    name: str
+    model: mujoco.MjModel
+    parts: tuple[MovingPart, ...]
+    joints: Int[np.ndarray, " parts"]  # of the model, that of each part
+    latches: Latches
+    closed: Float[np.ndarray, " parts"]  # rad or m: from where parts open, to the further end
+    middle: Float[np.ndarray, "3"]
+    size: float
+    front: float
+    above: bool
+
+    @property
+    def bodies(self) -> Int[np.ndarray, " parts"]:
+        """The body of each part."""
+        return self.model.jnt_bodyid[self.joints]
+
+    @property
+    def addresses(self) -> Int[np.ndarray, " parts"]:
+        """Where each part's position is in MuJoCo's `qpos`."""
+        return self.model.jnt_qposadr[self.joints]
+
+    @property
+    def freedoms(self) -> Int[np.ndarray, " parts"]:
+        """Where each part's velocity is in MuJoCo's `qvel`."""
+        return self.model.jnt_dofadr[self.joints]
+
+    @property
+    def travel(self) -> Float[np.ndarray, " parts"]:
+        """From closed to the further end, rad or m, with its sign."""
+        ends = np.array([(part.low, part.high) for part in self.parts]).reshape(-1, 2)
+        ends = ends - self.closed[:, None]
+        return ends[np.arange(len(ends)), np.abs(ends).argmax(axis=1)]
+
+
+def labels_of(
+    model: mujoco.MjModel, bodies: Int[np.ndarray, " parts"]
+) -> Int[np.ndarray, " bodies"]:
+    """The part that each body of a model belongs to, -1 of what stands still.
+
+    `bodies` are those of the parts; what is fixed to one belongs to it.
+    """
+    numbers = {int(body): number for number, body in enumerate(bodies)}
+    found = np.full(model.nbody, -1)
+    for body in range(1, model.nbody):
+        found[body] = numbers.get(body, found[model.body_parentid[body]])
+    return found

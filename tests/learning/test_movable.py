@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.learning.movable import Pull, moves, posterior, prior, probability
+from palpate.learning.movable import HEAVY, Pull, moves, posterior, prior, probability
 from palpate.perception.surfaces import Surface
 
 OUT, IN, LEFT = np.array([1.0, 0, 0]), np.array([-1.0, 0, 0]), np.array([0, 1.0, 0])
@@ -15,46 +15,70 @@ FRONT = Surface(
 RIGHT_EDGE, LEFT_EDGE = np.array([0, -0.28, 0.0]), np.array([0, 0.28, 0.0])
 
 
-def test_a_prior_is_a_distribution():
+def chance(belief, point, direction):
+    return float(moves(belief, FRONT, point[None], direction[None])[0])
+
+
+def certain(hypothesis):
+    """A belief in one hypothesis alone."""
     belief = prior(0.4)
+    return belief._replace(chances=np.eye(len(belief.chances))[hypothesis])
+
+
+def test_a_prior_is_a_distribution():
+    belief = prior(0.4).chances
     assert belief.sum() == pytest.approx(1.0)
     assert belief.min() >= 0.0
     assert 1.0 - belief[0] == pytest.approx(0.4)
 
 
 def test_a_hinge_goes_where_the_lever_is_long():
-    chance = moves(FRONT, np.stack([LEFT_EDGE, RIGHT_EDGE]), np.stack([OUT, OUT]))
     # the first hypotheses are of the hinge at the lower end of the first side: the right edge
-    assert chance[0, 1] > 0.9 > 0.1 > chance[1, 1]
-    assert chance[0, 0] == 0.0
+    assert chance(certain(1), LEFT_EDGE, OUT) > 0.9 > 0.1 > chance(certain(1), RIGHT_EDGE, OUT)
+    assert chance(certain(0), LEFT_EDGE, OUT) == 0.0
     # pulled inwards it goes if it goes both ways, not if it only opens
-    inward = moves(FRONT, LEFT_EDGE[None], IN[None])[0]
-    assert inward[1] > 0.9
-    assert inward[2] == 0.0
+    assert chance(certain(1), LEFT_EDGE, IN) > 0.9
+    assert chance(certain(2), LEFT_EDGE, IN) == 0.0
 
 
 def test_a_slide_goes_along_itself_alone():
-    aside = moves(FRONT, np.zeros((1, 3)), LEFT[None])[0]
-    along_normal, along_first_side = aside[1 + 12 : 1 + 15], aside[1 + 15 : 1 + 18]
-    assert along_normal.max() == 0.0
-    assert along_first_side.tolist() == [1.0, 1.0, 0.0]
+    assert [chance(certain(one), np.zeros(3), LEFT) for one in (13, 14, 15)] == [0.0] * 3
+    along_side = [chance(certain(one), np.zeros(3), LEFT) for one in (16, 17, 18)]
+    assert along_side[:2] == pytest.approx([1.0 - HEAVY] * 2)
+    assert along_side[2] == 0.0
 
 
 def test_a_pull_that_failed_at_one_edge_leaves_the_other():
-    belief = posterior(prior(0.5), FRONT, [Pull(RIGHT_EDGE, OUT, False, True)])
-    chance = moves(FRONT, np.stack([LEFT_EDGE, RIGHT_EDGE]), np.stack([OUT, OUT])) @ belief
-    assert chance[0] > 2.0 * chance[1]
-    assert belief[0] > 0.5
-    assert belief.sum() == pytest.approx(1.0)
+    belief = posterior(prior(0.5), FRONT, [Pull(RIGHT_EDGE, OUT, False, False, True)])
+    assert chance(belief, LEFT_EDGE, OUT) > 2.0 * chance(belief, RIGHT_EDGE, OUT)
+    assert belief.chances[0] > 0.5
+    assert belief.chances.sum() == pytest.approx(1.0)
+
+
+def test_what_withstood_a_pull_moves_only_under_a_stronger_one():
+    """Given that it is a hinge, the same pull again is in vain, and twice the lever is not."""
+    middle = Pull(np.array([0.0, -0.12, 0.0]), OUT, False, False, True)
+    belief = posterior(certain(1), FRONT, [middle])
+    assert chance(belief, middle.point, OUT) == 0.0
+    assert chance(belief, LEFT_EDGE, OUT) > 0.9
+    again = posterior(belief, FRONT, [middle])
+    assert again.withstood == pytest.approx(belief.withstood)
+    assert again.chances == pytest.approx(belief.chances)
+
+
+def test_what_gives_a_little_moves_rather_than_what_does_not():
+    pulls = [Pull(np.zeros(3), OUT, False, gave, True) for gave in (True, False)]
+    gave, still = (posterior(prior(0.2), FRONT, [pull]).chances[0] for pull in pulls)
+    assert gave < 0.5 < 0.8 < still
 
 
 def test_what_stopped_early_rather_goes_back():
-    ended = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, True)])
-    further = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, False)])
-    back, on = (moves(FRONT, LEFT_EDGE[None], way[None])[0] for way in (IN, OUT))
-    assert ended[0] < 0.2
-    assert back @ ended > back @ further > on @ ended
-    assert on @ further > 0.6 > on @ ended
+    ended = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, False, True)])
+    further = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, False, False)])
+    assert ended.chances[0] < 0.2
+    back = chance(ended, LEFT_EDGE, IN)
+    assert back > chance(further, LEFT_EDGE, IN) > chance(ended, LEFT_EDGE, OUT)
+    assert chance(further, LEFT_EDGE, OUT) > 0.6 > chance(ended, LEFT_EDGE, OUT)
 
 
 def test_features_move_the_odds_the_way_that_they_should():
@@ -63,13 +87,13 @@ def test_features_move_the_odds_the_way_that_they_should():
         "goes on beside it": 0.5, "of the scene before it": 0.2, "has a handle": 0.0,
     }  # fmt: skip
 
-    def chance(**changed: float) -> float:
+    def odds(**changed: float) -> float:
         return probability(plain | changed, on_part=False, largest=False)
 
-    assert 0.0 < chance() < 1.0
-    assert chance(**{"has a handle": 1.0}) > chance()
-    assert chance(**{"free behind it": 1.0}) > chance()
-    assert chance(**{"of the scene before it": 0.9}) < chance()
+    assert 0.0 < odds() < 1.0
+    assert odds(**{"has a handle": 1.0}) > odds()
+    assert odds(**{"free behind it": 1.0}) > odds()
+    assert odds(**{"of the scene before it": 0.9}) < odds()
     own = probability(plain, on_part=True, largest=False)
-    assert own < chance()
+    assert own < odds()
     assert probability(plain, on_part=True, largest=True) < own

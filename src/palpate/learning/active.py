@@ -25,6 +25,7 @@ FEWEST = 10  # points of a part that a hand can be put to
 REACH = 0.3  # m that a hand goes
 UNKNOWN = 0.3  # of its reach that a hand is expected to take a part beyond where it was seen
 INSET = 0.12  # of a surface, from its edge to where a hand takes hold
+PLAY = 0.0015  # m: a hand that got so far has felt something give
 ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an end
 ASIDE = 0.7  # how much to the side of the normal a hand also pulls, which tries two joints at once
 
@@ -35,6 +36,8 @@ def most_informative(twin: Twin, random: np.random.Generator) -> Push:
     """The push of which most is expected."""
     look = len(twin.looks) - 1
     options = [*_tries(twin, look, random), *_repeats(twin, look, random)]
+    if not options:  # nothing flat is large enough
+        return at_random(twin, random)
     return max(options, key=lambda one: one[0])[1]
 
 
@@ -65,14 +68,18 @@ def _tries(twin: Twin, look: int, random: np.random.Generator) -> list[tuple[flo
         )
         pulls = [
             movable.Pull(
-                one.push.point, one.push.direction, one.moved, one.travel < ENDED * one.push.travel
+                one.push.point,
+                one.push.direction,
+                moved=one.moved,
+                gave=one.travel > PLAY,
+                ended=one.travel < ENDED * one.push.travel,
             )
             for one in there
             if one.held and not (one.moved and on_part)
         ]
         belief = movable.posterior(movable.prior(before), surface, pulls)
         points, directions = _grips(cloud, surface)
-        chance = movable.moves(surface, points, directions) @ belief
+        chance = movable.moves(belief, surface, points, directions)
         missed = [one.push.point for one in there if not one.held]
         near = np.zeros(len(points))
         for point in missed:

@@ -39,18 +39,32 @@ HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
 # normal that is outwards, as what is closed goes.
 SENSES_OUT, SENSES_SIDE = (0.45, 0.5, 0.05), (0.3, 0.35, 0.35)
 RESISTANCE = 0.05, 0.7  # of a hand's force at the best place: least and most that moves a part
+HEAVY = 0.03  # probability that none moves it
 AT_END = 0.6  # probability that what stopped early is at its end, and not too hard to move on
 STRAYED = 0.05  # probability that something else went with the hand
+# Probability that a hand feels a little play where a part is held by a latch or by friction, and
+# where all stands still.
+PLAY, PLAY_STILL = 0.2, 0.01
 
 Chances = Float[np.ndarray, " hypotheses"]
 
 
+class Belief(NamedTuple):
+    """What is believed of a surface: how likely each hypothesis is, that of standing still first,
+    and the greatest share of a hand's force that each joint has withstood."""
+
+    chances: Chances
+    withstood: Chances
+
+
 class Pull(NamedTuple):
-    """Where a hand pulled and which way, whether that moved something, and whether it ended."""
+    """Where a hand pulled and which way, and what came of it: whether something moved, or gave a
+    little."""
 
     point: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
     moved: bool
+    gave: bool
     ended: bool  # before the hand had gone as far as it would
 
 
@@ -64,12 +78,13 @@ def probability(features: dict[str, float], *, on_part: bool, largest: bool) -> 
     return 1.0 / (1.0 + math.exp(-sum(weight * known[name] for name, weight in weights.items())))
 
 
-def prior(chance: float) -> Chances:
+def prior(chance: float) -> Belief:
     """Of standing still, and of each joint and sense, given the probability to move."""
     joints = np.array([HINGE] * 4 + [ALONG_NORMAL] + [ALONG_SIDE] * 2)
     senses = np.array([SENSES_OUT] * 5 + [SENSES_SIDE] * 2)
     moving = chance * (joints[:, None] * senses).ravel()
-    return np.concatenate([[1.0 - moving.sum()], moving])
+    chances = np.concatenate([[1.0 - moving.sum()], moving])
+    return Belief(chances, np.zeros(len(chances)))
 
 
 def _forces(surface: Surface, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -82,28 +97,56 @@ def _forces(surface: Surface, points: np.ndarray, directions: np.ndarray) -> np.
     return np.concatenate([out * levers, out, directions @ surface.sides.T], axis=1)
 
 
-def moves(
+def _shares(
     surface: Surface, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n hypotheses"]:
-    """Probability that each pull moves the surface, under each hypothesis of `prior`."""
+    """Share of each pull's force that goes into the motion of each hypothesis; none of standing."""
     forces = _forces(surface, points, directions)
     ways = np.stack([np.abs(forces), forces, -forces], axis=2).reshape(len(points), -1)
+    return np.pad(np.maximum(ways, 0.0), [(0, 0), (1, 0)])
+
+
+def _goes(
+    shares: Float[np.ndarray, "*n hypotheses"], withstood: Chances
+) -> Float[np.ndarray, "*n hypotheses"]:
+    """Probability that such shares of a hand's force move what has withstood others."""
     least, most = RESISTANCE
-    return np.pad(np.clip((ways - least) / (most - least), 0.0, 1.0), [(0, 0), (1, 0)])
+
+    def below(share: np.ndarray) -> np.ndarray:
+        return (1.0 - HEAVY) * np.clip((share - least) / (most - least), 0.0, 1.0)
+
+    known = below(withstood)
+    return np.maximum(below(shares) - known, 0.0) / (1.0 - known)
 
 
-def posterior(belief: Chances, surface: Surface, pulls: Sequence[Pull]) -> Chances:
+def moves(
+    belief: Belief,
+    surface: Surface,
+    points: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, " n"]:
+    """Probability that each pull moves the surface."""
+    return _goes(_shares(surface, points, directions), belief.withstood) @ belief.chances
+
+
+def posterior(belief: Belief, surface: Surface, pulls: Sequence[Pull]) -> Belief:
     """After pulls at the surface. What stopped early may be at its end, from where it goes back."""
+    chances, withstood = belief
     for pull in pulls:
         point, direction = pull.point[None], pull.direction[None]
-        chance = moves(surface, point, direction)[0]
+        shares = _shares(surface, point, direction)[0]
+        goes = _goes(shares, withstood)
         if pull.moved:
-            chance[0] = STRAYED
-        belief = belief * (chance if pull.moved else 1.0 - chance)
+            goes[0] = STRAYED
+            chances = chances * goes
+        else:
+            play = np.where(shares > RESISTANCE[0], PLAY, PLAY_STILL)
+            chances = chances * (1.0 - goes) * (play if pull.gave else 1.0 - play)
+            withstood = np.maximum(withstood, shares)
         if pull.moved and pull.ended:
-            joints = belief[1:].reshape(-1, 3).sum(axis=1)
+            joints = chances[1:].reshape(-1, 3).sum(axis=1)
             ahead = _forces(surface, point, direction)[0] > 0.0
             back = np.stack([0.0 * joints, joints * ~ahead, joints * ahead], axis=1)
-            belief[1:] = AT_END * back.ravel() + (1.0 - AT_END) * belief[1:]
-        belief = belief / belief.sum()
-    return belief
+            chances[1:] = AT_END * back.ravel() + (1.0 - AT_END) * chances[1:]
+        chances = chances / chances.sum()
+    return Belief(chances, withstood)

@@ -17,6 +17,7 @@ from palpate.errors import PalpateError
 from palpate.numerics.pinhole import DepthImage
 
 CELL = 0.012  # m, of the grid
+LARGE = 0.8  # m: of what is smaller, cells are smaller, down to half of that
 EDGE = 0.03  # of the depth, between neighbouring pixels: they are on two sides of an edge
 MOST = 20_000  # points of a cloud, about: more say little more and take longer
 FEWEST = 200  # points of which anything can be said
@@ -98,6 +99,7 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
             f"above the floor: expected {FEWEST} or more, with depths in m and z upwards"
         )
     points, depth, source = points[above], depth[above], np.concatenate(source)[above]
+    cell = cell * float(np.clip(extent_of(points) / LARGE, 0.5, 1.0))
     # noisier points in larger cells, so that a normal is as good far away as it is near by
     size = max(cell, 1.5 * float(np.median(noise_at(depth))))
     members, means = _cells(points, size)
@@ -116,6 +118,12 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
     return Cloud(
         points, normals, deviation, sources, list(images), nearest, furthest, cKDTree(points)
     )
+
+
+def extent_of(points: Float[np.ndarray, "n 3"]) -> float:
+    """The diagonal (m) of a box along the axes around points, but a few at each side."""
+    low, high = np.quantile(points, (0.02, 0.98), axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def _floor(points: Float[np.ndarray, "n 3"]) -> float:

@@ -13,9 +13,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from palpate.perception.clouds import Cloud
+from palpate.perception.clouds import Cloud, extent_of
 
-SMALLEST = 0.004  # m^2: less is no surface of a part
+SMALLEST = 0.004, 0.01  # m^2, and of the square of the scene's extent: less is no surface of a part
 NEIGHBOURS = 8
 SEEDS, AROUND = 250, 60  # that planes grow from, and the points that are the first of each
 FLAT = 0.8  # cosine between a normal and that of its surface
@@ -55,6 +55,7 @@ def surfaces(
     neighbours = cloud.tree.query(cloud.points, NEIGHBOURS + 1)[1]
     size = float(np.median(cloud.tree.query(cloud.points[::50], 2)[0][:, 1])) ** 2
     room = STEP + 2.0 * cloud.deviation
+    smallest = min(SMALLEST[0], SMALLEST[1] * extent_of(cloud.points) ** 2)
     taken, pieces = np.zeros(len(cloud.points), bool), []
     for seed in random.permutation(len(cloud.points))[:SEEDS]:
         if taken[seed]:
@@ -68,7 +69,7 @@ def surfaces(
             near = np.abs((cloud.points - centre) @ normal) < room
             near &= (cloud.normals @ normal > FLAT) & ~taken & (labels == labels[seed])
             members = _connected(near, neighbours, seed)
-        if len(members) * size >= SMALLEST:
+        if len(members) * size >= smallest:
             taken[members] = True
             pieces.append(members)
     return [_surface(cloud, members, labels, size, ~taken) for members in pieces]

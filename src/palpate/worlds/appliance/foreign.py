@@ -1,12 +1,13 @@
 """The scene of a file that somebody else wrote, whole or one object of it.
 
-What the file says stays as it is: contacts, resistance, what else stands around. Robots stand
-still: a joint that an actuator drives is taken for one of theirs. Shapes that viewers hide by
-default, those of collisions, are felt and not seen, unless nothing else of what moves is seen. What
-has no floor, or was taken out of its scene, gets one.
+What the file says of an object stays as it is: shapes, contacts, resistance. Scenery, which carries
+nothing with a hinge or a slide, is left out: tables, walls, and robots, as a joint that an actuator
+drives is taken for one of theirs. What is left stands on a floor of its own. Shapes that viewers
+hide by default, those of collisions, are felt and not seen, unless nothing else of what moves is.
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -30,7 +31,7 @@ STEP = 5e-3  # s: longest time step
 DIRECTIONS, PIXELS = 16, 48  # from which an object is looked at, to find where most of it is seen
 ELEVATIONS = 0.35, 0.9  # rad, of cameras that stand level and above
 NEAR = 0.35 * math.pi  # rad about its front: where cameras stand
-FEET = 0.05  # m over a floor that it is given: what is lower is not told from the floor
+FEET = 0.05  # m over its floor: what is lower is not told from the floor
 
 
 def foreign_scene(spec: mujoco.MjSpec, file: Path, body: str | None = None) -> Scene:
@@ -44,6 +45,7 @@ def foreign_scene(spec: mujoco.MjSpec, file: Path, body: str | None = None) -> S
     _hold_robots(spec)
     for key in list(spec.keys):
         spec.delete(key)
+    _leave_out_scenery(spec)
     model = _compiled(spec, file)
     joints = [joint for joint in range(model.njnt) if int(model.jnt_type[joint]) in KINDS]
     if not joints:
@@ -54,13 +56,12 @@ def foreign_scene(spec: mujoco.MjSpec, file: Path, body: str | None = None) -> S
                 f"the body '{model.body(one).name}' of {file} has {count} joints: expected one "
                 "hinge or slide of each; bodies in between do the same"
             )
-    if body is not None or not (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any():
-        low, _ = _Parts(model, joints).bounds()
-        spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8.0, 8.0, 0.1), pos=(0.0, 0.0, low[2] - FEET),
-            contype=0, conaffinity=0, rgba=(0.8, 0.8, 0.78, 1.0),
-        )  # fmt: skip
-        model = _compiled(spec, file)
+    low, _ = _Parts(model, joints).bounds()
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8.0, 8.0, 0.1), pos=(0.0, 0.0, low[2] - FEET),
+        contype=0, conaffinity=0, rgba=(0.8, 0.8, 0.78, 1.0),
+    )  # fmt: skip
+    model = _compiled(spec, file)
     return _scene(body or file.stem, model, joints)
 
 
@@ -80,7 +81,7 @@ def _compiled(spec: mujoco.MjSpec, file: Path) -> mujoco.MjModel:
 
 
 def _keep(spec: mujoco.MjSpec, name: str, file: Path) -> None:
-    """Take out of a scene all that neither carries a body nor hangs on it, but the floor."""
+    """Take out of a scene all that neither carries a body nor hangs on it."""
     names = [body.name for body in spec.bodies if body.name and body.name != "world"]
     above, kept = spec.body(check_name(f"body of {file}", name, names)).parent, {name}
     while above is not None and above.name != "world":
@@ -93,6 +94,23 @@ def _keep(spec: mujoco.MjSpec, name: str, file: Path) -> None:
     for other in list(spec.worldbody.bodies):
         if other.name not in kept:
             spec.delete(other)
+
+
+def _leave_out_scenery(spec: mujoco.MjSpec) -> None:
+    """Take out what hangs on the world and carries nothing that moves, and floors."""
+    for body in list(spec.worldbody.bodies):
+        if not any(int(joint.type) in KINDS for each in _tree(body) for joint in each.joints):
+            spec.delete(body)
+    for geom in list(spec.worldbody.geoms):
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            spec.delete(geom)
+
+
+def _tree(body: mujoco.MjsBody) -> Iterator[mujoco.MjsBody]:
+    """A body and all that hangs on it."""
+    yield body
+    for below in body.bodies:
+        yield from _tree(below)
 
 
 def _hold_robots(spec: mujoco.MjSpec) -> None:

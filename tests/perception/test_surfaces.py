@@ -78,3 +78,33 @@ def test_features_tell_a_board_that_stands_free_from_a_wall(cloud):
     assert board["free behind it"] > wall["free behind it"] == 0.0
     assert board["has a handle"] == 1.0
     assert board["free before it"] > 0.9
+
+
+BEADS = "".join(f'<geom size=".018" pos=".14 {0.13 + 0.03 * one:.2f} 1"/>' for one in range(7))
+LEVER = f"""
+<mujoco><worldbody><body>
+  <geom type="box" size=".1 .1 .15" pos="0 0 1"/>{BEADS}
+</body></worldbody></mujoco>
+"""
+
+
+def test_a_lever_is_a_piece_of_its_own_though_nothing_of_it_is_flat():
+    model = mujoco.MjModel.from_xml_string(LEVER)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    random = np.random.default_rng(0)
+    images: list[DepthImage] = []
+    for side in (-0.4, 0.5):
+        camera = Pinhole.looking_at((0.0, 0.1, 1.0), (0.9, side, 1.4), 320, 240, math.radians(58))
+        images.append(depth_image(model, data, camera, DepthSensor(), random)[0])
+    small = cloud_of(images)
+    every = surfaces(small, np.full(len(small.points), -1), np.random.default_rng(1))
+    on_lever = small.points[:, 1] > 0.115
+    held = np.zeros(len(small.points), int)
+    for number, one in enumerate(every, 1):
+        held[one.members] = number
+    # most of what stands out is of pieces with nothing of the box
+    numbers = np.unique(held[on_lever & (held > 0)])
+    assert np.mean(held[on_lever] > 0) > 0.5
+    box = np.all(np.abs(small.points - [0, 0, 1.0]) < [0.11, 0.11, 0.16], axis=1)
+    assert not np.isin(held[box & (held > 0)], numbers).any()

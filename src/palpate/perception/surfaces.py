@@ -72,7 +72,24 @@ def surfaces(
         if len(members) * size >= smallest:
             taken[members] = True
             pieces.append(members)
-    return [_surface(cloud, members, labels, size, ~taken) for members in pieces]
+    found = [_surface(cloud, members, labels, size, ~taken) for members in pieces]
+    held = np.concatenate([one.handles for one in found] or [np.empty((0, 3))])
+    return found + [
+        _surface(cloud, members, labels, size, ~taken)
+        for members in _bars(cloud, labels, ~taken, math.sqrt(smallest))
+        if not len(held) or cKDTree(cloud.points[members]).query(held)[0].min() > TOGETHER
+    ]
+
+
+def _bars(cloud: Cloud, labels: np.ndarray, loose: np.ndarray, shortest: float) -> list[np.ndarray]:
+    """What is of no flat piece and hangs together over a length (m): levers, bars and taps."""
+    found = []
+    for label in np.unique(labels[loose]):
+        rest = np.flatnonzero(loose & (labels == label))
+        for piece in _pieces(cloud.points[rest], 0.5 * TOGETHER):
+            if extent_of(cloud.points[rest[piece]]) > shortest and len(piece) > NEIGHBOURS:
+                found.append(rest[piece])
+    return found
 
 
 def _surface(
@@ -147,7 +164,8 @@ def _handles(
     inside = above(loose, *STANDS_OFF)
     beyond = above(whole, STANDS_OFF[1], 2.5 * STANDS_OFF[1])
     found = []
-    for piece in _pieces(inside):
+    for members in _pieces(inside, TOGETHER):
+        piece = inside[members]
         if len(piece) < 3:
             continue
         if len(beyond) and np.sum(cKDTree(piece).query(beyond)[0] < 3.0 * STANDS_OFF[1]) > 3:
@@ -159,14 +177,14 @@ def _handles(
     return np.array(found).reshape(-1, 3)
 
 
-def _pieces(points: np.ndarray) -> list[np.ndarray]:
-    """Points in groups that are `TOGETHER`."""
+def _pieces(points: np.ndarray, together: float) -> list[np.ndarray]:
+    """The numbers of points in groups, each point no further (m) than that from another of its."""
     if not len(points):
         return []
-    pairs = cKDTree(points).query_pairs(TOGETHER, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(together, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), [len(points)] * 2)
     piece = connected_components(graph, directed=False)[1]
-    return [points[piece == one] for one in range(piece.max() + 1)]
+    return [np.flatnonzero(piece == one) for one in range(piece.max() + 1)]
 
 
 def features(cloud: Cloud, surface: Surface) -> dict[str, float]:

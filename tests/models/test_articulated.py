@@ -112,6 +112,19 @@ def test_screws_move_what_the_joints_carry(float64):
         np.testing.assert_allclose(rate, expected, atol=1e-8)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_an_action_comes_to_at_the_joints_does_the_same_as_the_action(float64, seed):
+    case = random_case(seed)
+    model = tree_of(case.links)
+    action = jnp.concatenate([case.torque[:, None], case.push, case.point], axis=1)
+    state = ArticulatedState(jnp.asarray(case.position), jnp.asarray(case.velocity))
+    given = model.joint_forces(state.position, action)
+    alone = jnp.zeros_like(action).at[:, 0].set(given)
+    expected = model.acceleration(state, action)
+    found = model.acceleration(state, alone)
+    np.testing.assert_allclose(found, expected, atol=1e-9 * float(jnp.abs(expected).max()))
+
+
 # --- motion -----------------------------------------------------------------------------------
 
 

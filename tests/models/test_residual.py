@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
+from palpate.models.articulated import Articulated, Link, tree_of
 from palpate.models.model import Model, Wrapper, rollout
 from palpate.models.planar import Planar, PlanarState, furniture
 from palpate.models.planar.shapes import rectangle
@@ -64,6 +65,13 @@ def bodies(**fields) -> Planar:
 MODELS = {
     "cart": Cart(1.0, 0.2),
     "pendulum": Pendulum(1.0, 0.2),
+    "cabinet": tree_of(
+        [
+            Link(axis=(0.0, 0.0, 1.0), mass=1.0, inertia=np.diag([0.1, 0.1, 0.1])),
+            Link("fixed", parent=0, mass=0.3, inertia=np.diag([0.01, 0.01, 0.01])),
+            Link("prismatic", parent=0, mass=0.5, inertia=np.diag([0.1, 0.1, 0.1])),
+        ]
+    ),
     "bodies": bodies(),
     "bodies, one of them bolted": bodies(bolted=[1], poses=np.zeros((3, 3))),
     "rope held at both ends": rope(),
@@ -117,6 +125,8 @@ def test_what_is_corrected_is_what_lies_between(model):
     free = np.ones(correctable(model).correction_shape)
     if isinstance(model, Planar):
         free -= np.asarray(model.bolted)[:, None]
+    if isinstance(model, Articulated):
+        free[1] = 0.0  # the fixed one
     if isinstance(model, Rope):
         free[list(model.driven)] = 0.0
         # Where the ends are near each other the axes are shorter than one, both ways.

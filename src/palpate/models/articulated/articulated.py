@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from palpate.models.articulated import integration
 from palpate.models.articulated.dynamics import Bodies, in_world, motion
@@ -182,6 +182,49 @@ class Articulated(TreeParameters):
     def velocity(self, state: ArticulatedState) -> Float[Array, "*batch links"]:
         """Of the joints, rad/s or m/s."""
         return state.velocity
+
+    @property
+    def correction_shape(self) -> tuple[int, int]:
+        """(links, 1): see `models.residual.Correctable`."""
+        return self.links, 1
+
+    @property
+    def correction_neighbours(self) -> Int[np.ndarray, "links 1 1"]:
+        """Each joint sees itself alone: how links act on each other is left to the physics."""
+        return np.arange(self.links)[:, None, None]
+
+    def residual_features(
+        self, state: ArticulatedState, action: Float[Array, "*batch links 7"]
+    ) -> Float[Array, "*batch links 3"]:
+        """Position and velocity of each joint, and what the action does there: N m or N."""
+        given = self.joint_forces(state.position, action)
+        return jnp.stack([state.position, state.velocity, given], axis=-1)
+
+    def corrected(
+        self, state: ArticulatedState, correction: Float[Array, "*batch links 1"]
+    ) -> ArticulatedState:
+        """The state with velocities (rad/s or m/s) added to what a joint moves."""
+        moves = self.revolute + self.prismatic
+        return ArticulatedState(state.position, state.velocity + moves * correction[..., 0])
+
+    def correction_between(
+        self, state: ArticulatedState, following: ArticulatedState
+    ) -> Float[Array, "*batch links 1"]:
+        """Change of the joints' velocities."""
+        moves = self.revolute + self.prismatic
+        return (moves * (following.velocity - state.velocity))[..., None]
+
+    def joint_forces(
+        self, position: Float[Array, "*batch links"], action: Float[Array, "*batch links 7"]
+    ) -> Float[Array, "*batch links"]:
+        """What an action comes to at each joint, N m or N: by the principle of virtual power."""
+        rotation, origin = self.link_poses(position)
+        push = action[..., 1:4]
+        point = origin + jnp.einsum("...ij,...j->...i", rotation, action[..., 4:])
+        wrench = jnp.concatenate([jnp.cross(point, push), push], axis=-1)
+        carried = carriers(self.parent, wrench.dtype)
+        on_joint = jnp.einsum("lj,...lk->...jk", carried, wrench)
+        return action[..., 0] + jnp.sum(self.screws(position) * on_joint, axis=-1)
 
 
 def _lanes(value: Array, axes: int) -> Array:

@@ -57,7 +57,7 @@ STAGES = {
     ],
     "learning": [
         "learning.active",
-        "learning.movable",
+        *("learning.movable", "learning.movable_guess"),
         *("learning.self_supervised", "learning.closed_loop", "learning.dagger"),
         *("learning.loss_monitor", "networks.policy", "networks.controller", "networks.channels"),
         *("learning.off_policy.loop", "learning.off_policy.agent", "learning.off_policy.buffer"),
@@ -112,6 +112,7 @@ STAGES = {
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),
         *("perception.rope.marker_observer", "perception.clouds", "perception.surfaces"),
+        "perception.surface_features",
     ],
     "trials": [
         *("trials.trial", "trials.controller", "trials.audit", "trials.adversaries"),
@@ -119,7 +120,7 @@ STAGES = {
         *("trials.rope.learned", "trials.rope.baselines", "trials.rope.planners"),
         *("trials.furniture.namo_episode", "trials.furniture.cart_trials"),
         *("trials.appliance.hand", "trials.appliance.interaction", "trials.appliance.score"),
-        "trials.appliance.motion",
+        *("trials.appliance.motion", "trials.appliance.surface_examples"),
     ],
     "deployment": [
         *("deployment.deployment", "deployment.supervisor", "deployment.intake"),

@@ -55,6 +55,7 @@ TRUTH_FILES = {
     "experiments/furniture/one_shot.py",
     *("families/rope/robot.py", "families/contact/robot.py"),
     *("trials/appliance/score.py", "trials/appliance/motion.py"),
+    "trials/appliance/surface_examples.py",
     "families/contact/path_picture.py",  # which draws what happened
     "families/contact/probes.py",  # which asks what happened next
 }

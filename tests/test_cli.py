@@ -174,7 +174,7 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         (
             "reproduce rope-modle",
             "unknown experiment 'rope-modle'; did you mean 'rope-model'? there are: "
-            "articulated-model, twin-interactive, twin-foreign, "
+            "articulated-model, twin-interactive, movable-surfaces, twin-foreign, "
             "maze-safe, contact-model, maze-arm, maze-reflex, energy-audit, maze-passive, "
             "namo-scenarios, namo-scaling, namo-online, "
             "calibration, one-shot, cart-online, velocity-yardstick, "

@@ -25,9 +25,27 @@ def kept(found, degrees, centimetres, near, extra=0):
 
 MOVED = {
     "motions": [
-        {"error": 0.02, "still": 0.4, "covered": 1.0, "inside": [True, True, False]},
-        {"error": 0.1, "still": 0.5, "covered": 0.5, "inside": [True, False, False]},
-        {"error": 0.03, "still": 0.3, "covered": 0.9, "inside": [True, True, True]},
+        {
+            "error": 0.02,
+            "corrected": 0.03,
+            "still": 0.4,
+            "covered": 1.0,
+            "inside": [True, True, False],
+        },
+        {
+            "error": 0.1,
+            "corrected": 0.08,
+            "still": 0.5,
+            "covered": 0.5,
+            "inside": [True, False, False],
+        },
+        {
+            "error": 0.03,
+            "corrected": 0.03,
+            "still": 0.3,
+            "covered": 0.9,
+            "inside": [True, True, True],
+        },
     ],
     "urdf_s": 0.5,
 }
@@ -57,6 +75,17 @@ def test_parts_are_pooled_and_categories_stand_by_themselves():
     assert values["motion_coverage_90"] == pytest.approx(0.8)
     assert values["parameter_coverage_90"] == pytest.approx(2 / 3)
     assert values["cloud_to_urdf_s_p95"] == 0.5
+
+
+@pytest.mark.parametrize(("corrected", "worse", "kept"), [(0.05, 0, 1), (0.06, 1, 1), (None, 0, 0)])
+def test_an_appliance_is_worse_where_its_correction_moves_it_worse(corrected, worse, kept):
+    moves = [dict(one) for one in MOVED["motions"]]
+    for one in moves:
+        one["corrected"] = corrected  # beside a mean error of 0.05 without
+    of = FOUND | {("box", 1, "information"): FOUND["box", 1, "information"] | {"motions": moves}}
+    values = {figure.name: figure.value for figure in figures(of)}
+    assert values["residual_worse_count"] == worse
+    assert values["residual_kept_count"] == kept
 
 
 def test_only_appliances_with_several_parts_are_handled_at_random_too():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.learning.movable import HEAVY, Pull, moves, posterior, prior, probability
+from palpate.learning.movable import HEAVY, Pull, moves, posterior, prior
 from palpate.perception.surfaces import Surface
 
 OUT, IN, LEFT = np.array([1.0, 0, 0]), np.array([-1.0, 0, 0]), np.array([0, 1.0, 0])
@@ -79,21 +79,3 @@ def test_what_stopped_early_rather_goes_back():
     back = chance(ended, LEFT_EDGE, IN)
     assert back > chance(further, LEFT_EDGE, IN) > chance(ended, LEFT_EDGE, OUT)
     assert chance(further, LEFT_EDGE, OUT) > 0.6 > chance(ended, LEFT_EDGE, OUT)
-
-
-def test_features_move_the_odds_the_way_that_they_should():
-    plain = {
-        "faces the cameras": 0.5, "free before it": 1.0, "free behind it": 0.0,
-        "goes on beside it": 0.5, "of the scene before it": 0.2, "has a handle": 0.0,
-    }  # fmt: skip
-
-    def odds(**changed: float) -> float:
-        return probability(plain | changed, on_part=False, largest=False)
-
-    assert 0.0 < odds() < 1.0
-    assert odds(**{"has a handle": 1.0}) > odds()
-    assert odds(**{"free behind it": 1.0}) > odds()
-    assert odds(**{"of the scene before it": 0.9}) < odds()
-    own = probability(plain, on_part=True, largest=False)
-    assert own < odds()
-    assert probability(plain, on_part=True, largest=True) < own

@@ -1,5 +1,6 @@
 """Flat pieces of clouds of boxes before a wall, whose places are known."""
 
+import dataclasses
 import math
 
 import mujoco
@@ -8,7 +9,8 @@ import pytest
 
 from palpate.numerics.pinhole import DepthImage, Pinhole
 from palpate.perception.clouds import Cloud, cloud_of
-from palpate.perception.surfaces import features, surfaces
+from palpate.perception.surface_features import FEATURES, features_of
+from palpate.perception.surfaces import surfaces
 from palpate.worlds.depth import DepthSensor, depth_image
 
 # A wall at x = 0, a board that stands off it, and a bar before the board as a handle; all of it
@@ -71,13 +73,45 @@ def test_surfaces_share_no_point_and_keep_to_one_label(cloud):
 
 
 def test_features_tell_a_board_that_stands_free_from_a_wall(cloud):
-    board, wall = (features(cloud, found_at(cloud, x)) for x in (0.3, 0.0))
+    every = [found_at(cloud, x) for x in (0.3, 0.0)]
+    rows = features_of(cloud, every)
+    board, wall = (dict(zip(FEATURES, row, strict=True)) for row in rows)
     assert board["faces the cameras"] > 0.7
     assert board["of the scene before it"] < 0.03 < wall["of the scene before it"]
     assert board["goes on beside it"] < 0.3
     assert board["free behind it"] > wall["free behind it"] == 0.0
     assert board["has a handle"] == 1.0
     assert board["free before it"] > 0.9
+    assert board["area"] + wall["area"] == pytest.approx(1.0)
+    assert board["area"] < wall["area"]
+    assert board["size"] < wall["size"] < 0.0
+    assert board["aspect"] == pytest.approx(math.log(4 / 3), abs=0.1)
+    assert board["height"] > wall["height"]
+    assert board["fills its rectangle"] > 0.7
+    assert abs(board["faces up"]) < 0.05
+    assert board["on a part"] == board["largest of its part"] == 0.0
+
+
+def test_what_is_turned_stands_off_the_axes_of_its_scene_wherever_that_is_turned(cloud):
+    board, wall = found_at(cloud, 0.3), found_at(cloud, 0.0)
+    offs = FEATURES.index("off the scene's axes")
+    for turn in (0.0, 0.7):
+        cosine, sine = math.cos(turn), math.sin(turn)
+        whole = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        open_by = 0.5
+        cosine, sine = math.cos(open_by), math.sin(open_by)
+        opened = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        every = [
+            dataclasses.replace(wall, normal=whole @ wall.normal),
+            dataclasses.replace(board, normal=whole @ opened @ board.normal),
+        ]
+        found = features_of(cloud, every)[:, offs]
+        assert found[0] < 0.04
+        assert found[1] == pytest.approx(open_by, abs=0.06)
+
+
+def test_of_no_surface_there_are_no_features(cloud):
+    assert features_of(cloud, []).shape == (0, len(FEATURES))
 
 
 BEADS = "".join(f'<geom size=".018" pos=".14 {0.13 + 0.03 * one:.2f} 1"/>' for one in range(7))

@@ -1,5 +1,6 @@
 """`palpate interact`: handle an appliance until its joints are known, and write its twin."""
 
+import functools
 from pathlib import Path
 
 from palpate.commands import folders
@@ -10,7 +11,8 @@ from palpate.families.appliance.twin_picture import PICTURE, show_twin
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.twin import Twin
-from palpate.learning.active import CHOICES
+from palpate.learning.active import CHOICES, most_informative
+from palpate.learning.movable_guess import load_guess
 from palpate.models.articulated.mjcf import write_mjcf
 from palpate.models.articulated.urdf import write_urdf
 from palpate.runs.run import RESULT
@@ -35,6 +37,8 @@ def run(options: Interact) -> Path:
             world = ApplianceWorld(source, options.seed, views=options.views)
             world.reset(options.seed)
             choose, twin = CHOICES[options.choose], Twin()
+            if options.guess is not None:
+                choose = functools.partial(most_informative, guess=load_guess(options.guess))
             real: dict[int, Labels] = {}
             for number, step in enumerate(interact(world, choose, options.pushes, options.seed)):
                 twin = step.twin

@@ -99,9 +99,15 @@ class Interact(Options):
     """Cameras before the appliance."""
     choose: Literal["information", "random"] = "information"
     """Where to pull next: where most is expected to be learnt, or anywhere."""
+    guess: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: palpate's own)")
+    ] = None
+    """Which surfaces move by their looks, as `reproduce movable-surfaces` trains it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.guess is not None and self.choose == "random":
+            raise PalpateError("--guess is for --choose information: random pulls anywhere")
         if self.pushes < 1:
             raise PalpateError(f"--pushes is 1 or greater, not {self.pushes}")
         if self.body is not None and self.file is None:

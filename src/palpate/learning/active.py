@@ -15,8 +15,10 @@ from palpate.identification.interactive.refinement import way_information
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
 from palpate.learning import movable
+from palpate.learning.movable_guess import MovableGuess, load_guess
 from palpate.perception.clouds import Cloud
-from palpate.perception.surfaces import STANDS_OFF, Surface, features, surfaces
+from palpate.perception.surface_features import features_of
+from palpate.perception.surfaces import STANDS_OFF, Surface, surfaces
 
 JOINT = 10.0  # nats that a joint is worth which was not known
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
@@ -32,10 +34,14 @@ ASIDE = 0.7  # how much to the side of the normal a hand also pulls, which tries
 Choice = Callable[[Twin, np.random.Generator], Push]
 
 
-def most_informative(twin: Twin, random: np.random.Generator) -> Push:
-    """The push of which most is expected."""
+def most_informative(
+    twin: Twin, random: np.random.Generator, guess: MovableGuess | None = None
+) -> Push:
+    """The push of which most is expected; `guess` says which surfaces move, untouched, or the one
+    that comes with palpate."""
     look = len(twin.looks) - 1
-    options = [*_tries(twin, look, random), *_repeats(twin, look, random)]
+    guess = load_guess() if guess is None else guess
+    options = [*_tries(twin, look, random, guess), *_repeats(twin, look, random)]
     if not options:  # nothing flat is large enough
         return at_random(twin, random)
     return max(options, key=lambda one: one[0])[1]
@@ -50,22 +56,16 @@ def at_random(twin: Twin, random: np.random.Generator) -> Push:
     return Push(cloud.points[index], way / np.linalg.norm(way))
 
 
-def _tries(twin: Twin, look: int, random: np.random.Generator) -> list[tuple[float, Push]]:
+def _tries(
+    twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess
+) -> list[tuple[float, Push]]:
     """Of every surface, the pull that would show best whether it moves."""
     cloud, found = twin.looks[look], []
     every = surfaces(cloud, twin.labels[look], random)
-    areas = [
-        max((one.area for one in every if one.part == part), default=0.0)
-        for part in range(len(twin.parts))
-    ]
-    for surface in every:
+    before = guess(features_of(cloud, every))
+    for surface, chance in zip(every, before, strict=True):
         on_part = surface.part >= 0
         there = [one for one in twin.handled if _at(one, surface, cloud)]
-        before = movable.probability(
-            features(cloud, surface),
-            on_part=on_part,
-            largest=on_part and surface.area >= areas[surface.part],
-        )
         pulls = [
             movable.Pull(
                 one.push.point,
@@ -77,14 +77,14 @@ def _tries(twin: Twin, look: int, random: np.random.Generator) -> list[tuple[flo
             for one in there
             if one.held and not (one.moved and on_part)
         ]
-        belief = movable.posterior(movable.prior(before), surface, pulls)
+        belief = movable.posterior(movable.prior(float(chance)), surface, pulls)
         points, directions = _grips(cloud, surface)
-        chance = movable.moves(belief, surface, points, directions)
+        goes = movable.moves(belief, surface, points, directions)
         missed = [one.push.point for one in there if not one.held]
         near = np.zeros(len(points))
         for point in missed:
             near += np.linalg.norm(points - point, axis=1) < BESIDE
-        value = (_entropy(chance) + chance * JOINT) * MISSED**near
+        value = (_entropy(goes) + goes * JOINT) * MISSED**near
         best = int(np.argmax(value))
         found.append((float(value[best]), Push(points[best], directions[best])))
     return found

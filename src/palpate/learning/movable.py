@@ -1,11 +1,11 @@
 """What is believed of a surface: whether it moves, about or along what, and how hard it goes.
 
 A surface stands still, or it turns about one of the edges of its rectangle, or slides along its
-normal or a side of it. How likely it is to move is told by how it stands in the scene; what a hand
-found that pulled at it, and felt it stand still or go, weighs the joints anew (Bayes).
+normal or a side of it. How likely it is to move is guessed by how it stands in the scene
+(`movable_guess`); what a hand found that pulled at it, and felt it stand still or go, weighs the
+joints anew (Bayes).
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,25 +14,6 @@ from jaxtyping import Float
 
 from palpate.perception.surfaces import Surface
 
-# Logarithm of the odds that a surface moves, linear in its features: logistic regression on the
-# first looks at 240 appliances of the six categories (seeds 700000 to 700039).
-WEIGHTS = {
-    "": -4.09,
-    "faces the cameras": 2.59,
-    "free before it": 1.76,
-    "free behind it": 2.31,
-    "goes on beside it": 1.60,
-    "of the scene before it": -2.49,
-    "has a handle": 0.99,
-}
-# The same of a surface of a part that is known, to move on that part too (seeds to 700079).
-WEIGHTS_ON_PART = {
-    "": -2.41,
-    "faces the cameras": 1.5,
-    "free behind it": 2.2,
-    "goes on beside it": -3.04,
-    "is the largest of its part": -3.73,
-}
 # Shares of the joints: each of four, of one, and each of two.
 HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
 # Share of what moves that goes both ways, only the way of the axis or only against it: along the
@@ -66,16 +47,6 @@ class Pull(NamedTuple):
     moved: bool
     gave: bool
     ended: bool  # before the hand had gone as far as it would
-
-
-def probability(features: dict[str, float], *, on_part: bool, largest: bool) -> float:
-    """That a surface moves by itself, before it was tried.
-
-    `on_part` is of one on a part that is known, `largest` of the largest one on it.
-    """
-    weights = WEIGHTS_ON_PART if on_part else WEIGHTS
-    known = features | {"": 1.0, "is the largest of its part": float(largest)}
-    return 1.0 / (1.0 + math.exp(-sum(weight * known[name] for name, weight in weights.items())))
 
 
 def prior(chance: float) -> Belief:

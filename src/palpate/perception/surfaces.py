@@ -1,4 +1,4 @@
-"""The flat pieces of a cloud: where each lies, what stands off it, and how it stands in the scene.
+"""The pieces of a cloud that may move: where each lies, and what stands off it.
 
 Planes grow from seeds: what is near the plane of a seed, faces as it does and hangs together with
 it is one piece, whose plane is then fitted again.
@@ -23,8 +23,8 @@ STEP = 0.004  # m from a surface, beside noise
 STANDS_OFF = 0.01, 0.08  # m: what is so far before a surface may be a handle on it
 OUTLINE = 0.03  # m beside a surface's points: what stands off there stands on it
 TOGETHER = 0.05  # m between points of one handle
-BEHIND, BEFORE = 0.08, 0.3  # m from a surface, at which it is asked whether space is free
-TOLERANCE = 3.0  # standard deviations of depth
+BAR = 3.0  # of the side of the smallest surface: how long a bar is at least
+TOUCHING = 3.0  # of the distance between points of the cloud: points of one bar
 
 Vector = Float[np.ndarray, "3"]
 
@@ -74,19 +74,25 @@ def surfaces(
             pieces.append(members)
     found = [_surface(cloud, members, labels, size, ~taken) for members in pieces]
     held = np.concatenate([one.handles for one in found] or [np.empty((0, 3))])
+    bars = _bars(cloud, labels, ~taken, BAR * math.sqrt(smallest), TOUCHING * math.sqrt(size))
     return found + [
         _surface(cloud, members, labels, size, ~taken)
-        for members in _bars(cloud, labels, ~taken, math.sqrt(smallest))
+        for members in bars
         if not len(held) or cKDTree(cloud.points[members]).query(held)[0].min() > TOGETHER
     ]
 
 
-def _bars(cloud: Cloud, labels: np.ndarray, loose: np.ndarray, shortest: float) -> list[np.ndarray]:
-    """What is of no flat piece and hangs together over a length (m): levers, bars and taps."""
+def _bars(
+    cloud: Cloud, labels: np.ndarray, loose: np.ndarray, shortest: float, together: float
+) -> list[np.ndarray]:
+    """What is of no flat piece and hangs together over a length (m): levers, bars and taps.
+
+    So do points that are `together` (m).
+    """
     found = []
     for label in np.unique(labels[loose]):
         rest = np.flatnonzero(loose & (labels == label))
-        for piece in _pieces(cloud.points[rest], 0.5 * TOGETHER):
+        for piece in _pieces(cloud.points[rest], together):
             if extent_of(cloud.points[rest[piece]]) > shortest and len(piece) > NEIGHBOURS:
                 found.append(rest[piece])
     return found
@@ -185,28 +191,3 @@ def _pieces(points: np.ndarray, together: float) -> list[np.ndarray]:
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), [len(points)] * 2)
     piece = connected_components(graph, directed=False)[1]
     return [np.flatnonzero(piece == one) for one in range(piece.max() + 1)]
-
-
-def features(cloud: Cloud, surface: Surface) -> dict[str, float]:
-    """How a surface stands in the scene: what tells a part that moves from a wall.
-
-    Shares are of its points, or of places just beside its outline.
-    """
-    points = cloud.points[surface.members][::2]
-    _, behind = cloud.surfaces(points - BEHIND * surface.normal, TOLERANCE)
-    _, before = cloud.surfaces(points + BEFORE * surface.normal, TOLERANCE)
-    angle = np.linspace(0.0, 2.0 * math.pi, 24, endpoint=False)
-    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ surface.sides
-    furthest = points[np.argmax(points @ ways.T, axis=0)]
-    goes_on, _ = cloud.surfaces(furthest + OUTLINE * ways, TOLERANCE)
-    toward = np.mean([image.pinhole.position for image in cloud.images], axis=0) - surface.centre
-    return {
-        "faces the cameras": float(surface.normal @ toward / np.linalg.norm(toward)),
-        "free before it": float(before.mean()),
-        "free behind it": float(behind.mean()),
-        "goes on beside it": float(goes_on.mean()),
-        "of the scene before it": float(
-            ((cloud.points - surface.centre) @ surface.normal > OUTLINE).mean()
-        ),
-        "has a handle": float(len(surface.handles) > 0),
-    }

@@ -17,8 +17,9 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, ratio
+from palpate.identification.gradient.residual import Correction, fit_residual
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.dynamics import dynamics_of
+from palpate.identification.interactive.dynamics import FORCE, POSITION, Dynamics, dynamics_of
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated.urdf import write_urdf
@@ -34,6 +35,7 @@ FIRST, FIRST_QUICK = 510_000, 490_000  # seed of the first appliance
 OBJECTS, PAIRED, QUICK = 20, 5, 1  # of each category
 EACH, MORE = 3, 3  # pushes for each moving part, and in all
 NEAR = 2.0  # degrees that every axis is known to
+FEWEST_ACTIONS = 3  # of which a correction can be learnt and judged
 MINUTES = {"by information": 35, "at random": 10}
 
 
@@ -117,13 +119,26 @@ def motion_of(twin: Twin, world: ApplianceWorld, found: Score, number: int) -> d
     with tempfile.TemporaryDirectory() as folder:
         write_urdf(Path(folder) / "twin.urdf", description)
     seconds = time.perf_counter() - began
-    listed = motions(twin, known, world, found, number)
+    correction = correction_of(known)
+    corrected = correction.model if correction is not None and correction.kept else None
+    listed = motions(twin, known, world, found, number, corrected)
     return {
         "urdf_s": seconds,
+        "correction": "too few actions" if correction is None else correction.reason,
         "warnings": known.warnings,
         "unmoved": sum(one is None for one in listed),
         "motions": [dataclasses.asdict(one) for one in listed if one is not None],
     }
+
+
+def correction_of(known: Dynamics) -> Correction | None:
+    """What `identify appliance --residual` finds of the actions on a twin; None of too few."""
+    aligned = known.recording.align(
+        period=known.model.control_period, observation=POSITION, action=FORCE
+    )
+    if len(aligned.length) < FEWEST_ACTIONS:
+        return None
+    return fit_residual(known.model, aligned)
 
 
 def figures(found: Mapping[tuple[str, int, str], Mapping[str, Any]]) -> list[Figure]:
@@ -176,9 +191,25 @@ def of_motions(found: Sequence[Mapping[str, Any]]) -> list[Figure]:
         Figure("motion_coverage_90", of("covered", np.mean), "", better="higher"),
         Figure("parameter_coverage_90", of("inside", np.mean), "", better="higher"),
         Figure("motions", float(len(moves)), "", better="higher"),
+        Figure("residual_worse_count", float(sum(map(worse_corrected, found))), "", 0.0),
+        Figure("residual_kept_count", float(sum(kept(each) for each in found)), ""),
         Figure("cloud_to_urdf_s_p95", float(np.quantile(seconds, 0.95)) if seconds else None, "s",
                10.0),
     ]  # fmt: skip
+
+
+def kept(each: Mapping[str, Any]) -> bool:
+    """Whether an appliance's twin was corrected."""
+    return any(one["corrected"] is not None for one in each["motions"])
+
+
+def worse_corrected(each: Mapping[str, Any]) -> bool:
+    """Whether an appliance's twin moves worse with its correction than without, over its parts."""
+    pairs = [(one["corrected"], one["error"]) for one in each["motions"]]
+    if not kept(each):
+        return False
+    corrected, alone = np.mean(np.array(pairs, float), axis=0)
+    return bool(corrected > alone)
 
 
 def compared(

@@ -13,6 +13,7 @@ FAMILY = Family(
     experiments={
         "articulated-model": "palpate.experiments.appliance.articulated_model:reproduce",
         "twin-interactive": "palpate.experiments.appliance.twin_interactive:reproduce",
+        "movable-surfaces": "palpate.experiments.appliance.movable_surfaces:reproduce",
         "twin-foreign": "palpate.experiments.appliance.twin_foreign:reproduce",
     },
 )

@@ -17,7 +17,7 @@ from palpate.identification.interactive.dynamics import Dynamics
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.articulated import ACTION, Articulated
 from palpate.models.articulated.parameters import ArticulatedState
-from palpate.models.model import rollout
+from palpate.models.model import Model, rollout
 from palpate.trials.appliance.score import Score, real_labels
 from palpate.worlds.appliance.appliance import HOLD, ApplianceWorld, HandAction
 from palpate.worlds.appliance.design import MOST_FORCE
@@ -38,20 +38,28 @@ class Motion:
     """How far a twin's motion is off, as shares of the part's range.
 
     `error` and `still` are root mean squares over the motion, of the twin and of one that stands
-    still. `covered` is the share of moments in which 90 % of the draws hold the truth. `inside`
-    says of friction, damping and inertia whether their 90 % intervals do.
+    still; `corrected` is that of the twin with a network on top, None without one. `covered` is the
+    share of moments in which 90 % of the draws hold the truth. `inside` says of friction, damping
+    and inertia whether their 90 % intervals do.
     """
 
     error: float
     still: float
+    corrected: float | None
     covered: float
     inside: tuple[bool, bool, bool]
 
 
 def motions(
-    twin: Twin, dynamics: Dynamics, world: ApplianceWorld, found: Score, seed: int
+    twin: Twin,
+    dynamics: Dynamics,
+    world: ApplianceWorld,
+    found: Score,
+    seed: int,
+    corrected: Model | None = None,
 ) -> list[Motion | None]:
-    """Of each real part that was found with its kind of joint.
+    """Of each real part that was found with its kind of joint; `corrected` is its model with a
+    network on top.
 
     None of one that no force of the hand moves by `LEAST` of its range, or that is hidden. The
     world is as it was in the twin's last look, and is left as it is.
@@ -64,7 +72,7 @@ def motions(
             continue
         seen = points[labels == real]
         result.append(
-            _motion(twin, dynamics, world, real, int(part), seen, random, seed)
+            _motion(twin, dynamics, corrected, world, real, int(part), seen, random, seed)
             if len(seen)
             else None
         )
@@ -74,6 +82,7 @@ def motions(
 def _motion(
     twin: Twin,
     dynamics: Dynamics,
+    corrected: Model | None,
     world: ApplianceWorld,
     real: int,
     part: int,
@@ -112,17 +121,19 @@ def _motion(
     start = np.array([twin.parts[one].positions[look] for one in dynamics.parts])
     models = dynamics.draws(DRAWS, seed)
     ways = np.asarray(_rolled(models, jnp.asarray(start), jnp.asarray(acts)))[:, :, link]
-    alone = np.asarray(_rolled(_batch(dynamics.model), jnp.asarray(start), jnp.asarray(acts)))[
-        0, :, link
-    ]
     sign = 1.0 if twin.screw(part, look).axis @ axis > 0.0 else -1.0
     gone = sign * real_way
     noise = PLACE * random.standard_normal(ways.shape)
     low, high = np.quantile(ways - start[link] + noise, WITHIN, axis=0)
-    off = (alone - start[link] - gone) / own.range
+
+    def error_of(model: Model) -> float:
+        way = np.asarray(_rolled_alone(model, jnp.asarray(start), jnp.asarray(acts)))[:, link]
+        return float(np.sqrt(np.mean(np.square((way - start[link] - gone) / own.range))))
+
     return Motion(
-        error=float(np.sqrt(np.mean(np.square(off)))),
+        error=error_of(dynamics.model),
         still=float(np.sqrt(np.mean(np.square(gone / own.range)))),
+        corrected=None if corrected is None else error_of(corrected),
         covered=float(np.mean((gone >= low) & (gone <= high))),
         inside=_inside(dynamics, link, world, real),
     )
@@ -165,13 +176,13 @@ def _rolled(
     return rollout(models, state, repeated).position
 
 
-def _batch(model: Articulated) -> Articulated:
-    """The model as a batch of one, with a batch axis where draws have one."""
-    names = ("mass", "damping", "friction", "stiffness", "rest")
-    return eqx.tree_at(
-        lambda m: [getattr(m, name) for name in names], model,
-        [getattr(model, name)[None] for name in names],
-    )  # fmt: skip
+@eqx.filter_jit
+def _rolled_alone(
+    model: Model, start: Float[jax.Array, " links"], acts: Float[jax.Array, "time links 7"]
+) -> Float[jax.Array, "time links"]:
+    position = start.astype(acts.dtype)
+    state = ArticulatedState(position, jnp.zeros_like(position))
+    return model.observe(rollout(model, state, acts))
 
 
 def _inside(

@@ -1,0 +1,94 @@
+"""How surfaces stand in their scene: what tells a part that moves from a wall, without scale."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from palpate.perception.clouds import Cloud, extent_of
+from palpate.perception.surfaces import OUTLINE, Surface
+
+BEHIND, BEFORE = 0.08, 0.3  # m from a surface, at which it is asked whether space is free
+TOLERANCE = 3.0  # standard deviations of depth
+TURNS = np.radians(np.arange(0.0, 90.0, 1.5))  # of a scene about the vertical
+SHARP = 8  # power of cosines by which the surfaces that are along its axes decide how it is turned
+LEAST = 1e-3  # m and m^2: of what has no size
+
+# Shares are of a surface's points, or of places just beside its outline; lengths are over the
+# scene's extent.
+FEATURES = (
+    "faces the cameras",  # cosine
+    "free before it",
+    "free behind it",
+    "goes on beside it",
+    "of the scene before it",
+    "has a handle",
+    "off the scene's axes",  # rad
+    "area",  # of all surfaces'
+    "size",  # logarithm of the area over the square of the extent
+    "aspect",  # logarithm of long over short
+    "faces up",  # cosine
+    "height",  # over the middle
+    "distance",  # from the middle
+    "fills its rectangle",
+    "out of the middle",  # along its normal
+    "on a part",  # that is known
+    "largest of its part",
+)
+
+
+def features_of(cloud: Cloud, every: Sequence[Surface]) -> Float[np.ndarray, "surfaces features"]:
+    """The features of all surfaces of a scene."""
+    if not every:
+        return np.empty((0, len(FEATURES)))
+    extent, middle = extent_of(cloud.points), np.median(cloud.points, axis=0)
+    axes = _axes(every)
+    areas = np.array([one.area for one in every])
+    cameras = np.mean([image.pinhole.position for image in cloud.images], axis=0)
+    parts = np.array([one.part for one in every])
+    found = []
+    for one in every:
+        toward, away = cameras - one.centre, one.centre - middle
+        size = np.maximum(one.high - one.low, LEAST)
+        largest = one.part >= 0 and one.area >= areas[parts == one.part].max()
+        found.append([
+            one.normal @ toward / np.linalg.norm(toward),
+            *_surroundings(cloud, one),
+            float(len(one.handles) > 0),
+            math.acos(min(float(np.abs(axes @ one.normal).max()), 1.0)),
+            one.area / areas.sum(),
+            math.log(max(one.area, LEAST**2) / extent**2),
+            math.log(size.max() / size.min()),
+            one.normal[2],
+            away[2] / extent,
+            np.linalg.norm(away) / extent,
+            one.area / np.prod(size),
+            away @ one.normal / extent,
+            float(one.part >= 0),
+            float(largest),
+        ])  # fmt: skip
+    return np.array(found)
+
+
+def _surroundings(cloud: Cloud, surface: Surface) -> list[float]:
+    """Whether space is free before and behind, it goes on beside, and how much lies before it."""
+    points = cloud.points[surface.members][::2]
+    _, behind = cloud.surfaces(points - BEHIND * surface.normal, TOLERANCE)
+    _, before = cloud.surfaces(points + BEFORE * surface.normal, TOLERANCE)
+    angle = np.linspace(0.0, 2.0 * math.pi, 24, endpoint=False)
+    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ surface.sides
+    furthest = points[np.argmax(points @ ways.T, axis=0)]
+    goes_on, _ = cloud.surfaces(furthest + OUTLINE * ways, TOLERANCE)
+    ahead = (cloud.points - surface.centre) @ surface.normal > OUTLINE
+    return [float(each.mean()) for each in (before, behind, goes_on, ahead)]
+
+
+def _axes(every: Sequence[Surface]) -> Float[np.ndarray, "3 3"]:
+    """The vertical and the two level axes that most of the surfaces lie along."""
+    normals, areas = np.array([one.normal for one in every]), np.array([one.area for one in every])
+    cosine, sine, none = np.cos(TURNS), np.sin(TURNS), 0.0 * TURNS
+    first, second = np.stack([cosine, sine, none], 1), np.stack([-sine, cosine, none], 1)
+    along = np.maximum(np.abs(normals @ first.T), np.abs(normals @ second.T))
+    best = int(np.argmax(areas @ np.maximum(along, np.abs(normals[:, 2:])) ** SHARP))
+    return np.array([first[best], second[best], [0.0, 0.0, 1.0]])

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.handling import Push
+from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.labels import evidence, smoothed
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
@@ -213,6 +213,24 @@ def test_every_choice_points_at_something_that_was_seen(handled):
         assert twin.looks[-1].tree.query(push.point)[0] < 1e-9
 
 
+def test_a_part_that_is_hardly_seen_while_a_hand_pulls_in_vain_is_kept(handled):
+    _, twin, handling, _ = handled
+    twin = _copy(twin)
+    twin.observe(handling)
+    labels = twin.labels[-1]
+    mine = np.flatnonzero(labels == 0)
+    shown = np.sort(np.concatenate([np.flatnonzero(labels != 0), mine[:10]]))
+    hidden, later = (_chosen(twin.looks[-1], shown) for _ in range(2))
+    twin.look(hidden)
+    place = hidden.points[np.flatnonzero(twin.labels[-1] == 0)[0]]
+    nothing = np.zeros((5, 3))
+    twin.observe(
+        Handling(Push(place, np.eye(3)[0]), hidden, later, np.arange(5.0), place + nothing, nothing)
+    )
+    assert twin.held[-1][0] == 0
+    assert len(twin.parts) == 1
+
+
 def test_a_twin_becomes_a_file_that_can_be_read_again(handled, tmp_path):
     _, twin, handling, _ = handled
     with pytest.raises(PalpateError, match="no part was found that moves"):
@@ -252,7 +270,10 @@ def _copy(twin: Twin) -> Twin:
 
 
 def _shuffled(cloud: Cloud, seed: int) -> Cloud:
-    order = np.random.default_rng(seed).permutation(len(cloud.points))
+    return _chosen(cloud, np.random.default_rng(seed).permutation(len(cloud.points)))
+
+
+def _chosen(cloud: Cloud, order: np.ndarray) -> Cloud:
     return dataclasses.replace(
         cloud,
         points=cloud.points[order],

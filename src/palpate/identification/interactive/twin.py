@@ -79,11 +79,13 @@ class Twin:
         before = self._add_look(handling.before)
         after = self._add_look(handling.after)
         self.handled.append(handling)
+        known = list(self.parts)
         part = self._held(before, after, handling)  # may take parts out, and put `held` anew
         self.held.append((part, before))
         for look in (before, after):
             self.relabel(look)
-        self._drop(before, after)
+        if part >= 0 and not any(self.parts[part] is one for one in known):
+            self._drop_if_empty(part, before, after)
         self.refit()
 
     def look(self, cloud: Cloud) -> None:
@@ -327,13 +329,10 @@ class Twin:
                 gain += float(np.sum(gone - evidence(self.looks[look], points, normals)))
         return gain >= 0.0
 
-    def _drop(self, before: int, after: int) -> None:
-        """Take out a part that was found just now and explains nothing (section III-B d)."""
-        newest = len(self.parts) - 1
-        if newest < 0 or self.held[-1][0] != newest or len(self.parts[newest].ways) > 1:
-            return
-        if max((self.labels[look] == newest).sum() for look in (before, after)) < FEWEST:
-            self._remove(newest, self.parts[newest].parent)
+    def _drop_if_empty(self, part: int, before: int, after: int) -> None:
+        """Take out a part that was found just now if it explains nothing (section III-B d)."""
+        if max((self.labels[look] == part).sum() for look in (before, after)) < FEWEST:
+            self._remove(part, self.parts[part].parent)
 
     def _remove(self, part: int, heir: int) -> None:
         """Take a part out of the tree; what it carries and what was found of it goes to its heir,

@@ -279,6 +279,13 @@ def test_many_stages_are_counted(tmp_path, count, words):
     assert "→ run 5" not in page.text
 
 
+def test_lines_of_a_summary_are_sentences_on_the_page(tmp_path):
+    run = write_run(tmp_path / "run", "one", settings={"summary": ["part 1: a hinge", "It moves."]})
+    page = page_of(build_report([run], tmp_path / "page.html", "One"))
+    assert "part 1: a hinge. It moves." in page.text
+    assert "moves.." not in page.text
+
+
 def test_no_run_is_refused(tmp_path):
     with pytest.raises(PalpateError, match="at least one run"):
         build_report([], tmp_path / "page.html", "None")

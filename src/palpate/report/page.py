@@ -122,7 +122,8 @@ def _header(found: Sequence[Evidence], title: str) -> Iterator[str]:
     dates = sorted(str(e.environment["date"])[:10] for e in found if "date" in e.environment)
     when = f", {_text(dates[-1])}" if dates else ""
     yield f"<header><h1>{_text(title)}</h1><p>{names}{when}</p>"
-    summary = " ".join(map(_text, _listed(found[0].settings, "summary")))
+    lines = _listed(found[0].settings, "summary")
+    summary = " ".join(_text(each if each.endswith(".") else f"{each}.") for each in lines)
     yield f'<p class="lead">{summary}</p>' if summary else ""
     figures = [figure for evidence in found for figure in evidence.figures]
     verdicts = [figure.met for figure in figures if figure.met is not None]

@@ -36,7 +36,7 @@ def test_what_cannot_be_is_refused(tmp_path, capsys):
         (["oven", "--pushes", "0"], "--pushes is 1 or greater, not 0"),
         (["oven", "--views", "9"], "1 to 4 cameras, not 9"),
         (["oven", "--body", "door"], "--body is of a file, and oven is none"),
-        (["none.urdf"], "cannot read none.urdf"),
+        (["none.urdf"], "there is no file none.urdf"),
     ):
         assert main(["interact", *words, "--out", str(tmp_path / "twin")]) == 2
         assert sentence in capsys.readouterr().err
@@ -55,3 +55,6 @@ def test_a_file_of_yours_is_handled(tmp_path, capsys):
     assert "part 1: revolute" in capsys.readouterr().out
     hinges = [one for one in read_urdf(out / "twin.urdf").joints if one.kind == "revolute"]
     assert max(abs(one.axis[1]) for one in hinges) > 0.999  # whatever else was taken for a part
+    file.write_text(file.read_text().replace("1.2", "0.9"))  # another chest is not taken for it
+    assert main(["interact", str(file), "--pushes", "4", "--out", str(out)]) == 2
+    assert "push 1" not in capsys.readouterr().out

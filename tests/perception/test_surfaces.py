@@ -24,17 +24,21 @@ SCENE = """
 """
 
 
-@pytest.fixture(scope="module")
-def cloud() -> Cloud:
-    model = mujoco.MjModel.from_xml_string(SCENE)
+def looked(scene: str, target: tuple[float, ...], eyes: list[tuple[float, ...]]) -> Cloud:
+    model = mujoco.MjModel.from_xml_string(scene)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     random = np.random.default_rng(0)
     images: list[DepthImage] = []
-    for side in (-0.9, 0.9):
-        camera = Pinhole.looking_at((0.0, 0.1, 1.0), (1.6, side, 1.3), 320, 240, math.radians(58))
+    for eye in eyes:
+        camera = Pinhole.looking_at(target, eye, 320, 240, math.radians(58))
         images.append(depth_image(model, data, camera, DepthSensor(), random)[0])
     return cloud_of(images)
+
+
+@pytest.fixture(scope="module")
+def cloud() -> Cloud:
+    return looked(SCENE, (0.0, 0.1, 1.0), [(1.6, side, 1.3) for side in (-0.9, 0.9)])
 
 
 def found_at(cloud: Cloud, x: float):
@@ -123,15 +127,7 @@ LEVER = f"""
 
 
 def test_a_lever_is_a_piece_of_its_own_though_nothing_of_it_is_flat():
-    model = mujoco.MjModel.from_xml_string(LEVER)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    random = np.random.default_rng(0)
-    images: list[DepthImage] = []
-    for side in (-0.4, 0.5):
-        camera = Pinhole.looking_at((0.0, 0.1, 1.0), (0.9, side, 1.4), 320, 240, math.radians(58))
-        images.append(depth_image(model, data, camera, DepthSensor(), random)[0])
-    small = cloud_of(images)
+    small = looked(LEVER, (0.0, 0.1, 1.0), [(0.9, side, 1.4) for side in (-0.4, 0.5)])
     every = surfaces(small, np.full(len(small.points), -1), np.random.default_rng(1))
     on_lever = small.points[:, 1] > 0.115
     held = np.zeros(len(small.points), int)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, PalpateWarning
 from palpate.families.appliance.foreign import read_scene
 from palpate.worlds.appliance.appliance import HOLD, ApplianceWorld, HandAction
 from palpate.worlds.appliance.scene import labels_of
@@ -113,7 +113,8 @@ def test_a_door_of_a_file_is_seen_and_pulled_open(kitchen):
 def test_a_urdf_is_mended_and_moves(tmp_path):
     path = tmp_path / "chest.urdf"
     path.write_text(URDF)  # without any mass, effort or velocity
-    world = ApplianceWorld(read_scene(path))
+    with pytest.warns(PalpateWarning, match="of .*chest.urdf mended: `palpate check` names them"):
+        world = ApplianceWorld(read_scene(path))
     world.reset(0)
     assert [part.joint for part in world.parts] == ["revolute"]
     assert -0.01 <= world.truth().position[0] <= 1.21

@@ -31,7 +31,9 @@ def run(options: Interact) -> Path:
     Raises `PalpateError` for a category that there is not, for a file as `read_scene`, and where
     nothing was found to move.
     """
-    with folders.begin(options, "interact") as run:
+    given = {"file": options.file, "guess": options.guess}
+    inputs = {name: path for name, path in given.items() if path is not None}
+    with folders.begin(options, "interact", inputs) as run:
         if not run.finished:
             source = read_scene(options.file, options.body) if options.file else options.world
             world = ApplianceWorld(source, options.seed, views=options.views)

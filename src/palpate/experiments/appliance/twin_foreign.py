@@ -43,7 +43,7 @@ QUICK = "drawer"
 LONG = 0.10  # m
 KNOB = 0.1  # of its length that the axis of a knob passes its middle by at most
 PLACES = ("degrees", "centimetres")
-MINUTES = {"objects": 20}
+MINUTES = {"objects": 4}
 
 
 def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:

@@ -61,6 +61,24 @@ class Priced(gymnasium.Env):
         return np.zeros(1, np.float32), -((float(action[0]) - 1.0) ** 2), True, False, cost
 
 
+class Leaving(gymnasium.Env):
+    """Ten steps that cost 1 each, if no positive action ends them; each that goes on pays 0.2."""
+
+    observation_space = Box(-1.0, 1.0, (1,), np.float32)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = 10
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        leaves = bool(action[0] > 0.0)
+        self.left -= 1
+        cost = {"cost": 1.0}
+        return np.zeros(1, np.float32), 0.2 * (not leaves), leaves, self.left == 0, cost
+
+
 class Regulator(gymnasium.Env):
     """A scalar linear system x' = x + u, cost x^2 + u^2, 10 steps; its Riccati equation is solved.
 

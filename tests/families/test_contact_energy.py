@@ -58,7 +58,7 @@ def test_decisions_pay_for_what_they_draw_and_see_what_is_left(costs):
         expected = expected + ("ef" in costs) * (one["flow"] > tank.flow)
         np.testing.assert_allclose(one["cost"], expected)
         goes_on = one["end"] == ""
-        np.testing.assert_allclose(seen[goes_on, 9], one["level"][goes_on] / 0.6, rtol=1e-5)
+        np.testing.assert_allclose(seen[goes_on, 9], one["level"][goes_on] / TANK["upper"], rtol=1e-5)
         np.testing.assert_allclose(seen[~goes_on, 9], 1.0)  # a new episode, a full tank
         paid += one["cost"].sum()
     assert paid > 0.0
@@ -100,7 +100,7 @@ def test_episodes_tell_what_was_drawn():
     environments = blind_mazes(4, **metered_by("none", None, None), horizon=12)
     found = evaluate(environments, lambda seen: STIFF, 6, 3)
     assert np.all(found["drawn"] > 0.0)
-    assert np.all(found["level"] < 0.6)
+    assert np.all(found["level"] < TANK["upper"])
     named = {one.name: one.value for one in figures(found)}
     assert named["least_tank_level"] == pytest.approx(found["level"].min())
     assert named["energy_drawn"] is None  # none of them arrived

@@ -28,7 +28,7 @@ from palpate.learning.off_policy import (
 from palpate.learning.off_policy.buffer import ReplayBuffer
 from palpate.learning.off_policy.loop import Compiled
 from palpate.runs import Run
-from small_environments import Bandit, Priced, Regulator, side_by_side
+from small_environments import Bandit, Leaving, Priced, Regulator, side_by_side
 
 pytestmark = pytest.mark.optimised
 
@@ -72,6 +72,16 @@ def test_a_limit_finds_its_price(episodic: bool) -> None:
     state = train_off_policy(side_by_side(Priced, 8), agent, PRICED, 0)
     assert abs(greedy(agent, state, [[0.0]])[0, 0] - 0.5) < 0.07
     assert abs(state.multiplier - 1.0) < 0.3
+
+
+@pytest.mark.parametrize("relief", [True, False])
+def test_to_leave_is_a_way_out_of_costs_only_where_it_is_a_relief(relief: bool) -> None:
+    agent = Lagrangian(
+        SMALL, 0.0, learning_rate=3e-3, multiplier=1.0, multiplier_rate=0.0, width=32,
+        target_rate=0.02, relief=relief,
+    )  # fmt: skip
+    state = train_off_policy(side_by_side(Leaving, 8), agent, PRICED, 0)
+    assert (greedy(agent, state, [[0.0]])[0, 0] > 0.0) == relief
 
 
 def test_a_regulator_comes_near_its_riccati_gain() -> None:

@@ -96,7 +96,14 @@ METHODS: dict[str, Callable[[], Method]] = {
     ),
     "penalty": lambda: Method(Penalty(_agent(), VIOLATION_PRICE)),
     "passive": lambda: Method(
-        Lagrangian(_agent(), ENERGY_LIMIT, discount=DISCOUNT, multiplier_rate=1e-3, width=WIDTH),
+        Lagrangian(  # a violation of the force limit is no way out of paying for energy
+            _agent(),
+            ENERGY_LIMIT,
+            discount=DISCOUNT,
+            multiplier_rate=1e-4,
+            relief=False,
+            width=WIDTH,
+        ),
         passive=True,
     ),
 }

@@ -77,6 +77,9 @@ class Lagrangian:
     episode where `episodic` (mean of the last ones; as SAC-Lag of OmniSafe), else the discounted
     cost of the actor's own actions on the batch (Recovery RL's "LR"). It is held for the first
     `patience` updates, and until an episode has ended.
+
+    Without `relief` what ends an episode ends no costs: those to come are expected as if it went
+    on. Else whoever pays much for going on learns to break off, where that costs nothing.
     """
 
     agent: PricedAgent
@@ -88,6 +91,7 @@ class Lagrangian:
     multiplier: float = 1e-3  # in the beginning
     multiplier_rate: float = 1e-5
     patience: int = 0
+    relief: bool = True
     width: int = 256
     depth: int = 2
 
@@ -130,7 +134,8 @@ class Lagrangian:
         lived, (for_agent, for_cost, for_now) = batch.task, jax.random.split(key, 3)
         after = self.agent.propose(state.agent, lived.next_observation, for_cost)
         later = state.target(lived.next_observation, after)[0]
-        wanted = lived.cost + self.discount * (1.0 - lived.terminated) * later
+        goes_on = 1.0 - lived.terminated if self.relief else 1.0
+        wanted = lived.cost + self.discount * goes_on * later
 
         def critic_loss(critic: Critic) -> Array:
             return jnp.mean((critic(lived.observation, lived.action)[0] - wanted) ** 2)

@@ -111,9 +111,9 @@ def base_figures(rooms: Sequence[Mapping[str, Any]]) -> list[Figure]:
         np.array([room[name] for room in rooms], float)
         for name in ("bare", "filtered", "drawn", "least")
     )
+    more = float(filtered.sum() - bare.sum()) / len(rooms)  # 38 / 40 - 1 is less than -0.05
     return [
-        Figure("base.success_difference", float(filtered.mean() - bare.mean()), "", BASE_CLOSE,
-               better="higher"),
+        Figure("base.success_difference", more, "", BASE_CLOSE, better="higher"),
         Figure("detail.base.success_rate", float(filtered.mean()), "", better="higher"),
         Figure("detail.base.drawn_J", float(np.median(drawn)), "J"),
         Figure("detail.base.least_tank_level_J", float(least.min()), "J", better="higher"),

@@ -58,7 +58,9 @@ def test_decisions_pay_for_what_they_draw_and_see_what_is_left(costs):
         expected = expected + ("ef" in costs) * (one["flow"] > tank.flow)
         np.testing.assert_allclose(one["cost"], expected)
         goes_on = one["end"] == ""
-        np.testing.assert_allclose(seen[goes_on, 9], one["level"][goes_on] / TANK["upper"], rtol=1e-5)
+        np.testing.assert_allclose(
+            seen[goes_on, 9], one["level"][goes_on] / TANK["upper"], rtol=1e-5
+        )
         np.testing.assert_allclose(seen[~goes_on, 9], 1.0)  # a new episode, a full tank
         paid += one["cost"].sum()
     assert paid > 0.0

@@ -129,7 +129,7 @@ def test_a_part_that_goes_leaves_the_others_as_they_are(handled):
     twin.parts += [dataclasses.replace(part, parent=0), dataclasses.replace(part, parent=1)]
     twin.labels = [np.array([-1, 0, 1, 2])]
     twin.held = [(2, 0), (1, 0)]
-    twin._remove(1, 0)
+    twin.remove(1, 0)
     assert [one.parent for one in twin.parts] == [-1, 0]
     assert twin.labels[0].tolist() == [-1, 0, 0, 1]
     assert twin.held == [(1, 0), (0, 0)]
@@ -141,7 +141,7 @@ def test_an_action_is_kept_although_it_takes_a_part_out(handled):
     class Merging(Twin):
         def _held(self, before, after, handling):
             self.held = list(self.held)  # as a part that is taken out does
-            return -1
+            return -1, False
 
     twin = Merging()
     twin.look(seen.looks[0])
@@ -198,7 +198,7 @@ def test_a_refined_joint_is_nearer_than_its_first_guess(handled):
     true = Screw("revolute", after.axis[0], after.anchor[0])
     guess = true.varied(np.array([0.05, -0.04, 0.01, 0.01]))
     guess = dataclasses.replace(guess, axis=guess.axis * np.sign(guess.axis @ part.screw.axis))
-    found = refine(guess, np.array(part.positions), seen, [handling.points])
+    found = refine(guess, np.array(part.positions), seen, [(0, handling.points)])
     angle, gap = difference(found.screw, true.axis, true.point)
     assert angle < 1.5 < math.degrees(math.hypot(0.05, 0.04))
     assert gap < 1.0

@@ -45,6 +45,11 @@ class Part:
         """The least and the greatest position that was seen."""
         return min(self.positions), max(self.positions)
 
+    def settle(self, estimate: Estimate) -> None:
+        """Take an estimate of its joint, and of where it was in each look."""
+        self.estimate = estimate
+        self.positions = [float(one) for one in estimate.positions]
+
     def positions_of(self, screw: Screw) -> list[float]:
         """Where another joint has to be for the part to be where it was, in each look."""
         place = self.support[0].mean(axis=0)

@@ -38,6 +38,11 @@ MOMENTS = 25  # of a hand's way
 STEP = 1e-5  # of differences
 
 
+# The look before a hand took hold of a part, which the one after it follows, and the way (m, times
+# by 3) that it went.
+Way = tuple[int, np.ndarray]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sighting:
     """Points of a part in one look, as if what carries it had not moved since it was described."""
@@ -87,7 +92,7 @@ def refine(
     screw: Screw,
     positions: Float[np.ndarray, " looks"],
     seen: Sequence[Sighting | None],
-    ways: Sequence[Float[np.ndarray, "_ 3"]],
+    ways: Sequence[Way],
 ) -> Estimate:
     """The joint that explains what was seen of its part, from a first guess.
 
@@ -99,7 +104,7 @@ def refine(
     random = np.random.default_rng(0)
     chosen = {look: _subset(seen[look], random) for look in used}
     column = {look: AXES + number for number, look in enumerate(used[1:])}
-    middle = np.mean([way.mean(axis=0) for way in ways], axis=0) if ways else screw.point
+    middle = np.mean([way.mean(axis=0) for _, way in ways], axis=0) if ways else screw.point
     screw, positions = screw.near(middle), np.array(positions, float)
     unknown = AXES + len(column)
     # what nothing says anything of stays as it is; where a slide's axis is, nothing can say
@@ -110,8 +115,9 @@ def refine(
         sums = _Sums(unknown)
         for pair in pairs:
             _add_pair(sums, screw, positions, pair, seen, chosen, column, NEAR[number < COARSE])
-        for way in ways:
+        for before, way in ways:
             _add_way(sums, screw, way)
+            _add_travel(sums, screw, positions, column, before, way)
         change = -np.linalg.solve(sums.information + np.diag(prior), sums.slope)
         change[:2] = np.clip(change[:2], -0.3, 0.3)
         change[2:AXES] = np.clip(change[2:AXES], -0.2, 0.2)
@@ -203,6 +209,36 @@ def _add_way(sums: _Sums, screw: Screw, way: Float[np.ndarray, "times 3"]) -> No
     sums.independent += len(standard)
 
 
+def _add_travel(
+    sums: _Sums,
+    screw: Screw,
+    positions: Float[np.ndarray, " looks"],
+    column: dict[int, int],
+    before: int,
+    way: Float[np.ndarray, "times 3"],
+) -> None:
+    """How far a hand took the part: of a sheet that slides in its plane no cloud says it."""
+    rows, start = np.zeros((1, len(sums.slope))), way[:3].mean(axis=0)
+    gone = positions[before + 1] - positions[before]
+    travel = float(np.linalg.norm(way[-1] - way[0]))
+    scale = math.hypot(HAND, CREEP * math.sqrt(travel / CREEP_TRAVEL))
+
+    def error(screw: Screw) -> float:
+        went = float(screw.position_of(start, way)[-3:].mean())
+        return (gone - went) * float(np.linalg.norm(screw.velocity(start))) / scale
+
+    for look, sign in ((before + 1, 1.0), (before, -1.0)):
+        if look in column:
+            rows[0, column[look]] = sign * float(np.linalg.norm(screw.velocity(start))) / scale
+    if not rows.any():
+        return
+    standard = np.array([error(screw)])
+    for axis, one in enumerate(np.eye(AXES)):
+        rows[0, axis] = (error(screw.varied(STEP * one)) - standard[0]) / STEP
+    sums.add(rows, standard, np.ones(1))
+    sums.scatter += rows.T @ rows
+
+
 def _whitened(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Slopes and residuals of a hand's way: a random walk, white noise, an offset not known."""
     way = way[np.unique(np.linspace(0, len(way) - 1, MOMENTS).astype(int))]
@@ -214,6 +250,19 @@ def _whitened(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     white = np.linalg.solve(root, np.concatenate([base, *varied], axis=1))
     standard, *slopes = np.split(white, AXES + 1, axis=1)
     return np.stack([one.T.ravel() / STEP for one in slopes], axis=1), standard.T.ravel()
+
+
+def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
+    """How far a way is from one that a joint allows, as far as that is known: about 1 of its own.
+
+    The squared Mahalanobis distance of its errors, for each of them: those of the hand, and what
+    the covariance of the joint leaves open.
+    """
+    slopes, standard = _whitened(estimate.screw, way)
+    known = np.linalg.inv(estimate.covariance + 1e-10 * np.eye(AXES))
+    left = slopes.T @ standard
+    explained = left @ np.linalg.solve(known + slopes.T @ slopes, left)
+    return float((standard @ standard - explained) / len(standard))
 
 
 def way_information(screw: Screw, way: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "4 4"]:

@@ -13,7 +13,6 @@ from palpate.identification.interactive.twin import Twin
 from palpate.runs import Figure
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
-FEWEST = 20  # points of a part that a look shows
 MATCH = 0.25  # IoU of a part that was found with the one that it is
 
 Labels = Int[np.ndarray, " points"]
@@ -57,17 +56,16 @@ def real_labels(twin: Twin, world: ApplianceWorld) -> Labels:
 def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | None = None) -> Score:
     """Compare; the world is as it was in the twin's last look.
 
-    Points of a part are compared in that look, or where it is hidden then in the last of the
-    `earlier` looks, with their `real_labels`, that show it.
+    Points of a part are compared in that look or in that of the `earlier` looks, with their
+    `real_labels`, which shows most of them: a door that is seen edge-on says little of a mask.
     """
     truth, look = world.truth(), len(twin.looks) - 1
     parts = truth.parts
-    known = dict(sorted((earlier or {}).items(), reverse=True))
-    real = {look: real_labels(twin, world)} | known
+    real = {look: real_labels(twin, world)} | dict(earlier or {})
     overlap = np.zeros((len(parts), len(twin.parts)))
     labels: dict[int, Labels] = {look: twin.labels[look]}
     for one in range(len(parts)):
-        shown = next((at for at, own in real.items() if (own == one).sum() >= FEWEST), look)
+        shown = max(real, key=lambda at: int((real[at] == one).sum()))
         if shown not in labels:
             labels[shown] = twin.probabilities(shown).argmax(axis=0) - 1
         for other in range(len(twin.parts)):

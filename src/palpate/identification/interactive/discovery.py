@@ -1,0 +1,261 @@
+"""Parts that are new: what has moved with a hand as nothing does that is known.
+
+Where a hand pulled at a part of something that moved as well, as at the flap of a door, its way is
+no line and no circle. If the carrier is known, the way is only known by its ends: seen from the
+carrier, the joint is sought that explains what was seen. Else the pull tells nothing yet.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from palpate.identification.interactive.explanation import labels_near
+from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.labels import LEAST_MOTION, STANDS, evidence, telling
+from palpate.identification.interactive.part import Part, support_of
+from palpate.identification.interactive.refinement import Estimate, refine, sighting, surprise
+from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
+from palpate.identification.interactive.tree import FEWEST, Guest, PartTree
+
+TELLS = 0.02  # m that a hand has to go to tell of a joint that is not known
+WITHIN = 0.6  # share of a part's points that make it a part of another
+LITTLE = 0.05  # m that a hand has taken a part: too little was known of it to know it again
+STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see `surprise`)
+UNEXPLAINED = -1.0  # of evidence: a point that no label explains any better
+LEFT = 0.35  # of the points of a part, as many that are left unexplained beside it
+AROUND = 0.3  # m from a hand to the points by which a joint on a carrier is sought
+TURNS, ARMS = 12, (0.0, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7)  # directions, and m
+TRIED = 3  # of those joints, the best, which are refined
+SEEN = 0.2  # of evidence, for each point: less is no difference
+CARRIED = 0.15  # rad or m that a part has to go to show what it carries
+TOUCHES = 0.03  # m: what is so near a part may carry it
+
+
+@dataclasses.dataclass(frozen=True)
+class Discovery:
+    """A joint on a `carrier` where that was in the look before, and the points of both looks."""
+
+    carrier: int
+    estimate: Estimate
+    masks: list[Int[np.ndarray, " _"]]
+    way: Float[np.ndarray, "times 3"]  # as if the carrier had stood still
+
+
+def discover(tree: PartTree, before: int, after: int, handling: Handling) -> bool:
+    """Whether a new part explains what moved with the hand; it is the tree's last one then.
+
+    Parts that turn out to be a piece of it are taken out of the tree.
+    """
+    way = handling.points
+    found = _best(tree, before, after, -1, way, screws_of_way(way))
+    if found is None:
+        near = [one for one in labels_near(tree, before, handling.push.point) if one >= 0]
+        options = (_on_carrier(tree, before, after, carrier, way) for carrier in near)
+        found = next((one for one in options if one is not None), None)
+    if found is not None:
+        _insert(tree, before, after, found)
+    return found is not None
+
+
+def _on_carrier(
+    tree: PartTree, before: int, after: int, carrier: int, way: Float[np.ndarray, "times 3"]
+) -> Discovery | None:
+    """A part of something that moved as well: what joins the ends of the way, and was seen."""
+    motion = tree.motion(carrier, before, after)
+    ends = np.stack([way[:3].mean(axis=0), motion.inverse.at(way[-3:].mean(axis=0)[None])[0]])
+    places = tree.parts[carrier].positions
+    if abs(places[after] - places[before]) < LEAST_MOTION or math.dist(*ends) < TELLS:
+        return None
+    cloud = tree.looks[before]
+    lost = _unexplained(tree, before, Guest(NOWHERE, before, after))
+    lost &= np.linalg.norm(cloud.points - ends[0], axis=1) < AROUND
+    if lost.sum() < FEWEST:
+        return None
+    points, normals = cloud.points[lost], cloud.normals[lost]
+
+    def value(screw: Screw) -> float:
+        pose = motion @ screw.pose(float(screw.position_of(ends[0], ends[1:])[0]))
+        return float(np.sum(evidence(tree.looks[after], pose.at(points), pose.turned(normals))))
+
+    best = sorted(_joining(*ends), key=value, reverse=True)[:TRIED]
+    return _best(tree, before, after, carrier, np.repeat(ends, 3, axis=0), best)
+
+
+def _joining(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> list[Screw]:
+    """Joints that take a point from one place to another: a line, and circles all around it."""
+    middle, chord = 0.5 * (start + end), (end - start) / np.linalg.norm(end - start)
+    line = Screw("prismatic", chord, middle)
+    first, second = line.across
+    found = [line]
+    for turn in np.arange(TURNS) * math.tau / TURNS:
+        axis = math.cos(turn) * first + math.sin(turn) * second
+        side = np.cross(axis, chord)
+        found += [Screw("revolute", axis, middle + arm * side) for arm in ARMS]
+    return found
+
+
+def _best(
+    tree: PartTree,
+    before: int,
+    after: int,
+    carrier: int,
+    way: Float[np.ndarray, "times 3"],
+    screws: list[Screw],
+) -> Discovery | None:
+    """The likeliest of some joints, each from all that moved so; None if none explains enough."""
+    start, back = way[:3].mean(axis=0), tree.motion(carrier, after, before)
+    found: list[Discovery] = []
+    for screw in screws:
+        gone = float(screw.position_of(start, way)[-3:].mean())
+        estimate = Estimate(screw, np.array([0.0, gone]), np.eye(4), 0.0, 0.0)
+        masks: list[np.ndarray] = []
+        for _ in range(2):
+            guest = _guest(estimate, back, before, after)
+            masks = [
+                np.flatnonzero(tree.probabilities(look, guest).argmax(0) == len(tree.parts) + 1)
+                for look in (before, after)
+            ]
+            if max(map(len, masks)) < FEWEST:
+                break
+            seen = [
+                sighting(tree.looks[look], mask, pose) if len(mask) >= FEWEST else None
+                for look, mask, pose in zip((before, after), masks, (NOWHERE, back), strict=True)
+            ]
+            estimate = refine(estimate.screw, estimate.positions, seen, [(0, way)])
+        if max(map(len, masks)) < FEWEST or surprise(estimate, way) > STRANGE:
+            continue
+        guest = _guest(estimate, back, before, after)
+        left = [int(_unexplained(tree, look, guest).sum()) for look in (before, after)]
+        if all(
+            one < max(LEFT * len(mask), 2 * FEWEST) for one, mask in zip(left, masks, strict=True)
+        ):
+            found.append(Discovery(carrier, estimate, masks, way))
+    return min(found, key=lambda one: one.estimate.criterion, default=None)
+
+
+def _guest(estimate: Estimate, back: Pose, before: int, after: int) -> Guest:
+    gone = float(estimate.positions[1] - estimate.positions[0])
+    return Guest(back.inverse @ estimate.screw.pose(gone), before, after)
+
+
+def _unexplained(tree: PartTree, look: int, guest: Guest) -> np.ndarray:
+    """Which points of a look are, by the guest's other look, of no part and do not stand still."""
+    found = tree.scores(look, guest)
+    found[0] -= STANDS
+    return found.max(axis=0) < UNEXPLAINED
+
+
+def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
+    """Put a new part where it belongs in the tree."""
+    labels, mask = tree.labels[before], np.zeros(len(tree.labels[before]), bool)
+    mask[new.masks[0]] = True
+    parent, carried, same = new.carrier, [], []
+    for number, part in enumerate(tree.parts):
+        own = labels == number
+        if own.sum() < FEWEST or number == new.carrier:
+            continue
+        shared = (mask & own).sum()
+        if shared > WITHIN * own.sum() and part.longest_way < LITTLE:
+            same.append(number)
+        elif shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
+            carried.append(number)  # all of it has moved, and more
+        elif (
+            new.carrier < 0
+            and shared > WITHIN * mask.sum()
+            and _carries(tree, number, before, after, new.masks[0])
+        ):
+            parent = number
+    number = len(tree.parts)
+    back = tree.pose(parent, before).inverse
+    screw = new.estimate.screw.moved(back)
+    positions = [0.0] * len(tree.looks)
+    positions[after] = float(new.estimate.positions[1] - new.estimate.positions[0])
+    # a carrier that is found by its overlap alone has not moved: the whole way was the part's
+    there = tree.pose(parent, after) if new.carrier >= 0 else back.inverse
+    poses = back, (there @ screw.pose(positions[after])).inverse
+    support = support_of((tree.looks[before], tree.looks[after]), new.masks, poses)
+    estimate = dataclasses.replace(new.estimate, screw=screw)
+    seen = {before: new.masks[0], after: new.masks[1]}
+    ways = [(before, back.at(new.way))]
+    tree.parts.append(Part(parent, estimate, positions, seen, ways, support))
+    for child in carried:
+        if tree.parts[child].parent == parent:
+            tree.parts[child].parent = number
+            tree.parts[child].positions[after] = tree.parts[child].positions[before]
+    # what carries the carrier stays: a part cannot hang on what hangs on it
+    above = tree.carriers(number)
+    for old in sorted(set(same).difference(above), reverse=True):
+        if tree.parts[old].parent == parent:
+            tree.parts[number].ways += tree.parts[old].ways
+            again = tree.parts[old].positions_of(estimate.screw)
+            tree.parts[number].positions = [*again[:before], *positions[before:]]
+        tree.remove(old, number)
+        number -= 1
+
+
+def _carries(
+    tree: PartTree, part: int, before: int, after: int, mask: Int[np.ndarray, " _"]
+) -> bool:
+    """Whether these points of a look went where a part went, rather than stood still.
+
+    Where no look tells, what was taken for a piece of the part is.
+    """
+    cloud, places = tree.looks[before], np.array([one.positions for one in tree.parts])
+    points, normals = cloud.points[mask], cloud.normals[mask]
+    gain = 0.0
+    for look in telling(places, before):
+        pose = tree.motion(part, before, look)
+        if look != after and abs(places[part, look] - places[part, before]) > LEAST_MOTION:
+            gone = evidence(tree.looks[look], pose.at(points), pose.turned(normals))
+            gain += float(np.sum(gone - evidence(tree.looks[look], points, normals)))
+    return gain >= 0.0
+
+
+def hang_on(tree: PartTree, carrier: int, look: int) -> None:
+    """Hang on a part what it carries: what stands on it in a look and has gone along since."""
+    places = tree.parts[carrier].positions
+    for number, part in enumerate(tree.parts):
+        if number in (carrier, *tree.carriers(carrier)) or part.parent == carrier:
+            continue
+        first = part.ways[0][0]
+        gone = [
+            other
+            for other, chosen in part.seen.items()
+            if len(chosen) >= FEWEST and abs(places[other] - places[first]) > CARRIED
+        ]
+        if not gone:
+            continue
+        onto = tree.pose(carrier, first).inverse @ tree.pose(part.parent, first)
+        hung = dataclasses.replace(
+            part,
+            parent=carrier,
+            positions=list(part.positions),
+            estimate=dataclasses.replace(part.estimate, screw=part.screw.moved(onto)),
+            support=(onto.at(part.support[0]), onto.turned(part.support[1])),
+            ways=[
+                (other, (tree.pose(carrier, other).inverse @ tree.pose(part.parent, other)).at(way))
+                for other, way in part.ways
+            ],
+        )
+        before = np.mean([tree.seen_at(part, other) for other in gone])
+        tree.parts[number] = hung
+        for other in gone:
+            tree.find(number, other)
+        gain = float(np.mean([tree.seen_at(hung, other) for other in gone]) - before)
+        if gain > SEEN or (gain > -SEEN and _share_beside(tree, number, carrier, look) > WITHIN):
+            hung.settle(tree.estimate(hung))
+            for other in gone:
+                tree.relabel(other)
+        else:
+            tree.parts[number] = part
+
+
+def _share_beside(tree: PartTree, part: int, carrier: int, look: int) -> float:
+    """The share of a carrier in what is around the points of a part in a look."""
+    labels, cloud = tree.labels[look], tree.looks[look]
+    around = cloud.tree.query_ball_point(cloud.points[labels == part], TOUCHES)
+    near = np.unique(np.concatenate([np.array(one, int) for one in [[], *around]]))
+    beside = labels[near][labels[near] != part]
+    return float(np.mean(beside == carrier)) if len(beside) else 0.0

@@ -1,0 +1,203 @@
+"""Parts that carry each other: their joints, where they are in each look, which points they own.
+
+All looks count for every joint, and every joint for the labels of all points.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from palpate.identification.interactive.labels import evidence, scores, smoothed, telling
+from palpate.identification.interactive.part import Part
+from palpate.identification.interactive.refinement import Estimate, Sighting, refine, sighting
+from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
+from palpate.perception.clouds import Cloud
+
+FEWEST = 40  # points of a part in a look
+NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
+HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
+
+
+@dataclasses.dataclass(frozen=True)
+class Guest:
+    """A part that is not among the others yet: how it has moved from one look to another."""
+
+    motion: Pose
+    first: int
+    second: int
+
+    def between(self, look: int) -> tuple[int, Pose]:
+        """The other of the two looks, and how the part has moved from this one to it."""
+        if look == self.first:
+            return self.second, self.motion
+        return self.first, self.motion.inverse
+
+
+class PartTree:
+    """What a twin believes; `labels` of points are numbers of parts, -1 of what stands still."""
+
+    def __init__(self) -> None:
+        self.looks: list[Cloud] = []
+        self.parts: list[Part] = []
+        self.labels: list[Int[np.ndarray, " points"]] = []  # of each look
+
+    # --- kinematics ---------------------------------------------------------------------------
+
+    def pose(self, part: int, look: int) -> Pose:
+        """How a part has moved in a look since it was described."""
+        if part < 0:
+            return NOWHERE
+        one = self.parts[part]
+        return self.pose(one.parent, look) @ one.screw.pose(one.positions[look])
+
+    def motion(self, part: int, first: int, second: int) -> Pose:
+        """How a part has moved from one look to another."""
+        return self.pose(part, second) @ self.pose(part, first).inverse
+
+    def screw(self, part: int, look: int) -> Screw:
+        """A part's joint where it was in a look."""
+        return self.parts[part].screw.moved(self.pose(self.parts[part].parent, look))
+
+    def carriers(self, part: int) -> list[int]:
+        """What carries a part, one after the other."""
+        found = []
+        while (part := self.parts[part].parent) >= 0:
+            found.append(part)
+        return found
+
+    def ordered(self) -> list[int]:
+        """Parts from root to leaf."""
+        found: list[int] = []
+        while len(found) < len(self.parts):
+            found += [
+                part
+                for part, one in enumerate(self.parts)
+                if part not in found and (one.parent < 0 or one.parent in found)
+            ]
+        return found
+
+    # --- looks --------------------------------------------------------------------------------
+
+    def add_look(self, cloud: Cloud) -> int:
+        """Its number; parts are where they were last, unless they are clearly elsewhere."""
+        if self.looks and cloud is self.looks[-1]:
+            return len(self.looks) - 1
+        self.looks.append(cloud)
+        for part in self.parts:
+            part.positions.append(part.positions[-1])
+        self.labels.append(np.full(len(cloud.points), -1))
+        for part in self.ordered():
+            self.find(part, len(self.looks) - 1)
+        return len(self.looks) - 1
+
+    def find(self, part: int, look: int, around: float | None = None) -> None:
+        """Where a part is in a look: where it was, unless another position is clearly better.
+
+        `around` is where a hand has taken it: there it is, unless it clearly has not moved. What
+        closes flush with another surface is as well seen where it was, when it has gone.
+        """
+        one = self.parts[part]
+        points, normals = one.support
+        carrier = self.pose(one.parent, look)
+        cloud = self.looks[look]
+
+        def value(position: float) -> float:
+            pose = carrier @ one.screw.pose(position)
+            return float(np.sum(evidence(cloud, pose.at(points), pose.turned(normals))))
+
+        last = one.positions[look]
+        turn, step = (0.5, 0.04) if one.screw.joint == "revolute" else (0.2, 0.02)
+        low, high = min(*one.range, last) - turn, max(*one.range, last) + turn
+        if around is not None:
+            low, high = around - turn, around + turn
+        best = max(np.arange(low, high, step), key=value)
+        for _ in range(2):
+            best = max(np.linspace(best - step, best + step, 7), key=value)
+            step /= 3.0
+        ahead = -HAND_TELLS if around is not None else NOT_MOVED
+        if value(best) > value(last) + ahead * len(points):
+            one.positions[look] = float(best)
+
+    def seen_at(self, part: Part, look: int) -> float:
+        """The evidence, for each point, that a look gives of a part being where it is."""
+        pose = self.pose(part.parent, look) @ part.screw.pose(part.positions[look])
+        points, normals = part.support
+        return float(np.mean(evidence(self.looks[look], pose.at(points), pose.turned(normals))))
+
+    # --- labels -------------------------------------------------------------------------------
+
+    def scores(self, look: int, guest: Guest | None = None) -> Float[np.ndarray, "labels points"]:
+        """Logarithms of how likely each label is of each point of a look, first standing still.
+
+        With a guest, whose label is the last, by the other of its two looks alone.
+        """
+        places = np.array([one.positions for one in self.parts]).reshape(-1, len(self.looks))
+        others = telling(places, look) if guest is None else [guest.between(look)[0]]
+        motions = [[NOWHERE] * len(others)]
+        motions += [
+            [self.motion(part, look, other) for other in others] for part in range(len(self.parts))
+        ]
+        if guest is not None:
+            motions.append([guest.between(look)[1]])
+        return scores(self.looks[look], [self.looks[other] for other in others], motions)
+
+    def probabilities(
+        self, look: int, guest: Guest | None = None
+    ) -> Float[np.ndarray, "labels points"]:
+        """The same, as probabilities, with neighbours on one surface likely of one part."""
+        if len(self.looks) < 2:
+            return np.ones((1, len(self.looks[look].points)))
+        return smoothed(self.looks[look], self.scores(look, guest))
+
+    def relabel(self, look: int) -> None:
+        """Say anew which part each point of a look is of."""
+        self.labels[look] = self.probabilities(look).argmax(axis=0) - 1
+        for number, part in enumerate(self.parts):
+            part.seen[look] = np.flatnonzero(self.labels[look] == number)
+
+    # --- joints -------------------------------------------------------------------------------
+
+    def refit(self, last: int) -> None:
+        """Every joint anew from all looks, from root to leaf.
+
+        Of the part that was handled last (-1: none), the line and the circle of its longest way
+        stand against the joint that it had.
+        """
+        for number in self.ordered():
+            part = self.parts[number]
+            found = [self.estimate(part)]
+            if number == last and len(part.ways) > 1:
+                ways = [way for _, way in part.ways]
+                longest = max(ways, key=lambda way: float(np.linalg.norm(way[-1] - way[0])))
+                found += [
+                    self.estimate(part, screw)
+                    for screw in screws_of_way(longest)
+                    if screw.joint != part.screw.joint
+                ]
+            part.settle(min(found, key=lambda one: one.criterion))
+
+    def estimate(self, part: Part, screw: Screw | None = None) -> Estimate:
+        """A part's joint from all looks and ways, beginning with what it is, or with another."""
+        seen: list[Sighting | None] = [None] * len(self.looks)
+        for look, chosen in part.seen.items():
+            if len(chosen) >= FEWEST:
+                back = self.pose(part.parent, look).inverse
+                seen[look] = sighting(self.looks[look], chosen, back)
+        positions = part.positions if screw is None else part.positions_of(screw)
+        return refine(screw or part.screw, np.array(positions), seen, part.ways)
+
+    def remove(self, part: int, heir: int) -> None:
+        """Take a part out; what it carries and what was found of it goes to its heir, -1: none."""
+        moved = self.renumbering(part, heir)
+        del self.parts[part]
+        for one in self.parts:
+            one.parent = int(moved[one.parent + 1])
+        self.labels = [moved[labels + 1] for labels in self.labels]
+
+    def renumbering(self, part: int, heir: int) -> Int[np.ndarray, " labels"]:
+        """By label, from -1 on: the new one, once a part is taken out."""
+        moved = np.arange(-1, len(self.parts))
+        moved[part + 1] = heir
+        moved[moved > part] -= 1
+        return moved

@@ -1,0 +1,181 @@
+"""A door with a flap in it: pulls that move both, one after the other, and sheets that slide."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.refinement import Sighting, refine, surprise
+from palpate.identification.interactive.screws import Screw
+from palpate.identification.interactive.twin import Twin
+from palpate.numerics.pinhole import Pinhole
+from palpate.perception.clouds import Cloud, cloud_of
+from palpate.trials.appliance.score import difference
+from palpate.worlds.depth import DepthSensor, depth_image
+
+SCENE = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".02 .9 1.1" pos=".15 0 1.1"/>
+    <geom type="box" size=".05 .05 1.1" pos="0 .5 1.1"/>
+    <geom type="box" size=".05 .05 1.1" pos="0 -.5 1.1"/>
+    <body name="door" pos="0 .44 1.1">
+      <joint axis="0 0 1"/>
+      <geom type="box" size=".02 .08 1" pos="0 -.08 0"/>
+      <geom type="box" size=".02 .08 1" pos="0 -.78 0"/>
+      <geom type="box" size=".02 .27 .3" pos="0 -.43 -.7"/>
+      <geom type="box" size=".02 .27 .4" pos="0 -.43 .6"/>
+      <body name="flap" pos="0 -.43 .19">
+        <joint axis="0 1 0"/>
+        <geom type="box" size=".02 .26 .28" pos="0 0 -.29"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+ON_DOOR, ON_FLAP = np.array([-0.02, -0.4, 0.5]), np.array([-0.02, 0.0, 0.72])
+DOOR, FLAP = 1, 2
+
+
+class Room:
+    """The door and its flap, seen by two cameras, with a hand that is on one of them."""
+
+    def __init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_string(SCENE)
+        self.data = mujoco.MjData(self.model)
+        self.cameras = [
+            Pinhole.looking_at((0.0, 0.0, 1.0), place, 320, 240, math.radians(58.0))
+            for place in ((-2.4, 0.9, 1.8), (-2.4, -0.9, 1.5))
+        ]
+        self.random = np.random.default_rng(0)
+
+    def at(self, door: float, flap: float) -> None:
+        """Put both where they are to be, rad."""
+        self.data.qpos[:] = door, flap
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def look(self) -> Cloud:
+        """What the cameras see."""
+        taken = [
+            depth_image(self.model, self.data, camera, DepthSensor(), self.random)[0]
+            for camera in self.cameras
+        ]
+        return cloud_of(taken)
+
+    def pull(self, twin: Twin, body: int, start: tuple[float, float], end: tuple[float, float]):
+        """A hand on a body takes both joints from start to end."""
+        self.at(*start)
+        before = twin.looks[-1] if twin.looks else self.look()
+        point = self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ self.place(body)
+        way = []
+        for share in np.linspace(0.0, 1.0, 60):
+            self.at(*(np.array(start) + share * np.subtract(end, start)))
+            turn = self.data.xmat[body].reshape(3, 3)
+            way.append(self.data.xpos[body] + turn @ self.place(body))
+        points = np.array(way) + 5e-4 * self.random.standard_normal((60, 3))
+        direction = points[-1] - points[0]
+        push = Push(point, direction / np.linalg.norm(direction))
+        after = self.look()
+        twin.observe(Handling(push, before, after, np.linspace(0, 2, 60), points, 0.0 * points))
+        twin.look(self.look())
+
+    def place(self, body: int) -> np.ndarray:
+        """Where a hand holds a body, on it."""
+        return np.array([-0.02, -0.78, 0.0]) if body == DOOR else np.array([-0.02, 0.0, -0.5])
+
+    def error(self, twin: Twin, part: int, joint: int) -> tuple[float, float]:
+        """Degrees, and cm, from a part's joint to the true one."""
+        found = twin.screw(part, len(twin.looks) - 1)
+        return difference(found, self.data.xaxis[joint], self.data.xanchor[joint])
+
+
+@pytest.fixture
+def room() -> Room:
+    return Room()
+
+
+def test_a_pull_that_moves_two_unknown_joints_tells_nothing_yet(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, FLAP, (0.0, 0.0), (-0.5, 0.6))
+    assert not twin.parts
+    assert twin.held == [(-1, 0)]
+
+
+def test_a_flap_is_found_on_a_door_that_moves_with_it(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    room.pull(twin, FLAP, (-0.6, 0.0), (-0.2, 0.7))
+    assert [part.parent for part in twin.parts] == [-1, 0]
+    assert [part for part, _ in twin.held] == [0, 1]
+    for part in (0, 1):
+        degrees, centimetres = room.error(twin, part, part)
+        assert degrees < 4.0
+        assert centimetres < 3.0
+    positions = np.array([one.positions for one in twin.parts])
+    assert np.abs(positions[:, -1] - positions[:, 1]) == pytest.approx([0.4, 0.7], abs=0.1)
+
+
+def test_a_flap_that_is_known_is_hung_on_the_door_that_takes_it_along(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.3)
+    twin.look(room.look())
+    room.pull(twin, FLAP, (0.0, 0.3), (0.0, 0.9))
+    assert [part.parent for part in twin.parts] == [-1]
+    room.pull(twin, DOOR, (0.0, 0.9), (-0.7, 0.9))
+    door = next(number for number, one in enumerate(twin.parts) if one.parent < 0)
+    assert len(twin.parts) == 2
+    assert twin.parts[1 - door].parent == door
+    assert room.error(twin, 1 - door, 1)[0] < 4.0
+    assert room.error(twin, door, 0)[0] < 4.0
+
+
+def test_a_joint_that_a_short_way_left_open_is_mended_and_not_found_again(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.09, 0.0))
+    room.pull(twin, DOOR, (-0.09, 0.0), (-0.9, 0.0))
+    assert [part.screw.joint for part in twin.parts] == ["revolute"]
+    assert len(twin.parts[0].ways) == 2
+    assert room.error(twin, 0, 0)[0] < 2.0
+
+
+def sheet(corner: float) -> Sighting:
+    """What is seen of a sheet in the plane z = 0, which is the same wherever it has slid to."""
+    x, y = np.meshgrid(np.arange(0.2, 0.8, 0.02), np.arange(0.0, 0.5, 0.02))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, corner)], axis=1)
+    normals = np.tile([0.0, 0.0, 1.0], (x.size, 1))
+    return Sighting(points, normals, np.full(x.size, 1e-3), cKDTree(points))
+
+
+def test_the_hand_says_how_far_a_sheet_has_slid_in_its_plane() -> None:
+    way = np.linspace((0.5, 0.2, 0.01), (0.6, 0.2, 0.01), 40)
+    way = np.concatenate([way[:1], way[:1], way, way[-1:], way[-1:]])  # at rest at both ends
+    screw = Screw("prismatic", np.array([1.0, 0.0, 0.0]), way[0])
+    for guess in (0.1, 0.16):
+        found = refine(screw, np.array([0.0, guess]), [sheet(0.0), sheet(0.0)], [(0, way)])
+        assert found.positions[1] == pytest.approx(0.1, abs=2e-3)
+    alone = refine(screw, np.array([0.0, 0.16]), [sheet(0.0), sheet(0.0)], [])
+    assert alone.positions[1] == pytest.approx(0.16, abs=2e-3)  # no cloud says it
+
+
+def test_a_way_surprises_the_joint_that_it_is_not_of() -> None:
+    random = np.random.default_rng(0)
+    screw = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    angles = np.linspace(0.0, 0.8, 60)
+
+    def way(screw: Screw) -> np.ndarray:
+        points = np.array([screw.pose(one).at(np.array([[0.5, 0.0, 0.2]]))[0] for one in angles])
+        return points + 1e-3 * random.standard_normal(points.shape)
+
+    known = refine(screw, np.zeros(2), [None, None], [(0, way(screw)) for _ in range(8)])
+    assert surprise(known, way(screw)) < 1.0
+    assert surprise(known, way(screw.varied(np.array([0.3, 0.0, 0.0, 0.0])))) > 3.0
+    assert surprise(known, way(screw.varied(np.array([0.0, 0.0, 0.0, 0.2])))) > 1.2

@@ -178,10 +178,12 @@ def test_killed_training_resumes_to_the_same_weights(tmp_path) -> None:
     whole, lines = logged(tmp_path / "whole", CartToOrigin(), INTERRUPTED)
     here = Path(__file__).parent
     paths = [str(here), str(here.parent), *sys.path]
+    # as many devices as here: they say by how many threads sums are split, where cores are few
+    alike = {"JAX_NUM_CPU_DEVICES": str(jax.device_count())}
     child = subprocess.run(
         [sys.executable, "-c", CHILD, str(tmp_path / "cut")],
         check=False,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        env={**os.environ, **alike, "PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
         text=True,
         timeout=120,

@@ -204,6 +204,12 @@ class Identify(Options, ABC):
         """Options of `palpate.recordings.files.read_recording`."""
         return {"rate": self.rate}
 
+    def read(self, path: Path) -> Recording:
+        """What is at a path; a family may know kinds of its own."""
+        from palpate.recordings.files import read_recording
+
+        return read_recording(path, **self.reading())
+
     @property
     def fits(self) -> bool:
         """Whether the method gives one model with intervals, and not draws."""

@@ -39,8 +39,8 @@ class Cloud:
     deviation: Float[np.ndarray, " points"]
     source: Int[np.ndarray, "points 3"]
     images: Sequence[DepthImage]
-    nearest: Sequence[Float[np.ndarray, "height width"]]  # depth in each pixel's neighbourhood
-    furthest: Sequence[Float[np.ndarray, "height width"]]
+    nearest: Sequence[Float[np.ndarray, "_ _"]]  # depth in each pixel's neighbourhood
+    furthest: Sequence[Float[np.ndarray, "_ _"]]
     tree: cKDTree
 
     def surfaces(

@@ -8,7 +8,6 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.families.options import Identify
 from palpate.recordings import Aligned, Recording, join
-from palpate.recordings.files import read_recording
 from palpate.recordings.noise import measurement_noise
 
 SHORTEST = 0.5  # s of recordings that a posterior needs, in all
@@ -75,7 +74,7 @@ def _unit(recording: Recording, observed: tuple[str, ...]) -> str:
 
 
 def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
-    return join([read_recording(path, **options.reading()) for path in paths])
+    return join([options.read(path) for path in paths])
 
 
 def _prepared(recording: Recording, options: Identify, where: str) -> Recording:

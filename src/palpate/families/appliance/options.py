@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from tyro.conf import arg
 
 from palpate.errors import PalpateError
 from palpate.families.options import Identify, Record
@@ -79,11 +81,20 @@ class IdentifyAppliance(Identify):
 
     1. A recording of palpate:                  palpate identify appliance R.npz
     2. Draws of a posterior:                    palpate identify appliance R.npz --method nuts
+    3. Clouds of your own, a folder that has    palpate identify appliance actions
+       of each action before.ply, after.ply         --viewpoint -1.2 0.4 1.1
+       and hand.csv (time x y z fx fy fz):
     """
 
     family: ClassVar[str] = "appliance"
     observation: ClassVar[str] = "joint position"
     held_out: ClassVar[float] = 0.0  # parts that only one action moved would be lost
+
+    viewpoint: Annotated[
+        tuple[float, ...],
+        arg(metavar="X Y Z ...", help_behavior_hint="(default: as PCD files say)"),
+    ] = ()
+    """Where each camera of a folder of clouds stood, m, in the axes of the points."""
 
     def check(self) -> None:
         if self.validate:
@@ -91,6 +102,19 @@ class IdentifyAppliance(Identify):
                 "--validate is not for appliances: each recording makes a twin of its own, whose "
                 "joints are not those of another; name all recordings of one appliance together"
             )
+
+    def read(self, path: Path) -> Recording:
+        """A recording, or the actions of a folder with clouds of points."""
+        from palpate.families.appliance.cloud_folder import is_cloud_folder, read_clouds
+
+        if is_cloud_folder(path):
+            return read_clouds(path, self.viewpoint)
+        if self.viewpoint:
+            raise PalpateError(
+                f"--viewpoint is for a folder of clouds, and {path} is none: expected a folder of "
+                "each action in it, with before.ply, after.ply and hand.csv"
+            )
+        return super().read(path)
 
     def prepare(self, recording: Recording) -> Recording:
         """Joint positions and forces on links, of the twin that the actions make."""

@@ -53,29 +53,33 @@ def recording_of(
         looks = [one.before, one.after, *([last] if one is kept[-1] else [])]
         end = float(one.times[-1])
         times = [float(one.times[0]), end, end + 1.0][: len(looks)]
-        channels = [
+        channels = (
             Channel(HAND, Role.OBSERVATION, one.times, one.points, "m"),
             Channel(FORCE, Role.OBSERVATION, one.times, one.forces, "N"),
-        ]
-        events, facts = [], {}
-        for camera, image in enumerate(one.before.images):
-            name = f"depth {camera + 1}"
-            depths = [look.images[camera].depth.astype(np.float32) for look in looks]
-            events.append(Events(name, np.array(times), depths, "m"))
-            of = image.pinhole
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = of.world_from_camera, of.position
-            facts[f"camera {camera + 1}"] = Intrinsics(of.width, of.height, of.focal, of.centre)
-            facts[f"camera {camera + 1} pose"] = Quantity(pose, "")
-        trials.append(
-            Trial(
-                f"action {number}",
-                {each.name: each for each in channels},
-                {each.name: each for each in events},
-                facts,
-            )
         )
+        images = zip(*(look.images for look in looks), strict=True)
+        trials.append(trial_of(f"action {number}", channels, times, list(images)))
     return Recording(tuple(trials), about)
+
+
+def trial_of(
+    name: str,
+    channels: Sequence[Channel],
+    times: Sequence[float],
+    cameras: Sequence[Sequence[DepthImage]],
+) -> Trial:
+    """An action: what the hand felt, and what each camera saw at these times, s."""
+    events, facts = [], {}
+    for number, images in enumerate(cameras, 1):
+        depths = [image.depth.astype(np.float32) for image in images]
+        events.append(Events(f"depth {number}", np.array(times), depths, "m"))
+        of, pose = images[0].pinhole, np.eye(4)
+        pose[:3, :3], pose[:3, 3] = of.world_from_camera, of.position
+        facts[f"camera {number}"] = Intrinsics(of.width, of.height, of.focal, of.centre)
+        facts[f"camera {number} pose"] = Quantity(pose, "")
+    return Trial(
+        name, {each.name: each for each in channels}, {each.name: each for each in events}, facts
+    )
 
 
 def twin_of(recording: Recording) -> ApplianceTwin:

@@ -13,6 +13,7 @@ from palpate.identification.interactive.twin import Twin
 from palpate.runs import Figure
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
+SHOWN = 0.5  # of the points of a part that the look shows which shows most of them
 MATCH = 0.25  # IoU of a part that was found with the one that it is
 
 Labels = Int[np.ndarray, " points"]
@@ -56,8 +57,9 @@ def real_labels(twin: Twin, world: ApplianceWorld) -> Labels:
 def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | None = None) -> Score:
     """Compare; the world is as it was in the twin's last look.
 
-    Points of a part are compared in that look or in that of the `earlier` looks, with their
-    `real_labels`, which shows most of them: a door that is seen edge-on says little of a mask.
+    Points of a part are compared in that look, or where it shows few of them in the last of the
+    `earlier` looks, with their `real_labels`, that shows at least `SHOWN` of what the best one
+    shows: a door that is seen edge-on says little of a mask.
     """
     truth, look = world.truth(), len(twin.looks) - 1
     parts = truth.parts
@@ -65,7 +67,8 @@ def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | Non
     overlap = np.zeros((len(parts), len(twin.parts)))
     labels: dict[int, Labels] = {look: twin.labels[look]}
     for one in range(len(parts)):
-        shown = max(real, key=lambda at: int((real[at] == one).sum()))
+        counts = {at: int((own == one).sum()) for at, own in real.items()}
+        shown = max(at for at, count in counts.items() if count >= SHOWN * max(counts.values()))
         if shown not in labels:
             labels[shown] = twin.probabilities(shown).argmax(axis=0) - 1
         for other in range(len(twin.parts)):

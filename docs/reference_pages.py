@@ -24,7 +24,7 @@ STAGES = {
         *("recordings.alignment", "recordings.files", "recordings.npz", "recordings.csv"),
         *("recordings.columns", "recordings.markers", "recordings.lerobot", "recordings.rerun"),
         *("recordings.rosbag.bag", "families.rope.recording", "families.furniture.recording"),
-        "families.appliance.recording",
+        *("families.appliance.recording", "families.appliance.cloud_folder"),
     ],
     "models": [
         *("models.model", "models.contract", "models.files", "models.python_files", "parameters"),
@@ -114,7 +114,7 @@ STAGES = {
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),
         *("perception.rope.marker_observer", "perception.clouds", "perception.surfaces"),
-        "perception.surface_features",
+        *("perception.surface_features", "perception.point_files"),
     ],
     "trials": [
         *("trials.trial", "trials.controller", "trials.audit", "trials.adversaries"),

@@ -24,12 +24,13 @@ WITHIN = 0.6  # share of a part's points that make it a part of another
 LITTLE = 0.05  # m that a hand has taken a part: too little was known of it to know it again
 STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see `surprise`)
 UNEXPLAINED = -1.0  # of evidence: a point that no label explains any better
-LEFT = 0.35  # of the points of a part, as many that are left unexplained beside it
+LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained beside it is much
 AROUND = 0.3  # m from a hand to the points by which a joint on a carrier is sought
 TURNS, ARMS = 12, (0.0, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7)  # directions, and m
 TRIED = 3  # of those joints, the best, which are refined
 SEEN = 0.2  # of evidence, for each point: less is no difference
 CARRIED = 0.15  # rad or m that a part has to go to show what it carries
+STILLER = 0.05  # rad or m
 TOUCHES = 0.03  # m: what is so near a part may carry it
 
 
@@ -127,9 +128,9 @@ def _best(
         if max(map(len, masks)) < FEWEST or surprise(estimate, way) > STRANGE:
             continue
         guest = _guest(estimate, back, before, after)
-        left = [int(_unexplained(tree, look, guest).sum()) for look in (before, after)]
-        if all(
-            one < max(LEFT * len(mask), 2 * FEWEST) for one, mask in zip(left, masks, strict=True)
+        if not any(
+            _much_is_left(tree, look, guest, len(mask))
+            for look, mask in zip((before, after), masks, strict=True)
         ):
             found.append(Discovery(carrier, estimate, masks, way))
     return min(found, key=lambda one: one.estimate.criterion, default=None)
@@ -145,6 +146,12 @@ def _unexplained(tree: PartTree, look: int, guest: Guest) -> np.ndarray:
     found = tree.scores(look, guest)
     found[0] -= STANDS
     return found.max(axis=0) < UNEXPLAINED
+
+
+def _much_is_left(tree: PartTree, look: int, guest: Guest, own: int) -> bool:
+    """Whether more than the guest has moved, going by what nothing explains of a look."""
+    left = int(_unexplained(tree, look, guest).sum())
+    return left > max(LEFT[0] * own, LEFT[1] * len(tree.looks[look].points))
 
 
 def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
@@ -180,6 +187,8 @@ def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
     seen = {before: new.masks[0], after: new.masks[1]}
     ways = [(before, back.at(new.way))]
     tree.parts.append(Part(parent, estimate, positions, seen, ways, support))
+    for look in range(before):  # a pull that told nothing may have moved it
+        tree.find(number, look)
     for child in carried:
         if tree.parts[child].parent == parent:
             tree.parts[child].parent = number
@@ -214,7 +223,12 @@ def _carries(
 
 
 def hang_on(tree: PartTree, carrier: int, look: int) -> None:
-    """Hang on a part what it carries: what stands on it in a look and has gone along since."""
+    """Hang on a part what it carries, which has gone along since a look.
+
+    So it is if the part was seen where the carrier has taken it, and not where it was. Where both
+    explain what was seen, as of doors above each other on one hinge, it has to stand on the carrier
+    and to have moved less by itself.
+    """
     places = tree.parts[carrier].positions
     for number, part in enumerate(tree.parts):
         if number in (carrier, *tree.carriers(carrier)) or part.parent == carrier:
@@ -244,12 +258,19 @@ def hang_on(tree: PartTree, carrier: int, look: int) -> None:
         for other in gone:
             tree.find(number, other)
         gain = float(np.mean([tree.seen_at(hung, other) for other in gone]) - before)
-        if gain > SEEN or (gain > -SEEN and _share_beside(tree, number, carrier, look) > WITHIN):
+        stiller = _travel(hung, look) + STILLER < _travel(part, look)
+        beside = stiller and _share_beside(tree, number, carrier, look) > WITHIN
+        if gain > SEEN or (gain > -SEEN and beside):
             hung.settle(tree.estimate(hung))
             for other in gone:
                 tree.relabel(other)
         else:
             tree.parts[number] = part
+
+
+def _travel(part: Part, look: int) -> float:
+    """How far a part has moved by itself from a look to the next, rad or m."""
+    return abs(part.positions[look + 1] - part.positions[look])
 
 
 def _share_beside(tree: PartTree, part: int, carrier: int, look: int) -> float:

@@ -17,14 +17,12 @@ from palpate.identification.interactive.labels import LEAST_MOTION, STANDS, evid
 from palpate.identification.interactive.part import Part, support_of
 from palpate.identification.interactive.refinement import Estimate, refine, sighting, surprise
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
-from palpate.identification.interactive.tree import FEWEST, Guest, PartTree
+from palpate.identification.interactive.tree import FEWEST, UNEXPLAINED, Guest, PartTree
 
 TELLS = 0.02  # m that a hand has to go to tell of a joint that is not known
 WITHIN = 0.6  # share of a part's points that make it a part of another
 LITTLE = 0.05  # m that a hand has taken a part: too little was known of it to know it again
 STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see `surprise`)
-UNEXPLAINED = -1.0  # of evidence: a point that no label explains any better
-LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained beside it is much
 AROUND = 0.3  # m from a hand to the points by which a joint on a carrier is sought
 TURNS, ARMS = 12, (0.0, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7)  # directions, and m
 TRIED = 3  # of those joints, the best, which are refined
@@ -129,7 +127,7 @@ def _best(
             continue
         guest = _guest(estimate, back, before, after)
         if not any(
-            _much_is_left(tree, look, guest, len(mask))
+            tree.much_is_left(guest, look, len(mask))
             for look, mask in zip((before, after), masks, strict=True)
         ):
             found.append(Discovery(carrier, estimate, masks, way))
@@ -146,12 +144,6 @@ def _unexplained(tree: PartTree, look: int, guest: Guest) -> np.ndarray:
     found = tree.scores(look, guest)
     found[0] -= STANDS
     return found.max(axis=0) < UNEXPLAINED
-
-
-def _much_is_left(tree: PartTree, look: int, guest: Guest, own: int) -> bool:
-    """Whether more than the guest has moved, going by what nothing explains of a look."""
-    left = int(_unexplained(tree, look, guest).sum())
-    return left > max(LEFT[0] * own, LEFT[1] * len(tree.looks[look].points))
 
 
 def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:

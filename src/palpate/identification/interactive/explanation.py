@@ -6,8 +6,8 @@ import numpy as np
 
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.refinement import Estimate, Way, refine, surprise
-from palpate.identification.interactive.screws import screws_of_way
-from palpate.identification.interactive.tree import PartTree
+from palpate.identification.interactive.screws import NOWHERE, screws_of_way
+from palpate.identification.interactive.tree import Guest, PartTree
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
@@ -62,14 +62,23 @@ def _by_way(tree: PartTree, before: int, after: int, handling: Handling) -> int:
 
 
 def _went(tree: PartTree, part: int, before: int, after: int, handling: Handling) -> bool:
-    """Whether a look shows a part where a hand has taken it, which is where it is from now on."""
+    """Whether a look shows a part where a hand has taken it, and nothing else has moved.
+
+    It is there from now on, or where it was found without the hand.
+    """
     screw, one = tree.screw(part, before), tree.parts[part]
-    start = handling.points[:3].mean(axis=0)
+    start, alone = handling.points[:3].mean(axis=0), one.positions[after]
     gone = float(screw.position_of(start, handling.points)[-3:].mean())
     tree.find(part, after, around=one.positions[before] + gone)
     missed = abs(one.positions[after] - one.positions[before] - gone)
     arm = float(np.linalg.norm(screw.velocity(start)))
-    return missed * arm < EXPLAINED[0] + 2.0 * EXPLAINED[1] * handling.travel
+    own, guest = int(np.sum(tree.labels[before] == part)), Guest(NOWHERE, before, after)
+    if missed * arm < EXPLAINED[0] + 2.0 * EXPLAINED[1] * handling.travel and not any(
+        tree.much_is_left(guest, look, own) for look in (before, after)
+    ):
+        return True
+    one.positions[after] = alone
+    return False
 
 
 def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) -> int:

@@ -8,13 +8,15 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from palpate.identification.interactive.labels import evidence, scores, smoothed, telling
+from palpate.identification.interactive.labels import STANDS, evidence, scores, smoothed, telling
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Estimate, Sighting, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.perception.clouds import Cloud
 
 FEWEST = 40  # points of a part in a look
+UNEXPLAINED = -1.0  # of evidence: a point that no label explains any better
+LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
 HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
 
@@ -149,6 +151,13 @@ class PartTree:
         if len(self.looks) < 2:
             return np.ones((1, len(self.looks[look].points)))
         return smoothed(self.looks[look], self.scores(look, guest))
+
+    def much_is_left(self, guest: Guest, look: int, own: int) -> bool:
+        """Whether of a look more has moved than the parts and a guest of so many points explain."""
+        found = self.scores(look, guest)
+        found[0] -= STANDS
+        left = int(np.sum(found.max(axis=0) < UNEXPLAINED))
+        return left > max(LEFT[0] * own, LEFT[1] * len(self.looks[look].points))
 
     def relabel(self, look: int) -> None:
         """Say anew which part each point of a look is of."""

@@ -72,6 +72,23 @@ def test_what_is_missing_is_said(both, tmp_path: Path) -> None:
         read_clouds(tmp_path / "copy", place)
 
 
+def test_actions_come_in_the_order_of_their_numbers(both, tmp_path: Path) -> None:
+    _, folder, place = both
+    for number in (10, 9, 1):
+        shutil.copytree(folder / "1", tmp_path / f"{number}")
+    (tmp_path / ".hidden").mkdir()
+    assert [one.name for one in read_clouds(tmp_path, place).trials] == ["1", "9", "10"]
+
+
+def test_clouds_without_a_hand_are_told_what_is_missing(both, tmp_path: Path) -> None:
+    _, folder, place = both
+    shutil.copytree(folder, tmp_path / "copy")
+    for path in (tmp_path / "copy").glob("*/hand.csv"):
+        path.unlink()
+    with pytest.raises(PalpateError, match=r"cannot read .*hand\.csv"):
+        IdentifyAppliance(recordings=(tmp_path / "copy",), viewpoint=place).read(tmp_path / "copy")
+
+
 def test_a_viewpoint_without_clouds_is_refused(tmp_path: Path) -> None:
     options = IdentifyAppliance(recordings=(tmp_path / "R.npz",), viewpoint=(1.0, 2.0, 3.0))
     with pytest.raises(PalpateError, match="--viewpoint is for a folder of clouds"):

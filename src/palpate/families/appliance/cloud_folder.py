@@ -1,11 +1,12 @@
 """Actions on an appliance of yours as a folder: clouds of points, and what a hand felt.
 
-A folder inside it is an action, in the order of their names. It has a cloud `before`, one `after`,
-seen while the hand still held on at the end, and maybe one `released`, PLY or PCD, in m and z
-upwards; with several cameras `before-1`, `before-2` and so on. `hand.csv` has the columns
+A folder inside it is an action, in the order of their names, 2 before 10. It has a cloud `before`,
+one `after`, seen while the hand still held on at the end, and maybe one `released`, PLY or PCD, in
+m and z upwards; with several cameras `before-1`, `before-2` and so on. `hand.csv` has the columns
 `COLUMNS`: s, m and N, in the same axes, while the hand held on.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from palpate.recordings import Channel, Recording, Role, Trial
 from palpate.recordings.columns import read_columns
 
 COLUMNS = "time", "x", "y", "z", "fx", "fy", "fz"
+HAND_FILE = "hand.csv"
 LOOKS = "before", "after", "released"
 
 
@@ -30,7 +32,7 @@ def read_clouds(folder: Path, viewpoints: Sequence[float]) -> Recording:
     if len(viewpoints) % 3:
         raise PalpateError(f"a viewpoint is x, y and z: got {len(viewpoints)} numbers")
     given = np.reshape(viewpoints, (-1, 3))
-    actions = [one for one in sorted(folder.iterdir()) if one.is_dir()]
+    actions = [one for one in _in_order(folder) if one.is_dir()]
     if not actions:
         raise PalpateError(
             f"{folder} has no actions: expected a folder of each, with before.ply, after.ply and "
@@ -40,14 +42,16 @@ def read_clouds(folder: Path, viewpoints: Sequence[float]) -> Recording:
 
 
 def is_cloud_folder(path: Path) -> bool:
-    """Whether a path is a folder of such actions."""
-    return path.is_dir() and any(path.glob("*/hand.csv"))
+    """Whether a path is a folder of folders with clouds, or with what a hand felt."""
+    return path.is_dir() and any(
+        one.name == HAND_FILE or one.suffix.lower() in KINDS for one in path.glob("*/*")
+    )
 
 
 def _action(folder: Path, viewpoints: np.ndarray) -> Trial:
-    numbers, _ = read_columns(folder / "hand.csv", COLUMNS)
+    numbers, _ = read_columns(folder / HAND_FILE, COLUMNS)
     if len(numbers) < 2:
-        raise PalpateError(f"{folder / 'hand.csv'} has {len(numbers)} rows: expected 2 or more")
+        raise PalpateError(f"{folder / HAND_FILE} has {len(numbers)} rows: expected 2 or more")
     time = numbers[:, 0]
     channels = [
         Channel(HAND, Role.OBSERVATION, time, numbers[:, 1:4], "m"),
@@ -70,8 +74,18 @@ def _action(folder: Path, viewpoints: np.ndarray) -> Trial:
 
 def _clouds(folder: Path, look: str) -> list[Path]:
     """The files of one look, camera by camera."""
-    own = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in KINDS]
+    own = [path for path in _in_order(folder) if path.suffix.lower() in KINDS]
     return [path for path in own if path.stem == look or path.stem.startswith(f"{look}-")]
+
+
+def _in_order(folder: Path) -> list[Path]:
+    """What is in a folder by name, numbers as such; hidden files are left out."""
+
+    def key(path: Path) -> list[tuple[int, str]]:
+        parts = re.split(r"(\d+)", path.name)
+        return [(int(one), "") if one.isdigit() else (-1, one) for one in parts]
+
+    return sorted((one for one in folder.iterdir() if one.name[0] != "."), key=key)
 
 
 def _viewpoint(camera: int, path: Path, said: np.ndarray | None, given: np.ndarray) -> np.ndarray:

@@ -68,7 +68,10 @@ def trial_of(
     times: Sequence[float],
     cameras: Sequence[Sequence[DepthImage]],
 ) -> Trial:
-    """An action: what the hand felt, and what each camera saw at these times, s."""
+    """An action: what the hand felt, and what was seen at `times` (s).
+
+    `cameras` have of each camera an image for each of the times, all of one pinhole.
+    """
     events, facts = [], {}
     for number, images in enumerate(cameras, 1):
         depths = [image.depth.astype(np.float32) for image in images]

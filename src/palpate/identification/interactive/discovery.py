@@ -13,11 +13,11 @@ from jaxtyping import Float, Int
 
 from palpate.identification.interactive.explanation import labels_near
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import LEAST_MOTION, STANDS, evidence, telling
+from palpate.identification.interactive.labels import LEAST_MOTION, evidence, telling
 from palpate.identification.interactive.part import Part, support_of
 from palpate.identification.interactive.refinement import Estimate, refine, sighting, surprise
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
-from palpate.identification.interactive.tree import FEWEST, UNEXPLAINED, Guest, PartTree
+from palpate.identification.interactive.tree import FEWEST, Candidate, PartTree
 
 TELLS = 0.02  # m that a hand has to go to tell of a joint that is not known
 WITHIN = 0.6  # share of a part's points that make it a part of another
@@ -68,7 +68,7 @@ def _on_carrier(
     if abs(places[after] - places[before]) < LEAST_MOTION or math.dist(*ends) < TELLS:
         return None
     cloud = tree.looks[before]
-    lost = _unexplained(tree, before, Guest(NOWHERE, before, after))
+    lost = tree.unexplained(Candidate(NOWHERE, before, after), before)
     lost &= np.linalg.norm(cloud.points - ends[0], axis=1) < AROUND
     if lost.sum() < FEWEST:
         return None
@@ -111,9 +111,9 @@ def _best(
         estimate = Estimate(screw, np.array([0.0, gone]), np.eye(4), 0.0, 0.0)
         masks: list[np.ndarray] = []
         for _ in range(2):
-            guest = _guest(estimate, back, before, after)
+            candidate = _candidate(estimate, back, before, after)
             masks = [
-                np.flatnonzero(tree.probabilities(look, guest).argmax(0) == len(tree.parts) + 1)
+                np.flatnonzero(tree.probabilities(look, candidate).argmax(0) == len(tree.parts) + 1)
                 for look in (before, after)
             ]
             if max(map(len, masks)) < FEWEST:
@@ -125,25 +125,18 @@ def _best(
             estimate = refine(estimate.screw, estimate.positions, seen, [(0, way)])
         if max(map(len, masks)) < FEWEST or surprise(estimate, way) > STRANGE:
             continue
-        guest = _guest(estimate, back, before, after)
+        candidate = _candidate(estimate, back, before, after)
         if not any(
-            tree.much_is_left(guest, look, len(mask))
+            tree.much_is_left(candidate, look, len(mask))
             for look, mask in zip((before, after), masks, strict=True)
         ):
             found.append(Discovery(carrier, estimate, masks, way))
     return min(found, key=lambda one: one.estimate.criterion, default=None)
 
 
-def _guest(estimate: Estimate, back: Pose, before: int, after: int) -> Guest:
+def _candidate(estimate: Estimate, back: Pose, before: int, after: int) -> Candidate:
     gone = float(estimate.positions[1] - estimate.positions[0])
-    return Guest(back.inverse @ estimate.screw.pose(gone), before, after)
-
-
-def _unexplained(tree: PartTree, look: int, guest: Guest) -> np.ndarray:
-    """Which points of a look are, by the guest's other look, of no part and do not stand still."""
-    found = tree.scores(look, guest)
-    found[0] -= STANDS
-    return found.max(axis=0) < UNEXPLAINED
+    return Candidate(back.inverse @ estimate.screw.pose(gone), before, after)
 
 
 def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
@@ -214,7 +207,7 @@ def _carries(
     return gain >= 0.0
 
 
-def hang_on(tree: PartTree, carrier: int, look: int) -> None:
+def reparent(tree: PartTree, carrier: int, look: int) -> None:
     """Hang on a part what it carries, which has gone along since a look.
 
     So it is if the part was seen where the carrier has taken it, and not where it was. Where both

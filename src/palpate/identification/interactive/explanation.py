@@ -7,7 +7,7 @@ import numpy as np
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.refinement import Estimate, Way, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
-from palpate.identification.interactive.tree import Guest, PartTree
+from palpate.identification.interactive.tree import Candidate, PartTree
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
@@ -44,24 +44,22 @@ def _by_way(tree: PartTree, before: int, after: int, handling: Handling) -> int:
 
     A short way fits many joints, and is then only that of the part that the hand was put to.
     """
-    middle = handling.points.mean(axis=0)
     near = labels_near(tree, before, handling.push.point)
     others = [part for part in range(len(tree.parts)) if part not in near]
     for part in [*near, *others] if handling.travel > SHORT else near[:1]:
         if part < 0:
             continue
-        screw, one = tree.screw(part, before), tree.parts[part]
-        joint = dataclasses.replace(one.estimate, screw=screw.near(middle))
-        if surprise(joint, handling.points) > SURPRISE:
+        one = tree.parts[part]
+        way = tree.pose(one.parent, before).inverse.at(handling.points)
+        if surprise(one.estimate, way) > SURPRISE:
             continue
-        if _went(tree, part, before, after, handling):
-            back = tree.pose(one.parent, before).inverse
-            one.ways.append((before, back.at(handling.points)))
+        if _follows_hand(tree, part, before, after, handling):
+            one.ways.append((before, way))
             return part
     return -1
 
 
-def _went(tree: PartTree, part: int, before: int, after: int, handling: Handling) -> bool:
+def _follows_hand(tree: PartTree, part: int, before: int, after: int, handling: Handling) -> bool:
     """Whether a look shows a part where a hand has taken it, and nothing else has moved.
 
     It is there from now on, or where it was found without the hand.
@@ -72,9 +70,9 @@ def _went(tree: PartTree, part: int, before: int, after: int, handling: Handling
     tree.find(part, after, around=one.positions[before] + gone)
     missed = abs(one.positions[after] - one.positions[before] - gone)
     arm = float(np.linalg.norm(screw.velocity(start)))
-    own, guest = int(np.sum(tree.labels[before] == part)), Guest(NOWHERE, before, after)
+    own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
     if missed * arm < EXPLAINED[0] + 2.0 * EXPLAINED[1] * handling.travel and not any(
-        tree.much_is_left(guest, look, own) for look in (before, after)
+        tree.much_is_left(candidate, look, own) for look in (before, after)
     ):
         return True
     one.positions[after] = alone
@@ -96,7 +94,7 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
             continue
         kept = one.estimate, one.positions
         one.settle(dataclasses.replace(joint, positions=np.array(one.positions_of(joint.screw))))
-        if _went(tree, part, before, after, handling):
+        if _follows_hand(tree, part, before, after, handling):
             one.ways = ways
             return part
         one.estimate, one.positions = kept

@@ -6,7 +6,7 @@ All looks count for every joint, and every joint for the labels of all points.
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from palpate.identification.interactive.labels import STANDS, evidence, scores, smoothed, telling
 from palpate.identification.interactive.part import Part
@@ -22,7 +22,7 @@ HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
 
 
 @dataclasses.dataclass(frozen=True)
-class Guest:
+class Candidate:
     """A part that is not among the others yet: how it has moved from one look to another."""
 
     motion: Pose
@@ -129,34 +129,40 @@ class PartTree:
 
     # --- labels -------------------------------------------------------------------------------
 
-    def scores(self, look: int, guest: Guest | None = None) -> Float[np.ndarray, "labels points"]:
+    def scores(
+        self, look: int, candidate: Candidate | None = None
+    ) -> Float[np.ndarray, "labels points"]:
         """Logarithms of how likely each label is of each point of a look, first standing still.
 
-        With a guest, whose label is the last, by the other of its two looks alone.
+        With a candidate, whose label is the last, by the other of its two looks alone.
         """
         places = np.array([one.positions for one in self.parts]).reshape(-1, len(self.looks))
-        others = telling(places, look) if guest is None else [guest.between(look)[0]]
+        others = telling(places, look) if candidate is None else [candidate.between(look)[0]]
         motions = [[NOWHERE] * len(others)]
         motions += [
             [self.motion(part, look, other) for other in others] for part in range(len(self.parts))
         ]
-        if guest is not None:
-            motions.append([guest.between(look)[1]])
+        if candidate is not None:
+            motions.append([candidate.between(look)[1]])
         return scores(self.looks[look], [self.looks[other] for other in others], motions)
 
     def probabilities(
-        self, look: int, guest: Guest | None = None
+        self, look: int, candidate: Candidate | None = None
     ) -> Float[np.ndarray, "labels points"]:
         """The same, as probabilities, with neighbours on one surface likely of one part."""
         if len(self.looks) < 2:
             return np.ones((1, len(self.looks[look].points)))
-        return smoothed(self.looks[look], self.scores(look, guest))
+        return smoothed(self.looks[look], self.scores(look, candidate))
 
-    def much_is_left(self, guest: Guest, look: int, own: int) -> bool:
-        """Whether of a look more has moved than the parts and a guest of so many points explain."""
-        found = self.scores(look, guest)
+    def unexplained(self, candidate: Candidate, look: int) -> Bool[np.ndarray, " points"]:
+        """Which points of a look neither stand still nor are of a part, by the other look."""
+        found = self.scores(look, candidate)
         found[0] -= STANDS
-        left = int(np.sum(found.max(axis=0) < UNEXPLAINED))
+        return found.max(axis=0) < UNEXPLAINED
+
+    def much_is_left(self, candidate: Candidate, look: int, own: int) -> bool:
+        """Whether more of a look has moved than parts and a candidate of `own` points explain."""
+        left = int(self.unexplained(candidate, look).sum())
         return left > max(LEFT[0] * own, LEFT[1] * len(self.looks[look].points))
 
     def relabel(self, look: int) -> None:

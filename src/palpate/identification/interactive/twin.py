@@ -5,7 +5,7 @@ that is known, or by a part that is new, which is split off what stood still or 
 carries it.
 """
 
-from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, hang_on
+from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
 from palpate.identification.interactive.explanation import moved_part
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.tree import FEWEST, PartTree
@@ -38,7 +38,7 @@ class Twin(PartTree):
         self.refit(self.held[-1][0] if handling.moved else -1)
         for number, one in enumerate(self.parts):
             if abs(one.positions[after] - one.positions[before]) > CARRIED:
-                hang_on(self, number, before)
+                reparent(self, number, before)
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""

@@ -2,6 +2,8 @@
 
 import json
 
+from PIL import Image
+
 from palpate.cli import main
 from palpate.models.articulated.assembly import assembled
 from palpate.models.articulated.urdf import read_urdf
@@ -23,6 +25,9 @@ def test_a_microwave_is_handled_and_its_twin_is_taken_by_mujoco(tmp_path, capsys
         assert refusal(out / file) == ""
     assert len(assembled(read_urdf(out / "twin.urdf")).links) >= 1
     assert (out / "twin.png").stat().st_size > 10_000
+    with Image.open(out / "rendering.webp") as film:
+        assert getattr(film, "n_frames", 1) > 1  # of each look in which something had moved
+    assert "The scene in motion" in (out / "report.html").read_text()
     figures = {one["name"] for one in json.loads((out / "result.json").read_text())["figures"]}
     assert {"recall", "axis_deg", "miou"} <= figures
     # finished, it is only read

@@ -11,7 +11,7 @@ from palpate.errors import PalpateError
 from palpate.families.appliance.cloud_folder import is_cloud_folder, read_clouds
 from palpate.families.appliance.options import IdentifyAppliance
 from palpate.families.appliance.recording import recording_of, twin_of
-from palpate.learning.active import most_informative
+from palpate.learning.active import CHOICES
 from palpate.trials.appliance.interaction import interact
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
@@ -21,7 +21,7 @@ def both(tmp_path_factory):
     """A recording of a microwave by two cameras, and the same as clouds of points."""
     world = ApplianceWorld("microwave", 3, views=2)
     world.reset(3)
-    *_, step = interact(world, most_informative, 5, 3)
+    *_, step = interact(world, CHOICES["information"], 5, 3)
     recording = recording_of(step.twin.handled, step.twin.looks[-1], {"world": "appliance"})
     folder = tmp_path_factory.mktemp("actions")
     kept = [one for one in step.twin.handled if one.held]

@@ -14,7 +14,7 @@ from palpate.identification.interactive.labels import evidence, smoothed
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.twin import Twin
-from palpate.learning.active import at_random, most_informative
+from palpate.learning.active import CHOICES
 from palpate.models.articulated.assembly import assembled
 from palpate.models.articulated.urdf import read_urdf, write_urdf
 from palpate.perception.clouds import Cloud, cloud_of
@@ -207,7 +207,7 @@ def test_a_refined_joint_is_nearer_than_its_first_guess(handled):
 
 def test_every_choice_points_at_something_that_was_seen(handled):
     twin = handled[1]
-    for choose in (most_informative, at_random):
+    for choose in CHOICES.values():
         push = choose(twin, np.random.default_rng(0))
         assert np.linalg.norm(push.direction) == pytest.approx(1.0)
         assert twin.looks[-1].tree.query(push.point)[0] < 1e-9
@@ -249,7 +249,7 @@ def test_an_appliance_is_handled_until_its_parts_are_known():
     world = ApplianceWorld("microwave", QUIET)
     world.reset(QUIET)
     twin = Twin()
-    for step in interact(world, most_informative, 6, QUIET):
+    for step in interact(world, CHOICES["information"], 6, QUIET):
         twin = step.twin
         assert step.seconds > 0.0
     found = score(twin, world)

@@ -7,11 +7,11 @@ from palpate.commands import folders
 from palpate.commands.options import Interact
 from palpate.errors import PalpateError
 from palpate.families.appliance.foreign import read_scene
-from palpate.families.appliance.twin_picture import PICTURE, show_twin
+from palpate.families.appliance.twin_picture import FILM, PICTURE, film_twin, show_twin
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.twin import Twin
-from palpate.learning.active import CHOICES, most_informative
+from palpate.learning.active import CHOICES, WORTHS, choose_best
 from palpate.learning.movable_guess import load_guess
 from palpate.models.articulated.mjcf import write_mjcf
 from palpate.models.articulated.urdf import write_urdf
@@ -40,12 +40,14 @@ def run(options: Interact) -> Path:
             world.reset(options.seed)
             choose, twin = CHOICES[options.choose], Twin()
             if options.guess is not None:
-                choose = functools.partial(most_informative, guess=load_guess(options.guess))
+                guess = load_guess(options.guess)
+                choose = functools.partial(choose_best, worth=WORTHS[options.choose], guess=guess)
             real: dict[int, Labels] = {}
             for number, step in enumerate(interact(world, choose, options.pushes, options.seed)):
                 twin = step.twin
                 real[len(twin.looks) - 1] = real_labels(twin, world)
-                print(f"push {number + 1}: {said(twin)}", flush=True)
+                if number:
+                    print(f"push {number}: {said(twin)}", flush=True)
             description = describe(twin, options.name)
             lines = rows(twin)
             try:
@@ -59,6 +61,7 @@ def run(options: Interact) -> Path:
             write_mjcf(run.path / OTHER, description)
             twin.relabel(0)  # of parts that were found later, too
             show_twin(run.path / PICTURE, twin, options.name)
+            film_twin(run.path / FILM, twin, description)
             folders.finish(run, figures_of([score(twin, world, real)]), {folders.SUMMARY: lines})
         print("\n".join(read_json(run.path / RESULT)["settings"][folders.SUMMARY]))
         folders.hand_over(options, run, f"Twin: {options.name}")

@@ -97,8 +97,9 @@ class Interact(Options):
         int | None, arg(metavar="N", help_behavior_hint="(default: drawn, 1 to 4)")
     ] = None
     """Cameras before the appliance."""
-    choose: Literal["information", "random"] = "information"
-    """Where to pull next: where most is expected to be learnt, or anywhere."""
+    choose: Literal["information", "loss", "random"] = "information"
+    """Where to pull next: where most is expected to be learnt, where the twin is expected to miss
+    the next cloud by most (SAGCI's reward), or anywhere."""
     guess: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: palpate's own)")
     ] = None
@@ -107,7 +108,7 @@ class Interact(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.guess is not None and self.choose == "random":
-            raise PalpateError("--guess is for --choose information: random pulls anywhere")
+            raise PalpateError("--guess is not for --choose random, which pulls anywhere")
         if self.pushes < 1:
             raise PalpateError(f"--pushes is 1 or greater, not {self.pushes}")
         if self.body is not None and self.file is None:

@@ -1,9 +1,13 @@
 """Which pull tells the most about an appliance: where, and which way.
 
 A surface that nobody has tried moves with some probability; if it does, a joint is found. A part
-that is known is pulled where it makes its joint more certain. Both are information, in nats.
+that is known is pulled where it makes its joint more certain. Both are worth information, in nats.
+As a rival, both are worth the loss by which the twin would miss the next cloud, and which it loses
+by explaining that cloud: the reward of SAGCI (Eqn. 14).
 """
 
+import dataclasses
+import functools
 import itertools
 from collections.abc import Callable
 
@@ -11,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import way_information
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
@@ -32,16 +37,30 @@ ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an
 ASIDE = 0.7  # how much to the side of the normal a hand also pulls, which tries two joints at once
 
 Choice = Callable[[Twin, np.random.Generator], Push]
+Points = Float[np.ndarray, "n 3"]
 
 
-def most_informative(
-    twin: Twin, random: np.random.Generator, guess: MovableGuess | None = None
+@dataclasses.dataclass(frozen=True)
+class Worth:
+    """What a pull is expected to be worth.
+
+    `of_try` is that of pulls at a surface of a cloud which move it with these probabilities;
+    `of_repeat` that of taking a part by its joint, as it is now, so far (rad or m) with a hand that
+    begins at a point; of the part some points are given, and its share of the cloud.
+    """
+
+    of_try: Callable[[Float[np.ndarray, " n"], Surface, Cloud], Float[np.ndarray, " n"]]
+    of_repeat: Callable[[Part, Screw, float, Float[np.ndarray, "3"], Points, float], float]
+
+
+def choose_best(
+    twin: Twin, random: np.random.Generator, worth: Worth, guess: MovableGuess | None = None
 ) -> Push:
-    """The push of which most is expected; `guess` says which surfaces move, untouched, or the one
-    that comes with palpate."""
+    """The push that is worth most; `guess` says which surfaces move, untouched, or the one that
+    comes with palpate."""
     look = len(twin.looks) - 1
     guess = load_guess() if guess is None else guess
-    options = [*_tries(twin, look, random, guess), *_repeats(twin, look, random)]
+    options = [*_tries(twin, look, random, guess, worth), *_repeats(twin, look, random, worth)]
     if not options:  # nothing flat is large enough
         return at_random(twin, random)
     return max(options, key=lambda one: one[0])[1]
@@ -57,7 +76,7 @@ def at_random(twin: Twin, random: np.random.Generator) -> Push:
 
 
 def _tries(
-    twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess
+    twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess, worth: Worth
 ) -> list[tuple[float, Push]]:
     """Of every surface, the pull that would show best whether it moves."""
     cloud, found = twin.looks[look], []
@@ -84,7 +103,7 @@ def _tries(
         near = np.zeros(len(points))
         for point in missed:
             near += np.linalg.norm(points - point, axis=1) < BESIDE
-        value = (_entropy(goes) + goes * JOINT) * MISSED**near
+        value = worth.of_try(goes, surface, cloud) * MISSED**near
         best = int(np.argmax(value))
         found.append((float(value[best]), Push(points[best], directions[best])))
     return found
@@ -106,7 +125,8 @@ def _grips(
     nearest = np.linalg.norm(own[None] - wanted[:, None], axis=2).argmin(axis=1)
     points = np.concatenate([surface.handles, own[nearest]])
     aside = (0.0, ASIDE, -ASIDE)
-    ways = np.array(list(itertools.product((1.0, -1.0), aside, aside)))
+    sideways = [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
+    ways = np.array([*itertools.product((1.0, -1.0), aside, aside), *sideways])
     directions = ways @ np.stack([surface.normal, *surface.sides])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1))
@@ -121,7 +141,9 @@ def _at(one: Handling, surface: Surface, cloud: Cloud) -> bool:
     return float(np.linalg.norm(cloud.points[surface.members] - below, axis=1).min()) < BESIDE
 
 
-def _repeats(twin: Twin, look: int, random: np.random.Generator) -> list[tuple[float, Push]]:
+def _repeats(
+    twin: Twin, look: int, random: np.random.Generator, worth: Worth
+) -> list[tuple[float, Push]]:
     """Of every part that is known, the pulls either way that would make its joint more certain."""
     cloud, found = twin.looks[look], []
     for number, part in enumerate(twin.parts):
@@ -135,13 +157,11 @@ def _repeats(twin: Twin, look: int, random: np.random.Generator) -> list[tuple[f
             arms = np.linalg.norm(np.cross(options - screw.point, screw.axis), axis=1)
             furthest = np.argsort(arms)[int(0.85 * len(arms))]
             point, reach = options[furthest], REACH / max(float(arms[furthest]), 0.1)
-        along = screw.velocity(point)
-        before = np.linalg.inv(part.estimate.covariance + 1e-10 * np.eye(4))
+        along, share = screw.velocity(point), len(members) / len(cloud.points)
         for sign in (-1.0, 1.0):
-            way = _way(screw, point, sign * min(reach, _room(twin, number, look, sign, reach)))
-            more = way_information(screw, way)
-            gain = 0.5 * (np.linalg.slogdet(before + more)[1] - np.linalg.slogdet(before)[1])
-            found.append((float(gain), Push(point, sign * along / np.linalg.norm(along))))
+            go = sign * min(reach, _room(twin, number, look, sign, reach))
+            value = worth.of_repeat(part, screw, go, point, options, share)
+            found.append((value, Push(point, sign * along / np.linalg.norm(along))))
     return found
 
 
@@ -165,10 +185,42 @@ def _room(twin: Twin, number: int, look: int, sign: float, reach: float) -> floa
     return seen + UNKNOWN * reach
 
 
-def _entropy(chance: np.ndarray) -> np.ndarray:
-    """Of something that happens or not, nats."""
-    inner = np.clip(chance, 1e-9, 1.0 - 1e-9)
-    return -inner * np.log(inner) - (1.0 - inner) * np.log(1.0 - inner)
+def _information_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray:
+    """Nats: of whether it moves, and of a joint if it does."""
+    inner = np.clip(goes, 1e-9, 1.0 - 1e-9)
+    return goes * JOINT - inner * np.log(inner) - (1.0 - inner) * np.log(1.0 - inner)
 
 
-CHOICES: dict[str, Choice] = {"information": most_informative, "random": at_random}
+def _information_of_repeat(
+    part: Part, screw: Screw, go: float, point: np.ndarray, points: np.ndarray, share: float
+) -> float:
+    """Nats by which a joint's four numbers become more certain from one more way of a hand."""
+    before = np.linalg.inv(part.estimate.covariance + 1e-10 * np.eye(4))
+    more = way_information(screw, _way(screw, point, go))
+    return float(0.5 * (np.linalg.slogdet(before + more)[1] - np.linalg.slogdet(before)[1]))
+
+
+def _loss_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray:
+    """Mean square (m^2) by which the cloud is missed by a model in which the surface stands."""
+    return goes * len(surface.members) / len(cloud.points) * REACH**2
+
+
+def _loss_of_repeat(
+    part: Part, screw: Screw, go: float, point: np.ndarray, points: np.ndarray, share: float
+) -> float:
+    """Mean square (m^2) by which the cloud is missed, as uncertain as the part's joint is."""
+    there, step = screw.pose(go).at(points), 1e-5
+    slopes = np.stack(
+        [(screw.varied(one).pose(go).at(points) - there) / step for one in step * np.eye(4)]
+    )
+    squares = np.einsum("ink,ij,jnk->n", slopes, part.estimate.covariance, slopes)
+    return share * float(squares.mean())
+
+
+WORTHS = {
+    "information": Worth(_information_of_try, _information_of_repeat),
+    "loss": Worth(_loss_of_try, _loss_of_repeat),
+}
+CHOICES: dict[str, Choice] = {
+    name: functools.partial(choose_best, worth=worth) for name, worth in WORTHS.items()
+} | {"random": at_random}

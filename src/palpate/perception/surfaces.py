@@ -103,7 +103,7 @@ def _surface(
 ) -> Surface:
     points = cloud.points[members]
     centre, normal = _plane(points, cloud.normals[members])
-    sides, low, high = _rectangle(points - centre, normal)
+    sides, low, high = smallest_rectangle(points - centre, normal)
     handles = _handles(points, normal, centre, cloud.points[loose], cloud.points)
     return Surface(
         members, normal, centre, sides, low, high, len(members) * size, int(labels[members[0]]),
@@ -119,7 +119,9 @@ def _plane(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndar
     return centre, normal * (1.0 if normals.mean(axis=0) @ normal > 0.0 else -1.0)
 
 
-def _rectangle(around: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def smallest_rectangle(
+    around: np.ndarray, normal: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The sides of the smallest rectangle about points of a plane, and its ends along them."""
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)

@@ -47,6 +47,16 @@ def save_picture(path: Path, canvas: Any) -> None:
     write_bytes(path, buffer.getvalue())
 
 
+def image_of(canvas: Any) -> Any:
+    """A figure as Pillow's image."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
+
+    drawn = FigureCanvasAgg(canvas)
+    drawn.draw()
+    return Image.fromarray(np.asarray(drawn.buffer_rgba())[..., :3].copy())
+
+
 def save_animation(
     path: Path, pictures: Sequence[Any], milliseconds: int | list[int], **options: Any
 ) -> None:

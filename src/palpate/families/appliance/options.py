@@ -131,7 +131,7 @@ class IdentifyAppliance(Identify):
 
     def write_products(self, folder: Path, model: Model, recordings: Sequence[Recording]) -> None:
         """The twin as URDF with the masses, damping and friction of the model, and a picture."""
-        from palpate.families.appliance.twin_picture import PICTURE, show_twin
+        from palpate.families.appliance.twin_picture import FILM, PICTURE, film_twin, show_twin
         from palpate.identification.interactive.description import describe
         from palpate.models.articulated.articulated import Articulated
         from palpate.models.articulated.urdf import write_urdf
@@ -142,6 +142,7 @@ class IdentifyAppliance(Identify):
         write_urdf(folder / TWIN, description)
         known.twin.relabel(0)
         show_twin(folder / PICTURE, known.twin, "appliance")
+        film_twin(folder / FILM, known.twin, description)
         print(f"twin: {folder / TWIN}")
 
     def _twin(self, recordings: Sequence[Recording]) -> ApplianceTwin:

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Ellipse, Rectangle
 from matplotlib.transforms import Affine2D
 
 from palpate.networks.guarded import ActorPolicy, GuardedPolicy
-from palpate.report.picture import canvas_of, save_animation, save_picture
+from palpate.report.picture import canvas_of, image_of, save_animation, save_picture
 from palpate.worlds.gymnasium import GymnasiumWorlds
 from palpate.worlds.maze.layout import ARENA, TIP_RADIUS, Layout
 from palpate.worlds.maze.mjcf import OpenLayout
@@ -126,8 +126,6 @@ def path_picture(out: Path, episode: Episode) -> None:
 
 def film(out: Path, episode: Episode) -> None:
     """The same way as it went, a frame for every second decision, about as fast as it was."""
-    from PIL import Image
-
     pictures = []
     with matplotlib.rc_context(_SETTINGS):
         for count in [*range(1, len(episode.position), 2), len(episode.position)]:
@@ -135,7 +133,7 @@ def film(out: Path, episode: Episode) -> None:
             axis = canvas.subplots()
             _draw_place(axis, episode.layout, episode.scene[count - 1])
             _draw_way(axis, episode, count, last=True)
-            pictures.append(_image(canvas, Image))
+            pictures.append(image_of(canvas))
     save_animation(out, pictures, round(2000 * episode.period), quality=70)
 
 
@@ -143,14 +141,6 @@ def principal(episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     """The greater and the lesser of each decision's two stiffnesses, N/m."""
     values = np.linalg.eigvalsh(episode.stiffness)
     return values[:, 1], values[:, 0]
-
-
-def _image(canvas: Any, image: Any) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    drawn = FigureCanvasAgg(canvas)
-    drawn.draw()
-    return image.fromarray(np.asarray(drawn.buffer_rgba())[..., :3].copy())
 
 
 def _area(layout: OpenLayout) -> tuple[float, float, float, float]:

@@ -174,6 +174,9 @@ def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
     tree.parts.append(Part(parent, estimate, positions, seen, ways, support))
     for look in range(before):  # a pull that told nothing may have moved it
         tree.find(number, look)
+    for look in range(after + 1, len(tree.looks)):
+        tree.parts[number].positions[look] = tree.parts[number].positions[look - 1]
+        tree.find(number, look)
     for child in carried:
         if tree.parts[child].parent == parent:
             tree.parts[child].parent = number
@@ -184,7 +187,7 @@ def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
         if tree.parts[old].parent == parent:
             tree.parts[number].ways += tree.parts[old].ways
             again = tree.parts[old].positions_of(estimate.screw)
-            tree.parts[number].positions = [*again[:before], *positions[before:]]
+            tree.parts[number].positions = [*again[:before], *tree.parts[number].positions[before:]]
         tree.remove(old, number)
         number -= 1
 

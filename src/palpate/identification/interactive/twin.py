@@ -31,10 +31,9 @@ class Twin(PartTree):
         self.handled.append(handling)
         part, new = self._held(before, after, handling)
         self.held.append((part, before))
-        for look in (before, after):
-            self.relabel(look)
-        if new and max((self.labels[look] == part).sum() for look in (before, after)) < FEWEST:
-            self.remove(part, self.parts[part].parent)  # it explains nothing (section III-B d)
+        self._keep(new, before, after)
+        if new:
+            self._explain_earlier()
         self.refit(self.held[-1][0] if handling.moved else -1)
         for number, one in enumerate(self.parts):
             if abs(one.positions[after] - one.positions[before]) > CARRIED:
@@ -49,6 +48,27 @@ class Twin(PartTree):
         moved = self.renumbering(part, heir)
         self.held = [(int(moved[held + 1]), look) for held, look in self.held]
         super().remove(part, heir)
+
+    def _keep(self, new: bool, before: int, after: int) -> None:
+        """Say anew what two looks show; a new part that explains nothing vanishes (III-B d)."""
+        for look in (before, after):
+            self.relabel(look)
+        number = len(self.parts) - 1
+        if new and max((self.labels[look] == number).sum() for look in (before, after)) < FEWEST:
+            self.remove(number, self.parts[number].parent)
+
+    def _explain_earlier(self) -> None:
+        """Explain what moved and was of no part, now that one more is known that may carry it."""
+        for number, handling in enumerate(self.handled[:-1]):
+            held, before = self.held[number]
+            if held >= 0 or not handling.moved:
+                continue
+            after = before + 1
+            for look in (before, after):
+                self.relabel(look)
+            part, new = self._held(before, after, handling)
+            self.held[number] = part, before
+            self._keep(new, before, after)
 
     def _held(self, before: int, after: int, handling: Handling) -> tuple[int, bool]:
         """The part that the hand held, -1: none that is known; and whether it is new."""

@@ -15,7 +15,7 @@ from palpate.worlds.appliance.appliance import ApplianceWorld
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """After a push: the twin, and how long it took to re-estimate it (s)."""
+    """The twin after a push, or before the first; and how long it took to estimate it (s)."""
 
     twin: Twin
     seconds: float
@@ -24,10 +24,13 @@ class Step:
 def interact(
     world: ApplianceWorld, choose: Choice, pushes: int, seed: int, longest: float = LONGEST
 ) -> Iterator[Step]:
-    """Look, choose a push and do it for `longest` s at most, explain what happened; and again."""
+    """Look; then choose a push, do it for `longest` s at most and explain what happened, again and
+    again."""
     random = np.random.default_rng([seed, 7])
     twin = Twin()
+    began = time.perf_counter()
     twin.look(cloud_of(world.look()))
+    yield Step(twin, time.perf_counter() - began)
     for _ in range(pushes):
         handling = handle(world, choose(twin, random), twin.looks[-1], longest)
         began = time.perf_counter()

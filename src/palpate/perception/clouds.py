@@ -23,6 +23,8 @@ MOST = 20_000  # points of a cloud, about: more say little more and take longer
 FEWEST = 200  # points of which anything can be said
 FLOOR = 0.04  # m: what is no higher above it is the floor
 NEIGHBOURS = 24  # that give a normal
+AROUND = 5  # pixels, of the square in which nothing is seen where nothing is
+FACING = 0.5  # cosine between a normal and the way to a camera that sees the surface for sure
 NOISE = 1.2e-3, 1.9e-3  # m: at 0.4 m, and its growth with the square of what is further
 
 
@@ -41,6 +43,7 @@ class Cloud:
     images: Sequence[DepthImage]
     nearest: Sequence[Float[np.ndarray, "_ _"]]  # depth in each pixel's neighbourhood
     furthest: Sequence[Float[np.ndarray, "_ _"]]
+    blank: Sequence[Bool[np.ndarray, "_ _"]]  # around which nothing was seen
     tree: cKDTree
 
     def surfaces(
@@ -53,18 +56,37 @@ class Cloud:
         """
         on, free = np.zeros(len(points), bool), np.zeros(len(points), bool)
         for image, near, far in zip(self.images, self.nearest, self.furthest, strict=True):
-            pixels, depth = image.pinhole.project(points)
-            inside = depth > 0.05
-            pixels = np.where(inside[:, None], pixels, -1.0)
-            column, row = np.rint(pixels).astype(int).T
-            inside &= (column >= 0) & (row >= 0)
-            inside &= (column < image.pinhole.width) & (row < image.pinhole.height)
-            column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+            inside, row, column, depth = _pixels(image, points)
             least, most = near[row, column], far[row, column]
             room = tolerance * noise_at(depth)
             on |= inside & (depth > least - room) & (depth < most + room)
             free |= inside & (depth < least - room)
         return on & ~free, free
+
+    def missing(
+        self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Whether a camera that a surface would have faced at a point saw nothing around there."""
+        found = np.zeros(len(points), bool)
+        for image, blank in zip(self.images, self.blank, strict=True):
+            inside, row, column, _ = _pixels(image, points)
+            toward = np.asarray(image.pinhole.position) - points
+            facing = np.sum(normals * toward, axis=1) > FACING * np.linalg.norm(toward, axis=1)
+            found |= inside & facing & blank[row, column]
+        return found
+
+
+def _pixels(
+    image: DepthImage, points: Float[np.ndarray, "n 3"]
+) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"], np.ndarray]:
+    """Whether points are in an image; row and column of each, 0 of others, and depth (m)."""
+    pixels, depth = image.pinhole.project(points)
+    inside = depth > 0.05
+    pixels = np.where(inside[:, None], pixels, -1.0)
+    column, row = np.rint(pixels).astype(int).T
+    inside &= (column >= 0) & (row >= 0)
+    inside &= (column < image.pinhole.width) & (row < image.pinhole.height)
+    return inside, np.where(inside, row, 0), np.where(inside, column, 0), depth
 
 
 def noise_at(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -78,11 +100,12 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
     Raises `PalpateError` where too little was seen.
     """
     seen, depths, source = [], [], []
-    nearest, furthest = [], []
+    nearest, furthest, blank = [], [], []
     for number, image in enumerate(images):
         depth = np.where(image.depth > 0.0, image.depth, np.nan)
         near = minimum_filter(np.where(np.isfinite(depth), depth, np.inf), 3)
         far = maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
+        blank.append(~maximum_filter(np.isfinite(depth), AROUND))
         row, column = np.nonzero(np.isfinite(depth) & (far - near < EDGE * near))
         pixels = np.stack([column, row], axis=1)
         seen.append(image.pinhole.back_project(pixels, depth[row, column]))
@@ -116,8 +139,9 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
     points, normals, sources = points[kept], normals[kept], sources[kept]
     deviation = deviation[kept] / np.sqrt(np.minimum(count[kept], 9))
     return Cloud(
-        points, normals, deviation, sources, list(images), nearest, furthest, cKDTree(points)
-    )
+        points, normals, deviation, sources, list(images), nearest, furthest, blank,
+        cKDTree(points),
+    )  # fmt: skip
 
 
 def extent_of(points: Float[np.ndarray, "n 3"]) -> float:

@@ -1,7 +1,8 @@
 """Which part each point of a look belongs to, from how well each part's motion explains it.
 
 A point that belongs to a part is, in every other look, where the part has gone: on a surface that
-was seen there, or hidden. What a camera would have to look through is no part of it.
+was seen there, or hidden. What a camera would have to look through is no part of it, and hardly
+what would have faced a camera that saw nothing there: depth has holes, but small ones.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from palpate.identification.interactive.screws import Pose
 from palpate.perception.clouds import Cloud
 
 # logarithms of how much likelier each is of a point that moves so than of another
-ON, FREE, HIDDEN = 0.9, -2.9, -0.4
+ON, FREE, HIDDEN, MISSING = 0.9, -2.9, -0.4, -1.5
 TOLERANCE = 3.0  # standard deviations of depth
 AGREES = 0.7  # cosine of the angle between the normals of what is the same surface
 NEIGHBOURS = 10
@@ -38,6 +39,7 @@ def evidence(cloud: Cloud, points: np.ndarray, normals: np.ndarray) -> Float[np.
     alike = np.zeros(len(points), bool)
     alike[met] = np.sum(cloud.normals[index[met]] * normals[met], axis=1) > AGREES
     found = np.full(len(points), HIDDEN)
+    found[cloud.missing(points, normals)] = MISSING
     found[free] = FREE
     found[on & alike] = ON
     found[on & met & ~alike] = HIDDEN  # at an edge, or another surface: says little

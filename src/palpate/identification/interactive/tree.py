@@ -15,7 +15,7 @@ from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, scre
 from palpate.perception.clouds import Cloud
 
 FEWEST = 40  # points of a part in a look
-UNEXPLAINED = -1.0  # of evidence: a point that no label explains any better
+UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
 HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says

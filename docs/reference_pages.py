@@ -47,7 +47,7 @@ STAGES = {
         "identification.posterior.settled",
         *("identification.interactive.twin", "identification.interactive.tree"),
         *("identification.interactive.explanation", "identification.interactive.discovery"),
-        "identification.interactive.shape",
+        *("identification.interactive.shape", "identification.interactive.registration"),
         "identification.interactive.handling",
         *("identification.interactive.screws", "identification.interactive.labels"),
         *("identification.interactive.refinement", "identification.interactive.description"),

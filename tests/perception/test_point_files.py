@@ -106,7 +106,7 @@ def _replace(path: Path, old: bytes, new: bytes) -> None:
 @pytest.mark.parametrize("place", [PLACE, np.array([0.2, 0.0, 3.5])], ids=["before", "above"])
 def test_a_camera_sees_the_points_where_they_are_and_nothing_before_them(place) -> None:
     points = board() if place is PLACE else board()[:, [2, 1, 0]]  # lying, seen from above
-    (image,) = images_of([points], place)
+    (image,) = images_of([points], [place])
     row, column = np.nonzero(np.isfinite(image.depth))
     seen = image.pinhole.back_project(np.stack([column, row], axis=1), image.depth[row, column])
     assert np.quantile(cKDTree(points).query(seen)[0], 0.99) < 0.006  # half a pixel
@@ -121,4 +121,17 @@ def test_a_camera_sees_the_points_where_they_are_and_nothing_before_them(place) 
 
 def test_a_camera_among_the_points_is_refused() -> None:
     with pytest.raises(PalpateError, match="expected where the camera stood"):
-        images_of([board()], np.array([0.2, 0.0, 0.8]))
+        images_of([board()], [np.array([0.2, 0.0, 0.8])])
+
+
+def test_a_camera_that_moves_has_one_size():
+    places = [PLACE, np.array([-1.2, 0.6, 1.1])]
+    images = images_of([board(), board()], places)
+    assert [image.pinhole.position for image in images] == [tuple(one.tolist()) for one in places]
+    one, other = (image.pinhole for image in images)
+    assert (one.width, one.height, one.focal) == (other.width, other.height, other.focal)
+    for image in images:  # the board is where it was
+        row, column = np.nonzero(np.isfinite(image.depth))
+        pixels = np.stack([column, row], axis=1)
+        points = image.pinhole.back_project(pixels, image.depth[row, column])
+        assert cKDTree(board()).query(points)[0].max() < 0.03

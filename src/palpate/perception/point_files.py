@@ -4,6 +4,7 @@ What a cloud alone does not say is where nothing is: a depth image does, as noth
 camera and what it shows.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,15 +54,18 @@ def read_points(path: Path) -> tuple[Points, Viewpoint | None]:
     return points, viewpoint
 
 
-def images_of(clouds: Sequence[Points], viewpoint: Viewpoint) -> list[DepthImage]:
-    """Clouds that were seen from one place, m, as depth images of one camera there.
+def images_of(clouds: Sequence[Points], viewpoints: Sequence[Viewpoint]) -> list[DepthImage]:
+    """Clouds of one camera, m, and where it saw each from, as depth images of a camera there.
 
     A pixel is as wide as the angle between neighbouring points, and shows the nearest point in it.
-    Raises `PalpateError` where the place is among the points.
+    Raises `PalpateError` where such a place is among the points.
     """
-    pinhole = _camera(clouds, viewpoint)
+    if np.ptp(viewpoints, axis=0).max() == 0.0:
+        pinholes = [_camera(clouds, viewpoints[0])] * len(clouds)
+    else:
+        pinholes = _alike([_camera([one], at) for one, at in zip(clouds, viewpoints, strict=True)])
     found = []
-    for number, points in enumerate(clouds):
+    for number, (points, pinhole) in enumerate(zip(clouds, pinholes, strict=True)):
         pixels, depth = pinhole.project(points)
         column, row = np.rint(pixels).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < pinhole.width) & (row < pinhole.height)
@@ -69,6 +73,18 @@ def images_of(clouds: Sequence[Points], viewpoint: Viewpoint) -> list[DepthImage
         np.minimum.at(image, (row[inside], column[inside]), depth[inside])
         found.append(DepthImage(float(number), pinhole, np.where(image < np.inf, image, np.nan)))
     return found
+
+
+def _alike(pinholes: Sequence[Pinhole]) -> list[Pinhole]:
+    """Cameras that are one, which has moved: as coarse as the coarsest, as large as the largest."""
+    focal = min(one.focal[0] for one in pinholes)
+    width = max(math.ceil(one.width * focal / one.focal[0]) for one in pinholes)
+    height = max(math.ceil(one.height * focal / one.focal[0]) for one in pinholes)
+    centre = (width - 1) / 2, (height - 1) / 2
+    return [
+        dataclasses.replace(one, width=width, height=height, focal=(focal, focal), centre=centre)
+        for one in pinholes
+    ]
 
 
 def _camera(clouds: Sequence[Points], viewpoint: Viewpoint) -> Pinhole:

@@ -26,8 +26,8 @@ LOOKS = "before", "after", "released"
 def read_clouds(folder: Path, viewpoints: Sequence[float]) -> Recording:
     """The actions of a folder as a recording; `viewpoints` are x, y and z (m) of each camera.
 
-    A PCD file says itself where it was seen from, if it does. Raises `PalpateError` for a folder
-    without actions, and for an action that lacks something.
+    A PCD file says itself where it was seen from, if it does: that camera may move. Raises
+    `PalpateError` for a folder without actions, and for an action that lacks something.
     """
     if len(viewpoints) % 3:
         raise PalpateError(f"a viewpoint is x, y and z: got {len(viewpoints)} numbers")
@@ -68,7 +68,8 @@ def _action(folder: Path, viewpoints: np.ndarray) -> Trial:
     times, cameras = [time[0], time[-1], time[-1] + 1.0][: len(files)], []
     for camera, seen in enumerate(zip(*files, strict=True)):
         clouds, said = zip(*map(read_points, seen), strict=True)
-        cameras.append(images_of(clouds, _viewpoint(camera, seen[0], said[0], viewpoints)))
+        places = [_viewpoint(camera, *one, viewpoints) for one in zip(seen, said, strict=True)]
+        cameras.append(images_of(clouds, places))
     return trial_of(folder.name, channels, times, cameras)
 
 

@@ -5,7 +5,7 @@ something, in the axes of the world. Its events are depth images (m, NaN where n
 one camera or more, "depth 1" and so on: before the action, at its end while the hand still holds
 on, and, if there is a third, after it has let go. The facts "camera 1" and "camera 1 pose" say what
 each camera is and where it is: the latter is (4, 4), from its frame (x right, y down, z forward) to
-the world's.
+the world's, or (images, 4, 4) of a camera that moves.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.registration import exact_poses
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import DepthImage, Pinhole
 from palpate.perception.clouds import Cloud, cloud_of
@@ -70,16 +71,19 @@ def trial_of(
 ) -> Trial:
     """An action: what the hand felt, and what was seen at `times` (s).
 
-    `cameras` have of each camera an image for each of the times, all of one pinhole.
+    `cameras` have of each camera an image for each of the times, all of one pinhole, wherever that
+    was.
     """
     events, facts = [], {}
     for number, images in enumerate(cameras, 1):
         depths = [image.depth.astype(np.float32) for image in images]
         events.append(Events(f"depth {number}", np.array(times), depths, "m"))
-        of, pose = images[0].pinhole, np.eye(4)
-        pose[:3, :3], pose[:3, 3] = of.world_from_camera, of.position
+        of, poses = images[0].pinhole, np.tile(np.eye(4), (len(images), 1, 1))
+        for pose, image in zip(poses, images, strict=True):
+            pose[:3, :3], pose[:3, 3] = image.pinhole.world_from_camera, image.pinhole.position
+        moves = not np.allclose(poses, poses[0])
         facts[f"camera {number}"] = Intrinsics(of.width, of.height, of.focal, of.centre)
-        facts[f"camera {number} pose"] = Quantity(pose, "")
+        facts[f"camera {number} pose"] = Quantity(poses if moves else poses[0], "")
     return Trial(
         name, {each.name: each for each in channels}, {each.name: each for each in events}, facts
     )
@@ -88,14 +92,20 @@ def trial_of(
 def twin_of(recording: Recording) -> ApplianceTwin:
     """The twin that a recording's actions make, and what was felt of its joints.
 
-    Raises `PalpateError` for a recording that lacks what this module describes, in which no part
-    was found to move, or none by itself.
+    Poses of cameras that have moved are made exact by what both looks show. Raises `PalpateError`
+    for a recording that lacks what this module describes, in which no part was found to move, or
+    none by itself.
     """
-    twin = Twin()
+    twin, first = Twin(), _images(recording.trials[0])[0]
     for trial in recording.trials:
-        before, after, *released = _looks(trial)
-        if not twin.looks:
-            twin.look(before)
+        looks: list[Cloud] = []
+        for images in _images(trial):
+            moved = twin.looks and _moved(images, first)
+            earlier = [*twin.looks[:1], *twin.looks[-1:], *looks]
+            looks.append(cloud_of(exact_poses(images, earlier) if moved else images))
+            if not twin.looks:
+                twin.look(looks[0])
+        before, after, *released = looks
         twin.observe(_handling(trial, before, after))
         if released:
             twin.look(released[0])
@@ -140,7 +150,13 @@ def _three(trial: Trial, name: str, unit: str) -> Channel:
     return dataclasses.replace(channel, values=channel.values.astype(np.float64))
 
 
-def _looks(trial: Trial) -> list[Cloud]:
+def _moved(images: Sequence[DepthImage], first: Sequence[DepthImage]) -> bool:
+    """Whether a camera is not where it was in the first look, or another one sees."""
+    return [image.pinhole for image in images] != [image.pinhole for image in first]
+
+
+def _images(trial: Trial) -> list[list[DepthImage]]:
+    """What its cameras show, look by look."""
     cameras = list(_cameras(trial))
     if not cameras:
         raise PalpateError(
@@ -154,15 +170,18 @@ def _looks(trial: Trial) -> list[Cloud]:
             "images: expected of each one before the action, one at its end, and maybe one after"
         )
     return [
-        cloud_of([
-            DepthImage(float(events.time[look]), pinhole, np.asarray(events.values[look], float))
-            for events, pinhole in cameras
-        ])
+        [
+            DepthImage(
+                float(events.time[look]), pinholes[look], np.asarray(events.values[look], float)
+            )
+            for events, pinholes in cameras
+        ]
         for look in range(counts.pop())
-    ]  # fmt: skip
+    ]
 
 
-def _cameras(trial: Trial) -> Iterator[tuple[Events, Pinhole]]:
+def _cameras(trial: Trial) -> Iterator[tuple[Events, list[Pinhole]]]:
+    """The images of each camera, and its pinhole where it was in each."""
     number = 1
     while (name := f"depth {number}") in trial.events:
         of, pose = trial.facts.get(f"camera {number}"), trial.facts.get(f"camera {number} pose")
@@ -171,13 +190,18 @@ def _cameras(trial: Trial) -> Iterator[tuple[Events, Pinhole]]:
                 f"trial '{trial.name}' has '{name}' without a fact 'camera {number}' (intrinsics) "
                 f"or 'camera {number} pose' (a quantity)"
             )
-        matrix = np.asarray(pose.values, float)
-        if matrix.shape != (4, 4):
+        events, matrices = trial.event(name), np.asarray(pose.values, float)
+        count = len(events.values)
+        if matrices.shape not in ((4, 4), (count, 4, 4)):
             raise PalpateError(
-                f"'camera {number} pose' of trial '{trial.name}' has the shape {matrix.shape}: "
-                "expected (4, 4), from the camera's frame to the world's"
+                f"'camera {number} pose' of trial '{trial.name}' has the shape {matrices.shape}: "
+                f"expected (4, 4), from the camera's frame to the world's, or ({count}, 4, 4) of "
+                "one that moves"
             )
-        rows = tuple(map(tuple, matrix[:3, :3].tolist()))
-        (x, y, z), (fx, fy), (cx, cy) = matrix[:3, 3].tolist(), of.focal, of.centre
-        yield trial.event(name), Pinhole(of.width, of.height, (fx, fy), (cx, cy), (x, y, z), rows)
+        pinholes = []
+        for matrix in np.broadcast_to(matrices, (count, 4, 4)):
+            rows = tuple(map(tuple, matrix[:3, :3].tolist()))
+            (x, y, z), (fx, fy), (cx, cy) = matrix[:3, 3].tolist(), of.focal, of.centre
+            pinholes.append(Pinhole(of.width, of.height, (fx, fy), (cx, cy), (x, y, z), rows))
+        yield events, pinholes
         number += 1

@@ -25,6 +25,7 @@ STAGES = {
         *("recordings.columns", "recordings.markers", "recordings.lerobot", "recordings.rerun"),
         *("recordings.rosbag.bag", "families.rope.recording", "families.furniture.recording"),
         *("families.appliance.recording", "families.appliance.cloud_folder"),
+        "families.appliance.cloud_log",
     ],
     "models": [
         *("models.model", "models.contract", "models.files", "models.python_files", "parameters"),

@@ -5,7 +5,6 @@ import math
 
 import mujoco
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate.identification.interactive.registration import FEWEST, exact_poses, register
@@ -63,14 +62,19 @@ def misses(one: Pinhole, other: Pinhole) -> float:
     return float(np.linalg.norm(other.back_project(pixels, depth) - points, axis=1).max())
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_pose_is_made_exact_though_a_door_has_opened(seed):
-    first = cloud_of([seen(HOME, 0.0, 10 + seed)])
-    wrong = spoilt(seen(AWAY, 1.1, seed), 0.3, 0.01, seed)
-    (found,) = exact_poses([wrong], [first])
-    before, after = misses(AWAY, wrong.pinhole), misses(AWAY, found.pinhole)
-    assert before > 0.008
-    assert after < 0.7 * before
+def test_poses_are_made_exact_though_a_door_has_opened():
+    """To half of what they were off, mostly upwards, where all that is level is seen from aside."""
+    before, after = [], []
+    for seed in range(6):
+        first = cloud_of([seen(HOME, 0.0, 10 + seed)])
+        wrong = spoilt(seen(AWAY, 1.1, seed), 0.3, 0.01, seed)
+        (found,) = exact_poses([wrong], [first])
+        before.append(misses(AWAY, wrong.pinhole))
+        after.append(misses(AWAY, found.pinhole))
+        across = np.subtract(found.pinhole.position, AWAY.position)[:2]
+        assert np.linalg.norm(across) < 0.005
+    assert np.mean(before) > 0.01
+    assert np.mean(after) < 0.65 * np.mean(before)
 
 
 def test_what_shows_nothing_of_it_stays_as_it_is():

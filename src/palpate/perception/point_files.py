@@ -42,16 +42,21 @@ def read_points(path: Path) -> tuple[Points, Viewpoint | None]:
         points, viewpoint = _read_pcd(path) if kind == ".pcd" else (_read_ply(path), None)
     except OSError as error:
         raise PalpateError(f"cannot read {path}: {error.strerror or error}") from error
+    return points_of(points, str(path)), viewpoint
+
+
+def points_of(points: Points, name: str) -> Points:
+    """The finite ones; raises `PalpateError` for too few, or for what is too large for metres."""
     points = points[np.isfinite(points).all(axis=1)]
     if not FEWEST <= len(points) <= MOST:
-        raise PalpateError(f"{path} has {len(points)} points: expected {FEWEST} to {MOST:,}")
+        raise PalpateError(f"{name} has {len(points)} points: expected {FEWEST} to {MOST:,}")
     extent = float(np.ptp(points, axis=0).max())
     if extent > LARGEST:
         raise PalpateError(
-            f"the points of {path} extend over {extent:.3g} m: expected at most {LARGEST:g}; are "
+            f"the points of {name} extend over {extent:.3g} m: expected at most {LARGEST:g}; are "
             "they in m?"
         )
-    return points, viewpoint
+    return points
 
 
 def images_of(clouds: Sequence[Points], viewpoints: Sequence[Viewpoint]) -> list[DepthImage]:

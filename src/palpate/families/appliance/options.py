@@ -84,6 +84,8 @@ class IdentifyAppliance(Identify):
     3. Clouds of your own, a folder that has    palpate identify appliance actions
        of each action before.ply, after.ply         --viewpoint -1.2 0.4 1.1
        and hand.csv (time x y z fx fy fz):
+    4. A log of ROS with clouds, the hand's     palpate identify appliance log.mcap
+       wrench and tf:
     """
 
     family: ClassVar[str] = "appliance"
@@ -104,8 +106,9 @@ class IdentifyAppliance(Identify):
             )
 
     def read(self, path: Path) -> Recording:
-        """A recording, or the actions of a folder with clouds of points."""
+        """A recording, or the actions of a folder with clouds of points, or of a log of ROS."""
         from palpate.families.appliance.cloud_folder import is_cloud_folder, read_clouds
+        from palpate.families.appliance.cloud_log import SUFFIXES, read_log
 
         if is_cloud_folder(path):
             return read_clouds(path, self.viewpoint)
@@ -114,6 +117,8 @@ class IdentifyAppliance(Identify):
                 f"--viewpoint is for a folder of clouds, and {path} is none: expected a folder of "
                 "each action in it, with before.ply, after.ply and hand.csv"
             )
+        if path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file():
+            return read_log(path)
         return super().read(path)
 
     def prepare(self, recording: Recording) -> Recording:

@@ -19,7 +19,7 @@ from palpate.perception.clouds import Cloud, cloud_of
 GIVEN = np.array([0.005, 0.005, 0.005, 0.01, 0.01, 0.01])  # rad and m: how well a pose is known
 POINTS = 4000  # of a cloud that are laid onto another
 ROUNDS, REACH = 30, 0.03  # m to what may be the same surface
-AGREES = 0.8  # cosine between the normals of what may be the same surface
+AGREES = 0.95  # cosine between the normals of what may be the same surface
 CUTOFF = 4.0  # standard deviations from which on a point counts for nothing
 PATCH = 30.0  # neighbouring points have nearly the same error: so many count once
 FEWEST = 100  # points that meet something

@@ -81,7 +81,7 @@ def _markers(message: Any) -> Sight | None:
     names = None
     items: list[Any] = []
     if _field(message, "fields") is not None:
-        points = _cloud(message)
+        points = cloud_points(message)
     else:
         values = [
             value
@@ -137,8 +137,12 @@ def _name(item: Any) -> str:
     return ""
 
 
-def _cloud(message: Any) -> np.ndarray | None:
-    """(points, 3) of a packed cloud; None if it has no x, y and z in floating point."""
+def cloud_points(message: Any, most: int = MAX_POINTS) -> np.ndarray | None:
+    """(points, 3) of a packed cloud; None if it has no x, y and z in floating point, or more than
+    `most` of them.
+
+    Raises `ValueError` for one whose bytes are not as many as it says.
+    """
     packed = {_field(field, "name"): field for field in _field(message, "fields")}
     step = _field(message, "point_step") or _field(message, "point_stride")
     if not {"x", "y", "z"} <= packed.keys() or not isinstance(step, int):
@@ -152,7 +156,7 @@ def _cloud(message: Any) -> np.ndarray | None:
         formats.append(order + _FLOATS[kind])
         offsets.append(_field(packed[axis], "offset"))
     height, width = _field(message, "height"), _field(message, "width")
-    if height is not None and height * width > MAX_POINTS:
+    if height is not None and height * width > most:
         return None
     data = _field(message, "data")
     data = base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
 from palpate.networks.actor import Perceptron
+from palpate.networks.in_numpy import layers_of, values_of
 from palpate.perception.surface_features import FEATURES
 from palpate.runs.storage import load_arrays, save_arrays
 
@@ -40,11 +41,8 @@ class MovableGuess(eqx.Module):
     ) -> Float[np.ndarray, " surfaces"]:
         """The probability that each surface moves by itself, or on the part that it is of."""
         standard = (features - np.asarray(self.mean)) / np.asarray(self.deviation)
-        values = np.clip(standard, -FURTHEST, FURTHEST).astype(np.float32)
-        pairs = zip(self.network.weights, self.network.biases, strict=True)
-        for number, (weight, bias) in enumerate(pairs):
-            values = np.maximum(values, 0.0) if number else values
-            values = values @ np.asarray(weight) + np.asarray(bias)[:, None, :]
+        inputs = np.clip(standard, -FURTHEST, FURTHEST).astype(np.float32)
+        values = values_of(layers_of(self.network), inputs)
         return (1.0 / (1.0 + np.exp(-values[..., 0].astype(np.float64)))).mean(axis=0)
 
     def save(self, path: Path, manifest: dict[str, Any]) -> None:

@@ -28,10 +28,13 @@ class Ros:
     """Messages of one release of ROS: `ros.PoseArray(header, poses)`."""
 
     def __init__(self, one=False):
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self.one = one
         self.store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+        if one:  # rosbags knows no tf2 of ROS 1, whose bags bring their definitions
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
         types = sorted(self.store.types.items(), key=lambda item: "builtin" in item[0])
         self.types = {name.split("/")[-1]: kind for name, kind in types}
 

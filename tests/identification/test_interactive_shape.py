@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from depth_scenes import depth_of
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.screws import Screw
@@ -16,7 +17,6 @@ from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.mjcf import write_mjcf
 from palpate.numerics.pinhole import Pinhole
 from palpate.perception.clouds import Cloud, cloud_of
-from palpate.worlds.depth import DepthSensor, depth_image
 
 DOOR = 0.04, 0.6, 0.7  # m
 SCENE = f"""
@@ -41,19 +41,13 @@ OPEN = 1.3  # rad, towards the cameras
 @pytest.fixture(scope="module")
 def twin() -> Twin:
     """A cupboard whose door was opened before two cameras."""
-    model = mujoco.MjModel.from_xml_string(SCENE)
-    data, random = mujoco.MjData(model), np.random.default_rng(0)
     cameras = [
         Pinhole.looking_at((0.1, 0.0, 1.0), place, 320, 240, math.radians(50.0))
         for place in ((-1.7, 0.9, 1.6), (-1.8, -0.8, 1.3))
     ]
 
     def look(position: float) -> Cloud:
-        data.qpos[:] = position
-        mujoco.mj_kinematics(model, data)
-        return cloud_of(
-            [depth_image(model, data, one, DepthSensor(), random)[0] for one in cameras]
-        )
+        return cloud_of([depth_of(SCENE, position, one, seed) for seed, one in enumerate(cameras)])
 
     screw = Screw("revolute", np.array([0.0, 0.0, 1.0]), HINGE)
     way = np.stack([screw.pose(-one).at(HAND[None])[0] for one in np.linspace(0.0, OPEN, 60)])

@@ -3,15 +3,14 @@
 import dataclasses
 import math
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from depth_scenes import depth_of
 from palpate.identification.interactive.registration import FEWEST, exact_poses, register
 from palpate.identification.interactive.screws import NOWHERE
 from palpate.numerics.pinhole import DepthImage, Pinhole
 from palpate.perception.clouds import cloud_of
-from palpate.worlds.depth import DepthSensor, depth_image
 
 SCENE = """
 <mujoco>
@@ -34,11 +33,7 @@ AWAY = Pinhole.looking_at((0.1, 0.0, 1.0), (-1.6, -0.4, 1.6), 320, 240, math.rad
 
 
 def seen(pinhole: Pinhole, door: float, seed: int) -> DepthImage:
-    model = mujoco.MjModel.from_xml_string(SCENE)
-    data = mujoco.MjData(model)
-    data.qpos[:] = -door
-    mujoco.mj_kinematics(model, data)
-    return depth_image(model, data, pinhole, DepthSensor(), np.random.default_rng(seed))[0]
+    return depth_of(SCENE, -door, pinhole, seed)
 
 
 def spoilt(image: DepthImage, degrees: float, metres: float, seed: int) -> DepthImage:

@@ -25,7 +25,6 @@ from palpate.recordings.rosbag.frames import Frames
 from palpate.recordings.rosbag.messages import cloud_points, header
 from palpate.runs.storage import DamagedFileError
 
-SUFFIXES = (".mcap", ".bag", ".db3")
 HOLDS = 2.0  # N: less is the noise of a sensor
 PAUSE, SHORTEST = 0.5, 0.3  # s: without force within an action, and of an action
 SETTLED, LINGERS = 0.01, 2.0  # m and s: a hand that goes no further after an action still holds on

@@ -108,7 +108,8 @@ class IdentifyAppliance(Identify):
     def read(self, path: Path) -> Recording:
         """A recording, or the actions of a folder with clouds of points, or of a log of ROS."""
         from palpate.families.appliance.cloud_folder import is_cloud_folder, read_clouds
-        from palpate.families.appliance.cloud_log import SUFFIXES, read_log
+        from palpate.families.appliance.cloud_log import read_log
+        from palpate.recordings.rosbag.files import is_bag
 
         if is_cloud_folder(path):
             return read_clouds(path, self.viewpoint)
@@ -117,7 +118,7 @@ class IdentifyAppliance(Identify):
                 f"--viewpoint is for a folder of clouds, and {path} is none: expected a folder of "
                 "each action in it, with before.ply, after.ply and hand.csv"
             )
-        if path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file():
+        if is_bag(path):
             return read_log(path)
         return super().read(path)
 

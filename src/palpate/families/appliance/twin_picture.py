@@ -47,10 +47,10 @@ def film_twin(path: Path, twin: Twin, description: Description) -> None:
     for look in range(1, len(twin.looks)):
         if np.abs(places[:, look] - places[:, shown[-1]]).max() > MOVED:
             shown.append(look)
-    shown = shown[:: max(1, -(-len(shown) // MOST_FRAMES))]
+    frames = np.linspace(0, len(shown) - 1, min(len(shown), MOST_FRAMES)).round().astype(int)
     pictures = []
     with matplotlib.rc_context(_SETTINGS):
-        for look in shown:
+        for look in np.array(shown)[frames]:
             figure = canvas_of(8.0, 4.0, dpi=80)
             seen: Any = figure.add_subplot(1, 2, 1, projection="3d")
             cloud = twin.looks[look]

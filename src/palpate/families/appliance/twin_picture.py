@@ -50,7 +50,7 @@ def film_twin(path: Path, twin: Twin, description: Description) -> None:
     frames = np.linspace(0, len(shown) - 1, min(len(shown), MOST_FRAMES)).round().astype(int)
     pictures = []
     with matplotlib.rc_context(_SETTINGS):
-        for look in np.array(shown)[frames]:
+        for look in np.array(shown)[frames].tolist():
             figure = canvas_of(8.0, 4.0, dpi=80)
             seen: Any = figure.add_subplot(1, 2, 1, projection="3d")
             cloud = twin.looks[look]

@@ -158,12 +158,12 @@ def test_bash_completes_commands_subjects_and_options_from_the_top(tmp_path, cap
         ),
         (
             "identify",
-            "palpate identify needs a family first; there are: "
+            "palpate identify: which family? There are: "
             "appliance, contact, furniture, rope, FILE.py:CLASS",
         ),
         (
             "identify --seed 1 rope",
-            "palpate identify needs a family first; there are: "
+            "palpate identify: which family? There are: "
             "appliance, contact, furniture, rope, FILE.py:CLASS",
         ),
         (

@@ -154,7 +154,7 @@ def _run(words: list[str]) -> int:
                 print(_subjects(name, command, known))
                 return 0
             known = ", ".join(known)
-            raise PalpateError(f"{program} needs a {command.subject} first; there are: {known}")
+            raise PalpateError(f"{program}: which {command.subject}? There are: {known}")
         kind, *rest = rest
         program = f"{program} {kind}"
         if not (own := bool(command.own and re.search(r"\.py(:|$)", kind))):

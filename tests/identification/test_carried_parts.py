@@ -1,5 +1,6 @@
 """A door with a flap in it: pulls that move both, one after the other, and sheets that slide."""
 
+import dataclasses
 import math
 
 import mujoco
@@ -7,9 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from depth_scenes import depth_of
 from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.labels import scores, smoothed
+from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Sighting, refine, surprise
-from palpate.identification.interactive.screws import Screw
+from palpate.identification.interactive.screws import NOWHERE, Screw
+from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import Pinhole
 from palpate.perception.clouds import Cloud, cloud_of
@@ -179,3 +184,90 @@ def test_a_way_surprises_the_joint_that_it_is_not_of() -> None:
     assert surprise(known, way(screw)) < 1.0
     assert surprise(known, way(screw.varied(np.array([0.3, 0.0, 0.0, 0.0])))) > 3.0
     assert surprise(known, way(screw.varied(np.array([0.0, 0.0, 0.0, 0.2])))) > 1.2
+
+
+PANELS = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".02 .9 .6" pos=".15 0 .6"/>
+    <geom type="box" size=".02 .2 .5" pos="0 .5 .6"/>
+    <geom type="box" size=".02 .2 .5" pos="0 -.5 .6"/>
+    <geom type="box" size=".02 .12 .6" pos="-.3 .38 .6"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+DOOR_AND_WALL = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".02 1.2 .9" pos=".1 0 .9"/>
+    <body pos="0 0 .9">
+      <joint type="slide" axis="0 1 0"/>
+      <geom type="box" size=".02 .4 .8"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_most_of_a_door_that_slides_in_its_plane_is_of_it() -> None:
+    camera = Pinhole.looking_at((0.0, 0.0, 0.9), (-2.4, 0.0, 1.0), 320, 240, math.radians(58.0))
+    looks = [cloud_of([depth_of(DOOR_AND_WALL, 0.15 * n, camera, n)]) for n in range(2)]
+    slide = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3)).pose(0.15)
+    found = smoothed(looks[0], scores(looks[0], looks[1:], [[NOWHERE], [slide]])).argmax(axis=0)
+    door = looks[0].points[:, 0] < 0.03
+    assert found[door].mean() > 0.7
+    assert found[~door].mean() < 0.05
+
+
+def test_what_is_known_to_be_another_part_does_not_show_where_a_part_is() -> None:
+    # two equal panels; the first, half hidden behind a post, would be seen better at the other
+    camera = Pinhole.looking_at((0.0, 0.0, 0.6), (-2.4, 0.0, 0.7), 320, 240, math.radians(58.0))
+    tree = PartTree()
+    for seed in (0, 1):
+        tree.looks.append(cloud_of([depth_of(PANELS, 0.0, camera, seed)]))
+        points = tree.looks[-1].points
+        tree.labels.append(np.where((points[:, 1] > 0.28) & (points[:, 0] > -0.1), 0, -1))
+    y, z = np.meshgrid(np.arange(0.32, 0.7, 0.03), np.arange(0.15, 1.1, 0.03))
+    support = np.stack([np.full(y.size, -0.02), y.ravel(), z.ravel()], axis=1)
+    normals = np.tile([-1.0, 0.0, 0.0], (y.size, 1))
+    slide = Screw("prismatic", np.array([0.0, -1.0, 0.0]), support.mean(axis=0))
+    way = np.linspace(support[0], support[0] + slide.axis, 20)
+    known = refine(slide, np.zeros(2), [None, None], [(0, way)])
+    tree.parts.append(Part(-1, known, [0.0, 0.0], {}, [(0, way)], (support, normals)))
+    tree.parts[0].positions[0] = 1.0  # it has been there, so that it is sought there
+    tree.find(0, 1, others=tree.unchanged(0, 1))
+    assert tree.parts[0].positions[1] == 0.0
+    tree.find(0, 1)
+    assert tree.parts[0].positions[1] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_part_that_was_found_twice_becomes_one(room) -> None:
+    twin = Twin()
+    room.at(-0.3, 0.0)
+    twin.look(room.look())
+    room.pull(twin, FLAP, (-0.3, 0.0), (-0.3, 0.7))
+    assert len(twin.parts) == 1
+    other = twin.parts[0]
+    short = [(look, way[:10]) for look, way in other.ways]
+    twin.parts.append(dataclasses.replace(other, positions=list(other.positions), ways=short))
+    room.pull(twin, FLAP, (-0.3, 0.7), (-0.3, 0.1))
+    assert len(twin.parts) == 1
+    assert twin.held[-1][0] == 0
+    assert len(twin.parts[0].ways) == 3
+
+
+def test_a_way_on_a_part_whose_carrier_has_moved_counts_by_its_ends(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    room.pull(twin, FLAP, (-0.6, 0.0), (-0.2, 0.7))
+    look, way = twin.parts[1].ways[0]
+    local = twin.way_from(0, look, way)
+    assert local.shape == (6, 3)
+    still = Screw("revolute", np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.29]))
+    turned = still.position_of(local[0], local[-1:])[0]
+    assert abs(turned) == pytest.approx(0.7, abs=0.1)
+    assert twin.way_from(-1, look, way) is way

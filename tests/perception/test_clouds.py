@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from depth_scenes import depth_of
 from palpate.errors import PalpateError
 from palpate.numerics.pinhole import DepthImage, Pinhole
 from palpate.perception.clouds import cloud_of, noise_at
@@ -31,9 +32,11 @@ def test_points_are_on_the_surface_and_normals_towards_the_camera():
     assert (cloud.normals @ expected > 0.999).mean() > 0.95
 
 
-def test_points_are_as_noisy_as_they_say():
-    cloud = cloud_of([wall(noise=1.0)])
+@pytest.mark.parametrize("offset", [0.0, 1.5, 3.0])
+def test_points_are_as_noisy_as_they_say(offset):
+    cloud = cloud_of([wall(offset, noise=1.0)])
     inner = np.abs(cloud.points[:, 0]) < 0.5
+    assert inner.sum() > 300
     seen = np.std(cloud.points[inner, 1])
     assert 0.7 < seen / np.median(cloud.deviation[inner]) < 1.4
 
@@ -64,6 +67,30 @@ def test_two_cameras_see_more_than_one():
     one, both = cloud_of([wall()]), cloud_of([wall(), second])
     assert np.ptp(both.points[:, 0]) > np.ptp(one.points[:, 0]) + 0.2
     assert set(both.source[:, 0]) == {0, 1}
+
+
+BOX = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size="2 2 .01" pos="0 0 -.01"/>
+    <geom type="box" size=".3 .3 .4" pos="0 0 .4"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_face_that_another_camera_sees_edge_on_is_not_in_the_open():
+    angle = math.radians(60)
+    oblique = Pinhole.looking_at((0.0, 0.0, 0.4), (2.0, -3.6, 1.4), 320, 240, angle)
+    edge_on = Pinhole.looking_at((0.0, -0.3, 0.4), (-1.6, -0.3, 0.5), 320, 240, angle)
+    cloud = cloud_of([depth_of(BOX, 0.0, camera, n) for n, camera in enumerate((oblique, edge_on))])
+    face = (cloud.normals[:, 1] < -0.95) & (np.abs(cloud.points[:, 0]) < 0.28)
+    points, normals = cloud.points[face], cloud.normals[face]
+    assert len(points) > 100
+    assert cloud.surfaces(points, 3.0)[1].mean() > 0.03  # the second camera looks past them
+    assert cloud.surfaces(points, 3.0, normals)[1].mean() < 0.005
+    before = points - np.array([0.0, 0.25, 0.0])
+    assert cloud.surfaces(before, 3.0, normals)[1].mean() > 0.8
 
 
 @pytest.mark.parametrize("fill", [np.nan, 0.0, -1.0])

@@ -9,6 +9,7 @@ by explaining that cloud: the reward of SAGCI (Eqn. 14).
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -28,6 +29,7 @@ from palpate.perception.surfaces import STANDS_OFF, Surface, surfaces
 JOINT = 10.0  # nats that a joint is worth which was not known
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
 BESIDE = 0.05  # m from a surface at which a hand was still on it
+BEHIND = 0.03  # m
 FEWEST = 10  # points of a part that a hand can be put to
 REACH = 0.3  # m that a hand goes
 UNKNOWN = 0.3  # of its reach that a hand is expected to take a part beyond where it was seen
@@ -133,12 +135,17 @@ def _grips(
 
 
 def _at(one: Handling, surface: Surface, cloud: Cloud) -> bool:
-    """Whether a handling was at a surface, or at what stands off it there."""
+    """Whether a handling was at a surface, or at what stands off it there.
+
+    Of a cloud that is noisy or sparse some points of a surface may make another one.
+    """
     height = float((one.push.point - surface.centre) @ surface.normal)
-    if not -0.03 < height < STANDS_OFF[1]:
+    if not -max(BEHIND, 2.0 * cloud.error) < height < max(STANDS_OFF[1], 2.0 * cloud.error):
         return False
     below = one.push.point - height * surface.normal
-    return float(np.linalg.norm(cloud.points[surface.members] - below, axis=1).min()) < BESIDE
+    spacing = math.sqrt(surface.area / len(surface.members))
+    away = np.linalg.norm(cloud.points[surface.members] - below, axis=1).min()
+    return bool(away < max(BESIDE, 2.0 * spacing))
 
 
 def _repeats(

@@ -6,6 +6,7 @@ on a surface, in front of one (free) or behind (hidden) is looked up in the imag
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,7 +23,10 @@ EDGE = 0.03  # of the depth, between neighbouring pixels: they are on two sides 
 MOST = 20_000  # points of a cloud, about: more say little more and take longer
 FEWEST = 200  # points of which anything can be said
 FLOOR = 0.04  # m: what is no higher above it is the floor
+WIDE = 1.5  # of the noise: how wide cells are at least
+SPLIT = 3.0  # of the noise, between depths of pixels side by side: two surfaces
 NEIGHBOURS = 24  # that give a normal
+NEAREST = 10  # points that are a point's neighbours
 AROUND = 5  # pixels, of the square in which nothing is seen where nothing is
 FACING = 0.5  # cosine between a normal and the way to a camera that sees the surface for sure
 NOISE = 1.2e-3, 1.9e-3  # m: at 0.4 m, and its growth with the square of what is further
@@ -46,13 +50,31 @@ class Cloud:
     blank: Sequence[Bool[np.ndarray, "_ _"]]  # around which nothing was seen
     tree: cKDTree
 
+    @functools.cached_property
+    def error(self) -> float:
+        """How far (m) points are from their surface as a rule: the median of the camera whose
+        points are least exact."""
+        each = [self.deviation[self.source[:, 0] == image] for image in range(len(self.images))]
+        return float(max(np.median(one) for one in each if len(one)))
+
+    @functools.cached_property
+    def neighbours(self) -> Int[np.ndarray, "points _"]:
+        """The points nearest to each, without itself."""
+        return self.tree.query(self.points, NEAREST + 1)[1][:, 1:]
+
     def surfaces(
-        self, points: Float[np.ndarray, "n 3"], tolerance: float
+        self,
+        points: Float[np.ndarray, "n 3"],
+        tolerance: float,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """Whether each point is on a surface that was seen, and whether it is in the open.
 
         In the open is what some camera looks through at what is behind it. Neither: hidden, or
-        where no camera looks. `tolerance` is in standard deviations of depth.
+        where no camera looks. `tolerance` is in standard deviations of depth. Points of surfaces
+        have `normals`, towards whoever saw them, and an error along these like the points of this
+        look: a camera that sees the surface edge-on looks past such a point. They are in the open
+        if they would be without it as well.
         """
         on, free = np.zeros(len(points), bool), np.zeros(len(points), bool)
         for image, near, far in zip(self.images, self.nearest, self.furthest, strict=True):
@@ -60,7 +82,13 @@ class Cloud:
             least, most = near[row, column], far[row, column]
             room = tolerance * noise_at(depth)
             on |= inside & (depth > least - room) & (depth < most + room)
-            free |= inside & (depth < least - room)
+            before = inside & (depth < least - room)
+            if normals is not None:
+                some = np.flatnonzero(before)
+                back = points[some] - tolerance * self.error * _across(image, points, normals, some)
+                inside, row, column, depth = _pixels(image, back)
+                before[some] = inside & (depth < near[row, column] - tolerance * noise_at(depth))
+            free |= before
         return on & ~free, free
 
     def missing(
@@ -89,6 +117,19 @@ def _pixels(
     return inside, np.where(inside, row, 0), np.where(inside, column, 0), depth
 
 
+def _across(
+    image: DepthImage,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    chosen: Int[np.ndarray, " m"],
+) -> Float[np.ndarray, "m 3"]:
+    """Of the normals of chosen points what is across the way to the camera."""
+    toward = np.asarray(image.pinhole.position) - points[chosen]
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    normals = normals[chosen]
+    return normals - np.sum(normals * toward, axis=1, keepdims=True) * toward
+
+
 def noise_at(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Standard deviation (m) of a depth (m) as depth cameras have it, Nguyen et al. 2012, eq. 4."""
     return np.asarray(NOISE[0] + NOISE[1] * np.maximum(depth - 0.4, 0.0) ** 2)
@@ -99,7 +140,7 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
 
     Raises `PalpateError` where too little was seen.
     """
-    seen, depths, source = [], [], []
+    seen, depths, counts, source = [], [], [], []
     nearest, furthest, blank = [], [], []
     for number, image in enumerate(images):
         depth = np.where(image.depth > 0.0, image.depth, np.nan)
@@ -107,31 +148,33 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
         far = maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
         blank.append(~maximum_filter(np.isfinite(depth), AROUND))
         row, column = np.nonzero(np.isfinite(depth) & (far - near < EDGE * near))
-        pixels = np.stack([column, row], axis=1)
-        seen.append(image.pinhole.back_project(pixels, depth[row, column]))
-        depths.append(depth[row, column])
-        source.append(np.stack([np.full(len(row), number), row, column], axis=1))
+        pixels, measured, count, first = _blocks(image, row, column, depth[row, column])
+        seen.append(image.pinhole.back_project(pixels, measured))
+        depths.append(measured)
+        counts.append(count)
+        source.append(np.stack([np.full(len(first), number), row[first], column[first]], axis=1))
         # where nothing was seen, nothing is said
         nearest.append(np.where(np.isfinite(depth), near, -np.inf))
         furthest.append(np.where(np.isfinite(depth), far, -np.inf))
-    points, depth = np.concatenate(seen), np.concatenate(depths)
+    points, depth, weight = (np.concatenate(each) for each in (seen, depths, counts))
     above = points[:, 2] > _floor(points) + FLOOR + 2.0 * noise_at(depth)
-    if above.sum() < FEWEST:
+    if (high := int(weight[above].sum())) < FEWEST:
         raise PalpateError(
-            f"the depth images show {len(points)} points on surfaces, of which {above.sum()} are "
+            f"the depth images show {weight.sum()} points on surfaces, of which {high} are "
             f"above the floor: expected {FEWEST} or more, with depths in m and z upwards"
         )
-    points, depth, source = points[above], depth[above], np.concatenate(source)[above]
+    points, depth, weight = points[above], depth[above], weight[above]
+    source, noise = np.concatenate(source)[above], noise_at(depth)
     cell = cell * float(np.clip(extent_of(points) / LARGE, 0.5, 1.0))
     # noisier points in larger cells, so that a normal is as good far away as it is near by
-    size = max(cell, 1.5 * float(np.median(noise_at(depth))))
+    size = max(cell, WIDE * float(np.median(noise / np.sqrt(weight))))
     members, means = _cells(points, size)
     if len(means) > MOST:
         members, means = _cells(points, size * np.sqrt(len(means) / MOST))
     points = means
     first = np.unique(members, return_index=True)[1]
-    count = np.bincount(members)
-    deviation = np.bincount(members, noise_at(depth)) / count
+    count = np.bincount(members, weight)
+    deviation = np.bincount(members, noise) / np.bincount(members)
     tree = cKDTree(points)
     centres = np.array([image.pinhole.position for image in images])
     sources = source[first]
@@ -142,6 +185,35 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
         points, normals, deviation, sources, list(images), nearest, furthest, blank,
         cKDTree(points),
     )  # fmt: skip
+
+
+def _blocks(
+    image: DepthImage,
+    row: Int[np.ndarray, " n"],
+    column: Int[np.ndarray, " n"],
+    depth: Float[np.ndarray, " n"],
+) -> tuple[
+    Float[np.ndarray, "m 2"], Float[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]
+]:
+    """Pixels in squares as wide as their noise: the mean of each on one surface.
+
+    Their places (column and row), depths (m), how many pixels they are of, and one of those. Cells
+    of space would not do that: noise spreads a surface over several cells behind each other.
+    """
+    if not len(depth):
+        return np.empty((0, 2)), depth, row, row
+    middle = float(np.median(depth))
+    noise = float(noise_at(np.array(middle)))
+    wide = max(1, round(WIDE * noise * max(image.pinhole.focal) / middle))
+    block = row // wide * (image.pinhole.width // wide + 1) + column // wide
+    order = np.lexsort((depth, block))
+    new = np.diff(block[order], prepend=-1) > 0
+    new |= np.diff(depth[order], prepend=-np.inf) > SPLIT * noise_at(depth[order])
+    member = np.cumsum(new) - 1
+    count = np.bincount(member)
+    means = [np.bincount(member, one[order]) / count for one in (column, row, depth)]
+    first = order[np.flatnonzero(new) + count // 2]
+    return np.stack(means[:2], axis=1), means[2], count, first
 
 
 def extent_of(points: Float[np.ndarray, "n 3"]) -> float:

@@ -39,7 +39,6 @@ class Discovery:
     carrier: int
     estimate: Estimate
     masks: list[Int[np.ndarray, " _"]]
-    way: Float[np.ndarray, "times 3"]  # as if the carrier had stood still
 
 
 def discover(tree: PartTree, before: int, after: int, handling: Handling) -> bool:
@@ -54,7 +53,7 @@ def discover(tree: PartTree, before: int, after: int, handling: Handling) -> boo
         options = (_on_carrier(tree, before, after, carrier, way) for carrier in near)
         found = next((one for one in options if one is not None), None)
     if found is not None:
-        _insert(tree, before, after, found)
+        _insert(tree, before, after, found, way)
     return found is not None
 
 
@@ -130,7 +129,7 @@ def _best(
             tree.much_is_left(candidate, look, len(mask))
             for look, mask in zip((before, after), masks, strict=True)
         ):
-            found.append(Discovery(carrier, estimate, masks, way))
+            found.append(Discovery(carrier, estimate, masks))
     return min(found, key=lambda one: one.estimate.criterion, default=None)
 
 
@@ -139,8 +138,10 @@ def _candidate(estimate: Estimate, back: Pose, before: int, after: int) -> Candi
     return Candidate(back.inverse @ estimate.screw.pose(gone), before, after)
 
 
-def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
-    """Put a new part where it belongs in the tree."""
+def _insert(
+    tree: PartTree, before: int, after: int, new: Discovery, way: Float[np.ndarray, "times 3"]
+) -> None:
+    """Put a new part, with a hand's way on it, where it belongs in the tree."""
     labels, mask = tree.labels[before], np.zeros(len(tree.labels[before]), bool)
     mask[new.masks[0]] = True
     parent, carried, same = new.carrier, [], []
@@ -149,7 +150,8 @@ def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
         if own.sum() < FEWEST or number == new.carrier:
             continue
         shared = (mask & own).sum()
-        if shared > WITHIN * own.sum() and part.longest_way < LITTLE:
+        little = part.longest_way < LITTLE or shared > WITHIN * mask.sum()
+        if shared > WITHIN * own.sum() and little:
             same.append(number)
         elif shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
             carried.append(number)  # all of it has moved, and more
@@ -170,8 +172,7 @@ def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
     support = support_of((tree.looks[before], tree.looks[after]), new.masks, poses)
     estimate = dataclasses.replace(new.estimate, screw=screw)
     seen = {before: new.masks[0], after: new.masks[1]}
-    ways = [(before, back.at(new.way))]
-    tree.parts.append(Part(parent, estimate, positions, seen, ways, support))
+    tree.parts.append(Part(parent, estimate, positions, seen, [(before, way)], support))
     for look in range(before):  # a pull that told nothing may have moved it
         tree.find(number, look)
     for look in range(after + 1, len(tree.looks)):
@@ -184,10 +185,10 @@ def _insert(tree: PartTree, before: int, after: int, new: Discovery) -> None:
     # what carries the carrier stays: a part cannot hang on what hangs on it
     above = tree.carriers(number)
     for old in sorted(set(same).difference(above), reverse=True):
+        tree.parts[number].ways += tree.parts[old].ways
         if tree.parts[old].parent == parent:
-            tree.parts[number].ways += tree.parts[old].ways
-            again = tree.parts[old].positions_of(estimate.screw)
-            tree.parts[number].positions = [*again[:before], *tree.parts[number].positions[before:]]
+            again = np.array(tree.parts[old].positions_of(estimate.screw))
+            tree.parts[number].positions[:before] = (again[:before] - again[before]).tolist()
         tree.remove(old, number)
         number -= 1
 
@@ -225,7 +226,8 @@ def reparent(tree: PartTree, carrier: int, look: int) -> None:
         gone = [
             other
             for other, chosen in part.seen.items()
-            if len(chosen) >= FEWEST and abs(places[other] - places[first]) > CARRIED
+            if (len(chosen) >= FEWEST or other == look + 1)  # it may be taken for the carrier there
+            and abs(places[other] - places[first]) > CARRIED
         ]
         if not gone:
             continue
@@ -236,16 +238,10 @@ def reparent(tree: PartTree, carrier: int, look: int) -> None:
             positions=list(part.positions),
             estimate=dataclasses.replace(part.estimate, screw=part.screw.moved(onto)),
             support=(onto.at(part.support[0]), onto.turned(part.support[1])),
-            ways=[
-                (other, (tree.pose(carrier, other).inverse @ tree.pose(part.parent, other)).at(way))
-                for other, way in part.ways
-            ],
         )
-        before = np.mean([tree.seen_at(part, other) for other in gone])
-        tree.parts[number] = hung
-        for other in gone:
-            tree.find(number, other)
-        gain = float(np.mean([tree.seen_at(hung, other) for other in gone]) - before)
+        free = dataclasses.replace(part, positions=list(part.positions))
+        before = _seen(tree, number, free, gone)  # as free to be elsewhere as on the carrier
+        gain = _seen(tree, number, hung, gone) - before
         stiller = _travel(hung, look) + STILLER < _travel(part, look)
         beside = stiller and _share_beside(tree, number, carrier, look) > WITHIN
         if gain > SEEN or (gain > -SEEN and beside):
@@ -254,6 +250,12 @@ def reparent(tree: PartTree, carrier: int, look: int) -> None:
                 tree.relabel(other)
         else:
             tree.parts[number] = part
+
+
+def _seen(tree: PartTree, number: int, part: Part, looks: list[int]) -> float:
+    """Put a part in the place of another; the evidence of looks for it, wherever it may be."""
+    tree.parts[number] = part
+    return float(np.mean([tree.find(number, look) for look in looks]))
 
 
 def _travel(part: Part, look: int) -> float:

@@ -3,14 +3,16 @@
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.refinement import Estimate, Way, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
-from palpate.identification.interactive.tree import Candidate, PartTree
+from palpate.identification.interactive.tree import NOT_MOVED, Candidate, PartTree
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
+FURTHER = 1.5  # rad or m that a part may have been beyond where it was seen
 SHORT = 0.05  # m that a hand went: a way so short fits many joints
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 
@@ -21,6 +23,28 @@ def moved_part(tree: PartTree, before: int, after: int, handling: Handling) -> i
         if (part := explain(tree, before, after, handling)) >= 0:
             return part
     return -1
+
+
+def may_have_moved(tree: PartTree, part: int, look: int, way: Float[np.ndarray, "times 3"]) -> bool:
+    """Whether a hand has moved a part after a look: began at it, went as its joint allows, and both
+    looks show it there.
+
+    It need not be where it was believed to be, if another position is clearly better.
+    """
+    one, local = tree.parts[part], tree.way_from(tree.parts[part].parent, look, way)
+    if surprise(one.estimate, local) > SURPRISE:
+        return False
+    low, high = one.range
+    tried = np.array([one.positions[look], *np.arange(low - FURTHER, high + FURTHER, 0.04)])
+    seen = tree.seen_at(part, look, tried)
+    seen[0] += NOT_MOVED
+    place = float(tried[seen.argmax()])
+    points = one.screw.pose(place).at(one.support[0])
+    if np.linalg.norm(points - local[0], axis=1).min() > BESIDE:
+        return False
+    gone = float(one.screw.position_of(local[0], local)[-3:].mean())
+    moved, stood = tree.seen_at(part, look + 1, np.array([place + gone, place]))
+    return bool(moved > stood)
 
 
 def labels_near(tree: PartTree, look: int, point: np.ndarray) -> list[int]:
@@ -54,7 +78,7 @@ def _by_way(tree: PartTree, before: int, after: int, handling: Handling) -> int:
         if surprise(one.estimate, way) > SURPRISE:
             continue
         if _follows_hand(tree, part, before, after, handling):
-            one.ways.append((before, way))
+            one.ways.append((before, handling.points))
             return part
     return -1
 
@@ -67,7 +91,8 @@ def _follows_hand(tree: PartTree, part: int, before: int, after: int, handling: 
     screw, one = tree.screw(part, before), tree.parts[part]
     start, alone = handling.points[:3].mean(axis=0), one.positions[after]
     gone = float(screw.position_of(start, handling.points)[-3:].mean())
-    tree.find(part, after, around=one.positions[before] + gone)
+    around = one.positions[before] + gone
+    tree.find(part, after, around, tree.unchanged(part, after))
     missed = abs(one.positions[after] - one.positions[before] - gone)
     arm = float(np.linalg.norm(screw.velocity(start)))
     own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
@@ -88,8 +113,9 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
         if part < 0:
             continue
         one = tree.parts[part]
-        ways = [*one.ways, (before, tree.pose(one.parent, before).inverse.at(handling.points))]
-        joint = _joint_of(ways, len(tree.looks))
+        ways = [*one.ways, (before, handling.points)]
+        local = [(look, tree.way_from(one.parent, look, way)) for look, way in ways]
+        joint = _joint_of(local, len(tree.looks))
         if joint is None:
             continue
         kept = one.estimate, one.positions
@@ -112,10 +138,7 @@ def _joint_of(ways: list[Way], looks: int) -> Estimate | None:
 
 
 def _by_clouds(tree: PartTree, before: int, after: int, handling: Handling) -> int:
-    """The part that the clouds show to have moved as the hand has.
-
-    It has one way more, if nothing that carries it moved meanwhile.
-    """
+    """The part that the clouds show to have moved as the hand has, which has one way more."""
     start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
     misses = [
         float(np.linalg.norm(tree.motion(part, before, after).at(start[None])[0] - end))
@@ -124,10 +147,5 @@ def _by_clouds(tree: PartTree, before: int, after: int, handling: Handling) -> i
     if not misses or min(misses) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
         return -1
     part = int(np.argmin(misses))
-    if all(
-        abs(tree.parts[one].positions[before] - tree.parts[one].positions[after]) < 1e-3
-        for one in tree.carriers(part)
-    ):
-        back = tree.pose(tree.parts[part].parent, before).inverse
-        tree.parts[part].ways.append((before, back.at(handling.points)))
+    tree.parts[part].ways.append((before, handling.points))
     return part

@@ -8,7 +8,8 @@ what would have faced a camera that saw nothing there: depth has holes, but smal
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.sparse import csr_array
 
 from palpate.identification.interactive.screws import Pose
 from palpate.perception.clouds import Cloud
@@ -17,9 +18,9 @@ from palpate.perception.clouds import Cloud
 ON, FREE, HIDDEN, MISSING = 0.9, -2.9, -0.4, -1.5
 TOLERANCE = 3.0  # standard deviations of depth
 AGREES = 0.7  # cosine of the angle between the normals of what is the same surface
-NEIGHBOURS = 10
 SMOOTH = 0.45  # how much likelier neighbours on one surface are of one part (logarithm)
-ROUNDS = 40
+ROUNDS, SETTLED = 200, 0.01
+ALIKE = 0.2  # what slides in its own plane is seen as well where it was: its neighbours decide
 STANDS = 1.0  # how much likelier a point is to stand still, before anything is seen (logarithm)
 MOST_EVIDENCE = 6.0  # of all looks together: their errors are not independent
 
@@ -30,19 +31,32 @@ TELLING = 0.3  # rad or m of a part: to be further away tells no more
 Scores = Float[np.ndarray, "labels points"]
 
 
-def evidence(cloud: Cloud, points: np.ndarray, normals: np.ndarray) -> Float[np.ndarray, " n"]:
-    """How much likelier it makes these points that a look is as it is (logarithm)."""
-    on, free = cloud.surfaces(points, TOLERANCE)
-    reach = 0.02 + TOLERANCE * float(np.median(cloud.deviation))
-    distance, index = cloud.tree.query(points, distance_upper_bound=reach)
-    met = np.isfinite(distance)
-    alike = np.zeros(len(points), bool)
-    alike[met] = np.sum(cloud.normals[index[met]] * normals[met], axis=1) > AGREES
+def evidence(
+    cloud: Cloud,
+    points: np.ndarray,
+    normals: np.ndarray,
+    others: Bool[np.ndarray, " cloud"] | None = None,
+) -> Float[np.ndarray, " n"]:
+    """How much likelier it makes these points that a look is as it is (logarithm).
+
+    Points of the look that are known to be of `others` say nothing for them.
+    """
+    on, free = cloud.surfaces(points, TOLERANCE, normals)
+    reach = 0.02 + TOLERANCE * cloud.error
+    candidates = np.flatnonzero(on)
+    distance, index = cloud.tree.query(points[candidates], distance_upper_bound=reach)
+    near = np.isfinite(distance)
+    met, index = candidates[near], index[near]
+    alike = np.sum(cloud.normals[index] * normals[met], axis=1) > AGREES
+    if others is not None:
+        alike &= ~others[index]
     found = np.full(len(points), HIDDEN)
-    found[cloud.missing(points, normals)] = MISSING
     found[free] = FREE
-    found[on & alike] = ON
-    found[on & met & ~alike] = HIDDEN  # at an edge, or another surface: says little
+    found[met[alike]] = ON
+    unseen = ~free
+    unseen[met] = False  # at an edge, or of another surface: says little
+    rest = np.flatnonzero(unseen)
+    found[rest[cloud.missing(points[rest], normals[rest])]] = MISSING
     return found
 
 
@@ -68,7 +82,8 @@ def scores(
                 known.append((pose, same))
             found[label] += same
     found = np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
-    found[0] += STANDS
+    other = found[1:].max(axis=0, initial=-np.inf)
+    found[0] += np.where((found[0] > 0.0) & (other > found[0] - ALIKE), 0.0, STANDS)
     return found
 
 
@@ -101,15 +116,19 @@ def smoothed(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels points"]:
 
     Mean field of a Potts model on the graph of nearest neighbours (Krahenbuhl and Koltun 2011).
     """
-    neighbours = cloud.tree.query(cloud.points, NEIGHBOURS + 1)[1][:, 1:]
+    neighbours = cloud.neighbours
     alike = np.sum(cloud.normals[:, None] * cloud.normals[neighbours], axis=2)
     apart = cloud.points[neighbours] - cloud.points[:, None]
     step = np.sum(cloud.normals[:, None] * apart, axis=2) / (3e-3 + 2.0 * cloud.deviation[:, None])
     weight = SMOOTH * np.clip(alike, 0.0, 1.0) ** 4 * np.exp(-0.5 * step**2)
+    count, each = neighbours.shape
+    start = each * np.arange(count + 1)
+    graph = csr_array((weight.ravel(), neighbours.ravel(), start), shape=(count, count))
     chance = _softmax(given)
     for _ in range(ROUNDS):
-        around = np.einsum("lnk,nk->ln", chance[:, neighbours], weight)
-        chance = _softmax(given + around)
+        before, chance = chance, _softmax(given + (graph @ chance.T).T)
+        if np.abs(chance - before).max() < SETTLED:
+            break
     return chance
 
 

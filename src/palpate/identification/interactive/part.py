@@ -27,7 +27,7 @@ class Part:
     estimate: Estimate
     positions: list[float]
     seen: dict[int, np.ndarray]  # by look: which of its points
-    ways: list[tuple[int, np.ndarray]]  # a look before, and the way of a hand after it
+    ways: list[tuple[int, np.ndarray]]  # a look before, and a hand's way in the world after it
     support: Support  # points and normals, as described
 
     @property

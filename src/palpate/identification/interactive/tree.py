@@ -8,7 +8,14 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from palpate.identification.interactive.labels import STANDS, evidence, scores, smoothed, telling
+from palpate.identification.interactive.labels import (
+    ON,
+    STANDS,
+    evidence,
+    scores,
+    smoothed,
+    telling,
+)
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Estimate, Sighting, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
@@ -18,6 +25,7 @@ FEWEST = 40  # points of a part in a look
 UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
+TAKEN = 8e-3  # m that a carrier takes the end of a hand's way: less may be an error
 HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
 
 
@@ -89,43 +97,86 @@ class PartTree:
         for part in self.parts:
             part.positions.append(part.positions[-1])
         self.labels.append(np.full(len(cloud.points), -1))
+        look = len(self.looks) - 1
         for part in self.ordered():
-            self.find(part, len(self.looks) - 1)
-        return len(self.looks) - 1
+            self.find(part, look, others=self.unchanged(part, look))
+        return look
 
-    def find(self, part: int, look: int, around: float | None = None) -> None:
+    def unchanged(self, part: int, look: int) -> Bool[np.ndarray, " points"]:
+        """Which points of a look are not a part's: the look before saw something else there."""
+        if not look:
+            return np.zeros(len(self.looks[look].points), bool)
+        cloud, earlier = self.looks[look], self.looks[look - 1]
+        same = evidence(earlier, cloud.points, cloud.normals) == ON
+        return same & (self.labels[look - 1][earlier.tree.query(cloud.points)[1]] != part)
+
+    def find(
+        self,
+        part: int,
+        look: int,
+        around: float | None = None,
+        others: Bool[np.ndarray, " points"] | None = None,
+        beyond: float | None = None,
+    ) -> float:
         """Where a part is in a look: where it was, unless another position is clearly better.
 
+        Returns the evidence of the look, for each point, for the likeliest position of all.
+
         `around` is where a hand has taken it: there it is, unless it clearly has not moved. What
-        closes flush with another surface is as well seen where it was, when it has gone.
+        closes flush with another surface is as well seen where it was, when it has gone. Points
+        of `others` are not the part's, wherever it is. It is sought `beyond` (rad or m) where it
+        was seen, less by default.
         """
         one = self.parts[part]
-        points, normals = one.support
-        carrier = self.pose(one.parent, look)
-        cloud = self.looks[look]
-
-        def value(position: float) -> float:
-            pose = carrier @ one.screw.pose(position)
-            return float(np.sum(evidence(cloud, pose.at(points), pose.turned(normals))))
-
         last = one.positions[look]
         turn, step = (0.5, 0.04) if one.screw.joint == "revolute" else (0.2, 0.02)
-        low, high = min(*one.range, last) - turn, max(*one.range, last) + turn
+        reach = turn if beyond is None else beyond
+        low, high = min(*one.range, last) - reach, max(*one.range, last) + reach
         if around is not None:
             low, high = around - turn, around + turn
-        best = max(np.arange(low, high, step), key=value)
+        tried = np.arange(low, high, step)
+        best = tried[self.seen_at(part, look, tried, others).argmax()]
         for _ in range(2):
-            best = max(np.linspace(best - step, best + step, 7), key=value)
+            tried = np.linspace(best - step, best + step, 7)
+            best = tried[self.seen_at(part, look, tried, others).argmax()]
             step /= 3.0
         ahead = -HAND_TELLS if around is not None else NOT_MOVED
-        if value(best) > value(last) + ahead * len(points):
+        there, here = self.seen_at(part, look, np.array([best, last]), others)
+        if there > here + ahead:
             one.positions[look] = float(best)
+        return float(max(there, here))
 
-    def seen_at(self, part: Part, look: int) -> float:
-        """The evidence, for each point, that a look gives of a part being where it is."""
-        pose = self.pose(part.parent, look) @ part.screw.pose(part.positions[look])
-        points, normals = part.support
-        return float(np.mean(evidence(self.looks[look], pose.at(points), pose.turned(normals))))
+    def seen_at(
+        self,
+        part: int,
+        look: int,
+        positions: Float[np.ndarray, " n"],
+        others: Bool[np.ndarray, " points"] | None = None,
+    ) -> Float[np.ndarray, " n"]:
+        """The evidence of a look, for each point, for each of some positions of a part."""
+        one, carrier = self.parts[part], self.pose(self.parts[part].parent, look)
+        poses = [carrier @ one.screw.pose(float(position)) for position in positions]
+        # at once, as each by itself takes as long as many
+        points = np.concatenate([pose.at(one.support[0]) for pose in poses])
+        normals = np.concatenate([pose.turned(one.support[1]) for pose in poses])
+        found = evidence(self.looks[look], points, normals, others)
+        return found.reshape(len(poses), len(one.support[0])).mean(axis=1)
+
+    def way_from(
+        self, part: int, look: int, way: Float[np.ndarray, "times 3"]
+    ) -> Float[np.ndarray, "_ 3"]:
+        """A hand's way after a look as if a part had not moved since it was described (-1: as it
+        was).
+
+        Where the part moved meanwhile, only the way's ends are known so, three times each.
+        """
+        back, end = self.pose(part, look).inverse, way[-3:].mean(axis=0)
+        if part < 0:
+            return way
+        ended = self.motion(part, look + 1, look).at(end[None])[0]
+        if np.linalg.norm(ended - end) < TAKEN:
+            return back.at(way)
+        return back.at(np.repeat([way[:3].mean(axis=0), ended], 3, axis=0))
 
     # --- labels -------------------------------------------------------------------------------
 
@@ -183,7 +234,7 @@ class PartTree:
             part = self.parts[number]
             found = [self.estimate(part)]
             if number == last and len(part.ways) > 1:
-                ways = [way for _, way in part.ways]
+                ways = [self.way_from(part.parent, *way) for way in part.ways]
                 longest = max(ways, key=lambda way: float(np.linalg.norm(way[-1] - way[0])))
                 found += [
                     self.estimate(part, screw)
@@ -200,7 +251,8 @@ class PartTree:
                 back = self.pose(part.parent, look).inverse
                 seen[look] = sighting(self.looks[look], chosen, back)
         positions = part.positions if screw is None else part.positions_of(screw)
-        return refine(screw or part.screw, np.array(positions), seen, part.ways)
+        ways = [(look, self.way_from(part.parent, look, way)) for look, way in part.ways]
+        return refine(screw or part.screw, np.array(positions), seen, ways)
 
     def remove(self, part: int, heir: int) -> None:
         """Take a part out; what it carries and what was found of it goes to its heir, -1: none."""

@@ -6,7 +6,7 @@ carries it.
 """
 
 from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
-from palpate.identification.interactive.explanation import moved_part
+from palpate.identification.interactive.explanation import FURTHER, may_have_moved, moved_part
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
@@ -32,12 +32,12 @@ class Twin(PartTree):
         part, new = self._held(before, after, handling)
         self.held.append((part, before))
         self._keep(new, before, after)
+        self._hang(before, after)
         if new:
             self._explain_earlier()
+            self._hang(before, after)
         self.refit(self.held[-1][0] if handling.moved else -1)
-        for number, one in enumerate(self.parts):
-            if abs(one.positions[after] - one.positions[before]) > CARRIED:
-                reparent(self, number, before)
+        self._merge()
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""
@@ -49,6 +49,12 @@ class Twin(PartTree):
         self.held = [(int(moved[held + 1]), look) for held, look in self.held]
         super().remove(part, heir)
 
+    def _hang(self, before: int, after: int) -> None:
+        """Hang on each part that has moved what it carries."""
+        for number, one in enumerate(self.parts):
+            if abs(one.positions[after] - one.positions[before]) > CARRIED:
+                reparent(self, number, before)
+
     def _keep(self, new: bool, before: int, after: int) -> None:
         """Say anew what two looks show; a new part that explains nothing vanishes (III-B d)."""
         for look in (before, after):
@@ -56,6 +62,21 @@ class Twin(PartTree):
         number = len(self.parts) - 1
         if new and max((self.labels[look] == number).sum() for look in (before, after)) < FEWEST:
             self.remove(number, self.parts[number].parent)
+
+    def _merge(self) -> None:
+        """Parts whose ways were all those of another one, which was there, are that one."""
+        order = sorted(self.parts, key=lambda one: one.longest_way)
+        for least, part in enumerate(order):
+            for known in reversed(order[least + 1 :]):
+                old, number = self.parts.index(part), self.parts.index(known)
+                if old not in self.carriers(number) and all(
+                    may_have_moved(self, number, look, way) for look, way in part.ways
+                ):
+                    known.ways += part.ways
+                    for look in range(len(self.looks)):
+                        self.find(number, look, beyond=FURTHER)
+                    self.remove(old, number)
+                    break
 
     def _explain_earlier(self) -> None:
         """Explain what moved and was of no part, now that one more is known that may carry it."""

@@ -10,10 +10,9 @@ from scipy.spatial import cKDTree
 
 from depth_scenes import depth_of
 from palpate.identification.interactive.handling import Handling, Push
-from palpate.identification.interactive.labels import scores, smoothed
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Sighting, refine, surprise
-from palpate.identification.interactive.screws import NOWHERE, Screw
+from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import Pinhole
@@ -196,29 +195,6 @@ PANELS = """
   </worldbody>
 </mujoco>
 """
-
-
-DOOR_AND_WALL = """
-<mujoco>
-  <worldbody>
-    <geom type="box" size=".02 1.2 .9" pos=".1 0 .9"/>
-    <body pos="0 0 .9">
-      <joint type="slide" axis="0 1 0"/>
-      <geom type="box" size=".02 .4 .8"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
-def test_most_of_a_door_that_slides_in_its_plane_is_of_it() -> None:
-    camera = Pinhole.looking_at((0.0, 0.0, 0.9), (-2.4, 0.0, 1.0), 320, 240, math.radians(58.0))
-    looks = [cloud_of([depth_of(DOOR_AND_WALL, 0.15 * n, camera, n)]) for n in range(2)]
-    slide = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3)).pose(0.15)
-    found = smoothed(looks[0], scores(looks[0], looks[1:], [[NOWHERE], [slide]])).argmax(axis=0)
-    door = looks[0].points[:, 0] < 0.03
-    assert found[door].mean() > 0.7
-    assert found[~door].mean() < 0.05
 
 
 def test_what_is_known_to_be_another_part_does_not_show_where_a_part_is() -> None:

@@ -19,8 +19,7 @@ ON, FREE, HIDDEN, MISSING = 0.9, -2.9, -0.4, -1.5
 TOLERANCE = 3.0  # standard deviations of depth
 AGREES = 0.7  # cosine of the angle between the normals of what is the same surface
 SMOOTH = 0.45  # how much likelier neighbours on one surface are of one part (logarithm)
-ROUNDS, SETTLED = 200, 0.01
-ALIKE = 0.2  # what slides in its own plane is seen as well where it was: its neighbours decide
+ROUNDS = 40
 STANDS = 1.0  # how much likelier a point is to stand still, before anything is seen (logarithm)
 MOST_EVIDENCE = 6.0  # of all looks together: their errors are not independent
 
@@ -82,8 +81,7 @@ def scores(
                 known.append((pose, same))
             found[label] += same
     found = np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
-    other = found[1:].max(axis=0, initial=-np.inf)
-    found[0] += np.where((found[0] > 0.0) & (other > found[0] - ALIKE), 0.0, STANDS)
+    found[0] += STANDS
     return found
 
 
@@ -126,9 +124,7 @@ def smoothed(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels points"]:
     graph = csr_array((weight.ravel(), neighbours.ravel(), start), shape=(count, count))
     chance = _softmax(given)
     for _ in range(ROUNDS):
-        before, chance = chance, _softmax(given + (graph @ chance.T).T)
-        if np.abs(chance - before).max() < SETTLED:
-            break
+        chance = _softmax(given + (graph @ chance.T).T)
     return chance
 
 

@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 
 from depth_scenes import depth_of
 from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.labels import prior, scores, smoothed
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Sighting, refine, surprise
-from palpate.identification.interactive.screws import Screw
+from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import Pinhole
@@ -159,6 +160,16 @@ def sheet(corner: float) -> Sighting:
     return Sighting(points, normals, np.full(x.size, 1e-3), cKDTree(points))
 
 
+def boxed(gone: float) -> Sighting:
+    """A box's face towards x, and its side towards y, that slid along y."""
+    side, up = (one.ravel() for one in np.meshgrid(np.linspace(0, 1, 40), np.linspace(0, 1, 40)))
+    face = np.stack([0.0 * side, side, up], axis=1)
+    flank = np.stack([side, 0.0 * side, up], axis=1)
+    points = np.concatenate([face, flank]) + np.array([0.0, gone, 0.0])
+    normals = np.repeat([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], len(face), axis=0)
+    return Sighting(points, normals, np.full(len(points), 1e-3), cKDTree(points))
+
+
 def test_the_hand_says_how_far_a_sheet_has_slid_in_its_plane() -> None:
     way = np.linspace((0.5, 0.2, 0.01), (0.6, 0.2, 0.01), 40)
     way = np.concatenate([way[:1], way[:1], way, way[-1:], way[-1:]])  # at rest at both ends
@@ -168,6 +179,16 @@ def test_the_hand_says_how_far_a_sheet_has_slid_in_its_plane() -> None:
         assert found.positions[1] == pytest.approx(0.1, abs=2e-3)
     alone = refine(screw, np.array([0.0, 0.16]), [sheet(0.0), sheet(0.0)], [])
     assert alone.positions[1] == pytest.approx(0.16, abs=2e-3)  # no cloud says it
+
+
+def test_where_a_hand_began_is_not_known_if_the_part_was_not_seen_there() -> None:
+    # it was seen at 0 and .25, and taken from .15, where it was thought to be at .1
+    moved = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3))
+    start = np.array([0.0, 0.5, 0.5])
+    way = start + np.linspace(0.0, 0.1, 40)[:, None] * moved.axis
+    seen = [boxed(0.0), None, boxed(0.25)]
+    found = refine(moved, np.array([0.0, 0.1, 0.247]), seen, [(1, way)])
+    assert found.positions == pytest.approx([0.0, 0.15, 0.25], abs=8e-3)
 
 
 def test_a_way_surprises_the_joint_that_it_is_not_of() -> None:
@@ -195,6 +216,65 @@ PANELS = """
   </worldbody>
 </mujoco>
 """
+
+
+DOOR_AND_WALL = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".02 1.2 .9" pos=".1 0 .9"/>
+    <body pos="0 0 .9">
+      <joint type="slide" axis="0 1 0"/>
+      <geom type="box" size=".02 .4 .8"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_door_that_slides_in_its_plane_is_of_one_part_and_the_wall_behind_it_stands() -> None:
+    camera = Pinhole.looking_at((0.0, 0.0, 0.9), (-2.4, 0.0, 1.0), 320, 240, math.radians(58.0))
+    looks = [cloud_of([depth_of(DOOR_AND_WALL, 0.15 * n, camera, n)]) for n in range(2)]
+    slide = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3)).pose(0.15)
+    motions = [[NOWHERE], [slide]]
+    given = scores(looks[0], looks[1:], motions)
+    found = smoothed(looks[0], given + prior(looks[0], given, motions)).argmax(axis=0)
+    door = looks[0].points[:, 0] < 0.03
+    assert found[door].mean() > 0.98
+    assert found[~door].mean() < 0.02
+
+
+OVEN = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="4 4 .1"/>
+    <geom type="box" size=".25 .34 .15" pos=".25 0 .15"/>
+    <geom type="box" size=".25 .02 .2" pos=".25 .32 .46"/>
+    <geom type="box" size=".25 .02 .2" pos=".25 -.32 .46"/>
+    <geom type="box" size=".25 .34 .02" pos=".25 0 .68"/>
+    <body pos="-.02 0 .28">
+      <joint axis="0 -1 0"/>
+      <geom type="box" size=".02 .3 .2" pos="0 0 .18"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_floor_that_goes_on_from_an_open_door_is_not_of_it() -> None:
+    camera = Pinhole.looking_at((0.1, 0.0, 0.4), (-1.0, 0.3, 1.1), 320, 240, math.radians(58.0))
+    closed, opened = (
+        cloud_of([depth_of(OVEN, position, camera, number)])
+        for number, position in enumerate((0.0, 0.5 * math.pi))
+    )
+    door = Screw("revolute", np.array([0.0, -1.0, 0.0]), np.array([-0.02, 0.0, 0.28]))
+    motions = [[NOWHERE], [door.pose(-0.5 * math.pi)]]
+    given = scores(opened, [closed], motions)
+    found = smoothed(opened, given + prior(opened, given, motions)).argmax(axis=0)
+    flat = opened.normals[:, 2] > 0.9
+    x, y, z = opened.points.T
+    low = flat & (z < 0.4) & (np.abs(y) < 0.25)
+    assert found[low & (x < -0.1)].mean() > 0.95
+    assert found[low & (x > 0.1)].mean() < 0.05
 
 
 def test_what_is_known_to_be_another_part_does_not_show_where_a_part_is() -> None:

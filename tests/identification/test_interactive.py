@@ -218,8 +218,9 @@ def test_a_part_that_is_hardly_seen_while_a_hand_pulls_in_vain_is_kept(handled):
     twin = _copy(twin)
     twin.observe(handling)
     labels = twin.labels[-1]
-    mine = np.flatnonzero(labels == 0)
-    shown = np.sort(np.concatenate([np.flatnonzero(labels != 0), mine[:10]]))
+    mine, points = np.flatnonzero(labels == 0), twin.looks[-1].points
+    middle = np.linalg.norm(points[mine] - points[mine].mean(axis=0), axis=1).argsort()
+    shown = np.sort(np.concatenate([np.flatnonzero(labels != 0), mine[middle[:10]]]))
     hidden, later = (_chosen(twin.looks[-1], shown) for _ in range(2))
     twin.look(hidden)
     place = hidden.points[np.flatnonzero(twin.labels[-1] == 0)[0]]

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from palpate.errors import PalpateError
@@ -61,6 +62,19 @@ class Cloud:
     def neighbours(self) -> Int[np.ndarray, "points _"]:
         """The points nearest to each, without itself."""
         return self.tree.query(self.points, NEAREST + 1)[1][:, 1:]
+
+    @functools.cached_property
+    def surface_graph(self) -> csr_array:
+        """How much each point and its neighbours are on one flat surface: 1, less at edges and
+        steps."""
+        near = self.neighbours
+        alike = np.sum(self.normals[:, None] * self.normals[near], axis=2)
+        step = np.sum(self.normals[:, None] * (self.points[near] - self.points[:, None]), axis=2)
+        step /= 3e-3 + 2.0 * self.deviation[:, None]
+        weight = np.clip(alike, 0.0, 1.0) ** 4 * np.exp(-0.5 * step**2)
+        count, each = near.shape
+        start = each * np.arange(count + 1)
+        return csr_array((weight.ravel(), near.ravel(), start), shape=(count, count))
 
     def surfaces(
         self,

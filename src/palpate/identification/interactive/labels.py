@@ -9,10 +9,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.sparse import csr_array
+from scipy.sparse import diags_array
+from scipy.sparse.csgraph import dijkstra
 
 from palpate.identification.interactive.screws import Pose
-from palpate.perception.clouds import Cloud
+from palpate.perception.clouds import NEAREST, Cloud
 
 # logarithms of how much likelier each is of a point that moves so than of another
 ON, FREE, HIDDEN, MISSING = 0.9, -2.9, -0.4, -1.5
@@ -21,6 +22,11 @@ AGREES = 0.7  # cosine of the angle between the normals of what is the same surf
 SMOOTH = 0.45  # how much likelier neighbours on one surface are of one part (logarithm)
 ROUNDS = 40
 STANDS = 1.0  # how much likelier a point is to stand still, before anything is seen (logarithm)
+OF_SURFACE = 1.5  # the same, to be of what its surface is of: more than `ON` against `HIDDEN`
+SURE = 2.0  # of scores: how much better than all others the label of a sure point is
+DOUBT = 0.5  # of scores: what speaks for standing still by more is not of what its surface is of
+INSIDE, CONNECTED = 0.6, 0.5  # weights of neighbours: all of a point's inside a surface, and one
+HINGE, LEAST_TURN = 0.07, 0.1  # m from an axis; rad that tell where an axis is
 MOST_EVIDENCE = 6.0  # of all looks together: their errors are not independent
 
 OTHERS = 6  # looks that a look is held against
@@ -80,9 +86,7 @@ def scores(
                 same = evidence(other, pose.at(points), pose.turned(normals))
                 known.append((pose, same))
             found[label] += same
-    found = np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
-    found[0] += STANDS
-    return found
+    return np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
 
 
 def telling(places: Float[np.ndarray, "parts looks"], look: int) -> list[int]:
@@ -109,22 +113,60 @@ def telling(places: Float[np.ndarray, "parts looks"], look: int) -> list[int]:
     return chosen or [other for other in range(count) if other != look][-1:]
 
 
+def prior(cloud: Cloud, given: Scores, motions: Sequence[Sequence[Pose]]) -> Scores:
+    """How much likelier each label is of each point before its own scores count (logarithm).
+
+    A surface is as a rule of one part: a point is likely of what the nearest sure point on its
+    surface is of, unless its scores speak for standing still. Of a door that slides in its plane
+    that is most: all but the end that it has left is seen as well where it was. Over a hinge a
+    surface may go on as one of another part, as a door does that is open by a right angle.
+    """
+    found, every = np.zeros_like(given), np.arange(given.shape[1])
+    found[0] = STANDS
+    if len(given) < 2:
+        return found
+    best, ordered = given.argmax(axis=0), np.sort(given, axis=0)
+    # what floats before an edge has few neighbours, and must not lead from a surface to another
+    inside = cloud.surface_graph.sum(axis=1) > INSIDE * NEAREST
+    sure = inside & (ordered[-1] - ordered[-2] > SURE)
+    votes = cloud.surface_graph @ (sure & (best == np.arange(len(given))[:, None])).T
+    sure &= votes.argmax(axis=1) == best
+    if not sure.any():
+        return found
+    leading = inside & ~_at_hinges(cloud.points, motions)
+    way = diags_array(leading.astype(float)) @ (cloud.surface_graph > CONNECTED)
+    distance, _, nearest = dijkstra(
+        way, indices=np.flatnonzero(sure), return_predecessors=True, min_only=True, unweighted=True
+    )
+    reached = every[np.isfinite(distance)]
+    label = best[nearest[reached]]
+    kept = given[label, reached] > given[0, reached] - DOUBT
+    reached, label = reached[kept], label[kept]
+    found[0, reached] = 0.0
+    found[label, reached] = OF_SURFACE
+    return found
+
+
+def _at_hinges(
+    points: Float[np.ndarray, "n 3"], motions: Sequence[Sequence[Pose]]
+) -> Bool[np.ndarray, " n"]:
+    """Which points are near an axis that some label turns about."""
+    found = np.zeros(len(points), bool)
+    for motion in motions:
+        pose = max(motion, key=lambda one: one.chord)
+        if pose.chord > LEAST_TURN:
+            found |= np.linalg.norm(pose.at(points) - points, axis=1) < HINGE * pose.chord
+    return found
+
+
 def smoothed(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels points"]:
     """Probabilities of the labels, with neighbours on one surface likely of one part.
 
     Mean field of a Potts model on the graph of nearest neighbours (Krahenbuhl and Koltun 2011).
     """
-    neighbours = cloud.neighbours
-    alike = np.sum(cloud.normals[:, None] * cloud.normals[neighbours], axis=2)
-    apart = cloud.points[neighbours] - cloud.points[:, None]
-    step = np.sum(cloud.normals[:, None] * apart, axis=2) / (3e-3 + 2.0 * cloud.deviation[:, None])
-    weight = SMOOTH * np.clip(alike, 0.0, 1.0) ** 4 * np.exp(-0.5 * step**2)
-    count, each = neighbours.shape
-    start = each * np.arange(count + 1)
-    graph = csr_array((weight.ravel(), neighbours.ravel(), start), shape=(count, count))
     chance = _softmax(given)
     for _ in range(ROUNDS):
-        chance = _softmax(given + (graph @ chance.T).T)
+        chance = _softmax(given + SMOOTH * (cloud.surface_graph @ chance.T).T)
     return chance
 
 

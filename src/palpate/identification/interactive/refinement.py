@@ -96,13 +96,16 @@ def refine(
 ) -> Estimate:
     """The joint that explains what was seen of its part, from a first guess.
 
-    Looks in which a part was not seen have None, and keep their position. The position in the first
-    look with the part stays as it is: it says where the joint's zero is.
+    Looks in which a part was not seen have None, and keep their position unless a hand began or
+    ended there. The position in the first look with the part stays as it is: it says where the
+    joint's zero is.
     """
     pairs = _pairs(positions, seen)
-    used = sorted({look for pair in pairs for look in pair})
+    shown = sorted({look for pair in pairs for look in pair})
     random = np.random.default_rng(0)
-    chosen = {look: _subset(seen[look], random) for look in used}
+    chosen = {look: _subset(seen[look], random) for look in shown}
+    handled = {before + gone for before, _ in ways for gone in (0, 1)}
+    used = [*shown, *sorted(handled - set(shown))]
     column = {look: AXES + number for number, look in enumerate(used[1:])}
     middle = np.mean([way.mean(axis=0) for _, way in ways], axis=0) if ways else screw.point
     screw, positions = screw.near(middle), np.array(positions, float)

@@ -36,6 +36,11 @@ class Pose(NamedTuple):
         """Directions, moved."""
         return vectors @ self.rotation.T
 
+    @property
+    def chord(self) -> float:
+        """How far (m) what is 1 m from the axis goes, straight: twice the sine of half its turn."""
+        return float(np.linalg.norm(self.rotation - np.eye(3))) / math.sqrt(2.0)
+
 
 NOWHERE = Pose(np.eye(3), np.zeros(3))
 

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from palpate.identification.interactive.labels import (
     ON,
-    STANDS,
     evidence,
+    prior,
     scores,
     smoothed,
     telling,
@@ -22,6 +22,7 @@ from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, scre
 from palpate.perception.clouds import Cloud
 
 FEWEST = 40  # points of a part in a look
+UNKNOWN = -1.0  # of evidence of each look: of a point that is of no part that is known
 UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
@@ -187,29 +188,43 @@ class PartTree:
 
         With a candidate, whose label is the last, by the other of its two looks alone.
         """
-        places = np.array([one.positions for one in self.parts]).reshape(-1, len(self.looks))
-        others = telling(places, look) if candidate is None else [candidate.between(look)[0]]
-        motions = [[NOWHERE] * len(others)]
-        motions += [
-            [self.motion(part, look, other) for other in others] for part in range(len(self.parts))
-        ]
-        if candidate is not None:
-            motions.append([candidate.between(look)[1]])
+        others, motions = self._telling(look, candidate)
         return scores(self.looks[look], [self.looks[other] for other in others], motions)
 
     def probabilities(
         self, look: int, candidate: Candidate | None = None
     ) -> Float[np.ndarray, "labels points"]:
-        """The same, as probabilities, with neighbours on one surface likely of one part."""
+        """The same, as probabilities, with neighbours on one surface likely of one part.
+
+        The first is of no part that is known: what has moved by itself, or with a part that is not
+        known yet, fits no label.
+        """
         if len(self.looks) < 2:
             return np.ones((1, len(self.looks[look].points)))
-        return smoothed(self.looks[look], self.scores(look, candidate))
+        others, motions = self._telling(look, candidate)
+        cloud = self.looks[look]
+        given = scores(cloud, [self.looks[other] for other in others], motions)
+        given += prior(cloud, given, motions)
+        given[0] = np.maximum(given[0], UNKNOWN * len(others))
+        return smoothed(cloud, given)
+
+    def _telling(
+        self, look: int, candidate: Candidate | None
+    ) -> tuple[list[int], list[list[Pose]]]:
+        """The other looks that labels of a look are told from, and each label's motion to them."""
+        parts = range(len(self.parts))
+        if candidate is not None:
+            other, motion = candidate.between(look)
+            known = [[self.motion(part, look, other)] for part in parts]
+            return [other], [[NOWHERE], *known, [motion]]
+        places = np.array([one.positions for one in self.parts]).reshape(-1, len(self.looks))
+        others = telling(places, look)
+        motions = [[self.motion(part, look, other) for other in others] for part in parts]
+        return others, [[NOWHERE] * len(others), *motions]
 
     def unexplained(self, candidate: Candidate, look: int) -> Bool[np.ndarray, " points"]:
         """Which points of a look neither stand still nor are of a part, by the other look."""
-        found = self.scores(look, candidate)
-        found[0] -= STANDS
-        return found.max(axis=0) < UNEXPLAINED
+        return self.scores(look, candidate).max(axis=0) < UNEXPLAINED
 
     def much_is_left(self, candidate: Candidate, look: int, own: int) -> bool:
         """Whether more of a look has moved than parts and a candidate of `own` points explain."""

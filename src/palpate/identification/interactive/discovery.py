@@ -29,6 +29,7 @@ TRIED = 3  # of those joints, the best, which are refined
 SEEN = 0.2  # of evidence, for each point: less is no difference
 CARRIED = 0.15  # rad or m that a part has to go to show what it carries
 STILLER = 0.05  # rad or m
+TOLD = 6  # looks in which a new part is sought on a carrier
 TOUCHES = 0.03  # m: what is so near a part may carry it
 
 
@@ -172,7 +173,8 @@ def _insert(
     support = support_of((tree.looks[before], tree.looks[after]), new.masks, poses)
     estimate = dataclasses.replace(new.estimate, screw=screw)
     seen = {before: new.masks[0], after: new.masks[1]}
-    tree.parts.append(Part(parent, estimate, positions, seen, [(before, way)], support))
+    guessed = new.carrier >= 0
+    tree.parts.append(Part(parent, estimate, positions, seen, [(before, way)], support, guessed))
     for look in range(before):  # a pull that told nothing may have moved it
         tree.find(number, look)
     for look in range(after + 1, len(tree.looks)):
@@ -211,24 +213,28 @@ def _carries(
     return gain >= 0.0
 
 
-def reparent(tree: PartTree, carrier: int, look: int) -> None:
+def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
     """Hang on a part what it carries, which has gone along since a look.
 
     So it is if the part was seen where the carrier has taken it, and not where it was. Where both
     explain what was seen, as of doors above each other on one hinge, it has to stand on the carrier
-    and to have moved less by itself.
+    and to have moved less by itself. A `new` part is sought in all looks.
     """
     places = tree.parts[carrier].positions
     for number, part in enumerate(tree.parts):
         if number in (carrier, *tree.carriers(carrier)) or part.parent == carrier:
             continue
+        if new not in (-1, number):
+            continue
         first = part.ways[0][0]
+        shown = {other for other, chosen in part.seen.items() if len(chosen) >= FEWEST}
+        shown.add(look + 1)  # it may be taken for the carrier there
         gone = [
             other
-            for other, chosen in part.seen.items()
-            if (len(chosen) >= FEWEST or other == look + 1)  # it may be taken for the carrier there
-            and abs(places[other] - places[first]) > CARRIED
+            for other in (range(len(tree.looks)) if number == new else sorted(shown))
+            if abs(places[other] - places[first]) > CARRIED
         ]
+        gone = gone[:: max(1, len(gone) // TOLD)]
         if not gone:
             continue
         onto = tree.pose(carrier, first).inverse @ tree.pose(part.parent, first)

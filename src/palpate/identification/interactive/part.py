@@ -29,6 +29,7 @@ class Part:
     seen: dict[int, np.ndarray]  # by look: which of its points
     ways: list[tuple[int, np.ndarray]]  # a look before, and a hand's way in the world after it
     support: Support  # points and normals, as described
+    provisional: bool = False  # found by the ends of one way, on a carrier that moved as well
 
     @property
     def screw(self) -> Screw:

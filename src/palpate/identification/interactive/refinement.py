@@ -97,8 +97,8 @@ def refine(
     """The joint that explains what was seen of its part, from a first guess.
 
     Looks in which a part was not seen have None, and keep their position unless a hand began or
-    ended there. The position in the first look with the part stays as it is: it says where the
-    joint's zero is.
+    ended there. The position in the look before the first way stays as it is, or if the part was
+    not seen there, in the first look with it: it says where the joint's zero is.
     """
     pairs = _pairs(positions, seen)
     shown = sorted({look for pair in pairs for look in pair})
@@ -106,6 +106,9 @@ def refine(
     chosen = {look: _subset(seen[look], random) for look in shown}
     handled = {before + gone for before, _ in ways for gone in (0, 1)}
     used = [*shown, *sorted(handled - set(shown))]
+    if ways and ways[0][0] in shown:
+        used.remove(ways[0][0])
+        used.insert(0, ways[0][0])
     column = {look: AXES + number for number, look in enumerate(used[1:])}
     middle = np.mean([way.mean(axis=0) for _, way in ways], axis=0) if ways else screw.point
     screw, positions = screw.near(middle), np.array(positions, float)

@@ -5,6 +5,8 @@ that is known, or by a part that is new, which is split off what stood still or 
 carries it.
 """
 
+import numpy as np
+
 from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
 from palpate.identification.interactive.explanation import FURTHER, may_have_moved, moved_part
 from palpate.identification.interactive.handling import Handling
@@ -34,6 +36,8 @@ class Twin(PartTree):
         self._keep(new, before, after)
         self._hang(before, after)
         if new:
+            self._doubt()
+            self._hang_new()
             self._explain_earlier()
             self._hang(before, after)
         self.refit(self.held[-1][0] if handling.moved else -1)
@@ -54,6 +58,23 @@ class Twin(PartTree):
         for number, one in enumerate(self.parts):
             if abs(one.positions[after] - one.positions[before]) > CARRIED:
                 reparent(self, number, before)
+
+    def _hang_new(self) -> None:
+        """Hang the last part on what has carried it in earlier looks."""
+        for number, one in enumerate(self.parts[:-1]):
+            steps = np.abs(np.diff(one.positions))
+            if len(steps) and steps.max() > CARRIED:
+                reparent(self, number, int(steps.argmax()), new=len(self.parts) - 1)
+
+    def _doubt(self) -> None:
+        """Take out parts that are provisional, but the last: what is known now may explain them."""
+        for number in reversed(range(len(self.parts) - 1)):
+            part = self.parts[number]
+            if part.provisional and len(part.ways) == 1:
+                held = [index for index, (one, _) in enumerate(self.held) if one == number]
+                self.remove(number, part.parent)
+                for index in held:
+                    self.held[index] = -1, self.held[index][1]
 
     def _keep(self, new: bool, before: int, after: int) -> None:
         """Say anew what two looks show; a new part that explains nothing vanishes (III-B d)."""

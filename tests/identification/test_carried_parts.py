@@ -141,7 +141,7 @@ def test_a_flap_that_is_known_is_hung_on_the_door_that_takes_it_along(room) -> N
     assert room.error(twin, door, 0)[0] < 4.0
 
 
-def test_a_flap_that_was_guessed_from_two_ends_is_doubted_once_more_is_known(room) -> None:
+def test_a_flap_that_was_guessed_from_two_ends_is_dropped_once_more_is_known(room) -> None:
     twin = Twin()
     room.at(0.0, 0.0)
     twin.look(room.look())
@@ -150,13 +150,13 @@ def test_a_flap_that_was_guessed_from_two_ends_is_doubted_once_more_is_known(roo
     guess = twin.parts[1]
     assert guess.provisional
     twin.parts.append(dataclasses.replace(guess, provisional=False))
-    twin._doubt()
+    twin._drop_guesses()
     assert [part.provisional for part in twin.parts] == [False, False]
     assert [part for part, _ in twin.held] == [0, -1]
     twin.parts[1].ways.append((2, twin.parts[1].ways[0][1]))
     twin.parts[1].provisional = True
     twin.parts.append(dataclasses.replace(guess, provisional=False))
-    twin._doubt()  # two ways are no guess
+    twin._drop_guesses()  # two ways are no guess
     assert len(twin.parts) == 3
 
 

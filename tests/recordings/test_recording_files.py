@@ -64,6 +64,14 @@ def refused(path, sentence, **options):
 # --- our own files ----------------------------------------------------------------------------
 
 
+def test_the_folder_of_a_run_stands_for_its_recording(tmp_path):
+    write_recording(tmp_path / "recording.npz", sample())
+    (tmp_path / "result.json").write_text("{}")
+    assert [trial.name for trial in read_recording(tmp_path).trials] == [
+        trial.name for trial in sample().trials
+    ]
+
+
 def test_a_written_recording_comes_back_exactly(tmp_path):
     before = sample()
     write_recording(tmp_path / "r.npz", before)

@@ -14,12 +14,11 @@ from palpate.models.python_files import file_of
 from palpate.report import build_report
 from palpate.report.evidence import EVIDENCE, RENDERINGS
 from palpate.runs import Figure, Result, Run
-from palpate.runs.run import CONFIGURATION, ENVIRONMENT, RESULT
+from palpate.runs.run import CONFIGURATION, ENVIRONMENT, RECORDING, RESULT
 from palpate.runs.storage import check_writable, plain, read_json, write_bytes
 
 RUNS = Path("runs")
-RECORDING, MODEL, PLAN, POLICY, REPORT, TABLE = (
-    "recording.npz",
+MODEL, PLAN, POLICY, REPORT, TABLE = (
     "model.json",
     "plan.json",
     "policy.safetensors",

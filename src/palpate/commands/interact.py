@@ -62,7 +62,9 @@ def run(options: Interact) -> Path:
             twin.relabel(0)  # of parts that were found later, too
             show_twin(run.path / PICTURE, twin, options.name)
             film_twin(run.path / FILM, twin, description)
-            folders.finish(run, figures_of([score(twin, world, real)]), {folders.SUMMARY: lines})
+            figures = figures_of([score(twin, world, real)])
+            known = [one for one in figures if one.value is not None]  # no hinge has no place
+            folders.finish(run, known, {folders.SUMMARY: lines})
         print("\n".join(read_json(run.path / RESULT)["settings"][folders.SUMMARY]))
         folders.hand_over(options, run, f"Twin: {options.name}")
         print(f"twin: {run.path / TWIN}")
@@ -108,8 +110,8 @@ def resistances(twin: Twin, known: Dynamics) -> list[str]:
         what = "inertia" if kind == "revolute" else "mass"
         found.append(
             f"part {part + 1}: {what} {inertia:.3g} {of_mass} to "
-            f"{100.0 * share / own.mass_share:.0f} %, friction {own.friction:.2g} +- "
-            f"{friction:.1g} {of_force}, damping {own.damping:.2g} +- {damping:.1g} "
+            f"{100.0 * share / own.mass_share:.0f} %, friction {own.friction:.3g} +- "
+            f"{friction:.3g} {of_force}, damping {own.damping:.3g} +- {damping:.3g} "
             f"{of_damping} (90 %)"
         )
     return found

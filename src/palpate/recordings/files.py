@@ -23,6 +23,7 @@ from palpate.recordings.rosbag.bag import read_bag
 from palpate.recordings.rosbag.files import is_bag
 from palpate.recordings.rosbag.numbers import read_numbers
 from palpate.recordings.tables import METRES, Z_UP, MarkerTable, recording_of
+from palpate.runs.run import RECORDING
 from palpate.runs.storage import DamagedFileError
 
 __all__ = ["read_recording", "write_recording"]
@@ -44,7 +45,8 @@ def read_recording(
     was seen are padding. CSV is described at `csv.read_csv`. Both become one observation channel
     "markers" in each trial. Logs are MCAP files, rosbag2 folders or databases and ROS 1 bags,
     described at `rosbag.bag.read_bag`; `topics` names which of their topics to take, and besides
-    "markers" they may give a driven "gripper" and a "command".
+    "markers" they may give a driven "gripper" and a "command". The folder of a run that recorded
+    (`palpate record`) stands for its recording.
 
     A plain CSV that has `columns` by name, and no markers, becomes a channel for each, as
     `columns.read_channels` describes; in a log they are the places of numbers, as
@@ -57,6 +59,8 @@ def read_recording(
     Raises `PalpateError` for anything that is missing, damaged, too large or implausible.
     """
     path = Path(path)
+    if (path / RECORDING).is_file():
+        path /= RECORDING
     for option, value, known in (("unit", unit, METRES), ("up", up, Z_UP)):
         if value is not None and value not in known:
             raise PalpateError(f"{option} has to be one of {', '.join(known)}, not '{value}'")

@@ -4,7 +4,8 @@ from collections.abc import Iterable
 
 from palpate.runs.result import Figure
 
-# Of each part of a name ("in_model.success"), without the unit that it ends in ("time_to_1pct_s").
+# Of each part of a name ("in_model.success"), without the unit that it ends in ("time_to_1pct_s")
+# unless only that tells two apart.
 NAMES = {
     "l1": "mean error",
     "l1_fitted_trials": "mean error on the trials it was fitted to",
@@ -34,6 +35,14 @@ NAMES = {
     "turnaround_p99": "slowest answers to a state (99th percentile)",
     "brakes": "times it braked",
     "onnx_difference": "difference from the policy",
+    "recall": "parts found (recall)",
+    "precision": "of what was found, parts that are there (precision)",
+    "type_accuracy": "joint type right",
+    "axis_deg": "direction of the axis",
+    "axis_cm": "place of hinges",
+    "miou": "points of a part (IoU)",
+    "tree_accuracy": "tree right",
+    "axis_coverage_90": "coverage of the axis by 90 % intervals",
 }
 PLACES = {"in_model": "in the model", "in_world": "in a simulated world"}
 _SHARES = (
@@ -47,7 +56,10 @@ _SHARES = (
 
 def name_in_words(figure: Figure) -> str:
     """Its name as a person would say it: "time to 1 % energy, held still"."""
-    parts = [part.removesuffix(f"_{figure.unit}") for part in figure.name.split(".")]
+    parts = [
+        part if part in NAMES else part.removesuffix(f"_{figure.unit}")
+        for part in figure.name.split(".")
+    ]
     known = next((part for part in parts if part in NAMES), None)
     if known is None:
         known = next(part for part in (*parts, parts[0]) if part not in PLACES)

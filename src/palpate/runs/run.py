@@ -48,6 +48,7 @@ CONFIGURATION = "configuration.json"
 ENVIRONMENT = "environment.json"
 METRICS = "metrics.jsonl"
 RESULT = "result.json"
+RECORDING = "recording.npz"
 CHECKPOINTS = "checkpoints"
 _LOCK = ".lock"
 _BEGUN = {CONFIGURATION, ENVIRONMENT}

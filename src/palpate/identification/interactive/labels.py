@@ -121,7 +121,7 @@ def prior(cloud: Cloud, given: Scores, motions: Sequence[Sequence[Pose]]) -> Sco
     that is most: all but the end that it has left is seen as well where it was. Over a hinge a
     surface may go on as one of another part, as a door does that is open by a right angle.
     """
-    found, every = np.zeros_like(given), np.arange(given.shape[1])
+    found = np.zeros_like(given)
     found[0] = STANDS
     if len(given) < 2:
         return found
@@ -138,7 +138,7 @@ def prior(cloud: Cloud, given: Scores, motions: Sequence[Sequence[Pose]]) -> Sco
     distance, _, nearest = dijkstra(
         way, indices=np.flatnonzero(sure), return_predecessors=True, min_only=True, unweighted=True
     )
-    reached = every[np.isfinite(distance)]
+    reached = np.flatnonzero(np.isfinite(distance))
     label = best[nearest[reached]]
     kept = given[label, reached] > given[0, reached] - DOUBT
     reached, label = reached[kept], label[kept]

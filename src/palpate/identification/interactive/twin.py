@@ -36,7 +36,7 @@ class Twin(PartTree):
         self._keep(new, before, after)
         self._hang(before, after)
         if new:
-            self._doubt()
+            self._drop_guesses()
             self._hang_new()
             self._explain_earlier()
             self._hang(before, after)
@@ -66,8 +66,8 @@ class Twin(PartTree):
             if len(steps) and steps.max() > CARRIED:
                 reparent(self, number, int(steps.argmax()), new=len(self.parts) - 1)
 
-    def _doubt(self) -> None:
-        """Take out parts that are provisional, but the last: what is known now may explain them."""
+    def _drop_guesses(self) -> None:
+        """Take out guessed parts but the last, which may explain what they did."""
         for number in reversed(range(len(self.parts) - 1)):
             part = self.parts[number]
             if part.provisional and len(part.ways) == 1:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from palpate.errors import PalpateError, extra_module
 from palpate.recordings.alignment import MAX_BYTES
 from palpate.recordings.rosbag.decoding import Decode, ros_decoder
+from palpate.runs.run import RECORDING
 from palpate.runs.storage import DamagedFileError, parse_json
 
 CHUNK = 2**30  # bytes of one record or one unpacked chunk; writers make them a thousandth of this
@@ -65,7 +66,7 @@ class Bag:
 
 def is_bag(path: Path) -> bool:
     """Whether `path` is called like a log, or is a folder, such as `ros2 bag record` writes."""
-    return path.suffix.lower() in _FORMATS or path.is_dir()
+    return path.suffix.lower() in _FORMATS or (path.is_dir() and not (path / RECORDING).exists())
 
 
 def open_bag(path: Path) -> Bag:

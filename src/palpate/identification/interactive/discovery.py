@@ -29,7 +29,7 @@ TRIED = 3  # of those joints, the best, which are refined
 SEEN = 0.2  # of evidence, for each point: less is no difference
 CARRIED = 0.15  # rad or m that a part has to go to show what it carries
 STILLER = 0.05  # rad or m
-TOLD = 6  # looks in which a new part is sought on a carrier
+ENOUGH = 6  # looks that tell whether a part has gone along
 TOUCHES = 0.03  # m: what is so near a part may carry it
 
 
@@ -234,7 +234,7 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
             for other in (range(len(tree.looks)) if number == new else sorted(shown))
             if abs(places[other] - places[first]) > CARRIED
         ]
-        gone = gone[:: max(1, len(gone) // TOLD)]
+        gone = gone[:: max(1, len(gone) // ENOUGH)]
         if not gone:
             continue
         onto = tree.pose(carrier, first).inverse @ tree.pose(part.parent, first)

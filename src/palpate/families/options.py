@@ -154,8 +154,8 @@ class Identify(Options, ABC):
     recordings: Positional[
         Annotated[tuple[Path, ...], arg(metavar="RECORDING ...", help_behavior_hint="")]
     ]
-    """What to fit: .npz of palpate, .npz with `positions`, .csv of a motion-capture system, or a
-    robot's log: .mcap, .db3, .bag, or the folder of a rosbag2."""
+    """What to fit: .npz of palpate or the folder of `palpate record`, .npz with `positions`, .csv
+    of a motion-capture system, or a robot's log: .mcap, .db3, .bag, or the folder of a rosbag2."""
     rate: Number = None
     """Hz, for files that carry no time."""
     validate: Annotated[

@@ -41,6 +41,23 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
+# The flap beside the door, on the wall.
+APART = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".02 1.3 1.1" pos=".15 0 1.1"/>
+    <geom type="box" size=".05 .05 1.1" pos="0 .5 1.1"/>
+    <body name="door" pos="0 .44 1.1">
+      <joint axis="0 0 1"/>
+      <geom type="box" size=".02 .43 1" pos="0 -.43 0"/>
+    </body>
+    <body name="flap" pos="0 -.85 1.29">
+      <joint axis="0 1 0"/>
+      <geom type="box" size=".02 .26 .28" pos="0 0 -.29"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
 ON_DOOR, ON_FLAP = np.array([-0.02, -0.4, 0.5]), np.array([-0.02, 0.0, 0.72])
 DOOR, FLAP = 1, 2
 
@@ -48,8 +65,8 @@ DOOR, FLAP = 1, 2
 class Room:
     """The door and its flap, seen by two cameras, with a hand that is on one of them."""
 
-    def __init__(self) -> None:
-        self.model = mujoco.MjModel.from_xml_string(SCENE)
+    def __init__(self, scene: str = SCENE) -> None:
+        self.model = mujoco.MjModel.from_xml_string(scene)
         self.data = mujoco.MjData(self.model)
         self.cameras = [
             Pinhole.looking_at((0.0, 0.0, 1.0), place, 320, 240, math.radians(58.0))
@@ -139,6 +156,20 @@ def test_a_flap_that_is_known_is_hung_on_the_door_that_takes_it_along(room) -> N
     assert twin.parts[1 - door].parent == door
     assert room.error(twin, 1 - door, 1)[0] < 4.0
     assert room.error(twin, door, 0)[0] < 4.0
+
+
+def test_a_part_that_has_not_gone_along_is_taken_off_what_it_hung_on() -> None:
+    room, twin = Room(APART), Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, FLAP, (0.0, 0.0), (0.0, 0.6))
+    room.pull(twin, DOOR, (0.0, 0.6), (-0.6, 0.6))
+    assert [part.parent for part in twin.parts] == [-1, -1]
+    twin.parts[0].parent = 1
+    room.pull(twin, DOOR, (-0.6, 0.6), (0.0, 0.6))
+    assert [part.parent for part in twin.parts] == [-1, -1]
+    assert room.error(twin, 0, 1)[0] < 4.0
+    assert twin.parts[0].positions[-1] == pytest.approx(twin.parts[0].positions[1], abs=0.05)
 
 
 def test_a_flap_that_was_guessed_from_two_ends_is_dropped_once_more_is_known(room) -> None:

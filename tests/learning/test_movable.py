@@ -49,7 +49,7 @@ def test_a_slide_goes_along_itself_alone():
 
 
 def test_a_pull_that_failed_at_one_edge_leaves_the_other():
-    belief = posterior(prior(0.5), FRONT, [Pull(RIGHT_EDGE, OUT, False, False, True)])
+    belief = posterior(prior(0.5), FRONT, [Pull(RIGHT_EDGE, OUT, False, 0.0, True)])
     assert chance(belief, LEFT_EDGE, OUT) > 2.0 * chance(belief, RIGHT_EDGE, OUT)
     assert belief.chances[0] > 0.5
     assert belief.chances.sum() == pytest.approx(1.0)
@@ -57,25 +57,47 @@ def test_a_pull_that_failed_at_one_edge_leaves_the_other():
 
 def test_what_withstood_a_pull_moves_only_under_a_stronger_one():
     """Given that it is a hinge, the same pull again is in vain, and twice the lever is not."""
-    middle = Pull(np.array([0.0, -0.12, 0.0]), OUT, False, False, True)
+    middle = Pull(np.array([0.0, -0.12, 0.0]), OUT, False, 0.0, True)
     belief = posterior(certain(1), FRONT, [middle])
     assert chance(belief, middle.point, OUT) == 0.0
-    assert chance(belief, LEFT_EDGE, OUT) > 0.9
+    assert chance(belief, LEFT_EDGE, OUT) > 0.8
     again = posterior(belief, FRONT, [middle])
     assert again.withstood == pytest.approx(belief.withstood)
     assert again.chances == pytest.approx(belief.chances)
 
 
 def test_what_gives_a_little_moves_rather_than_what_does_not():
-    pulls = [Pull(np.zeros(3), OUT, False, gave, True) for gave in (True, False)]
+    pulls = [Pull(np.zeros(3), OUT, False, travel, True) for travel in (0.004, 0.0)]
     gave, still = (posterior(prior(0.2), FRONT, [pull]).chances[0] for pull in pulls)
-    assert gave < 0.5 < 0.8 < still
+    assert gave < 0.6 < 0.8 < still
+
+
+def test_what_gives_a_little_and_withstands_every_pull_outwards_goes_back():
+    """A drawer at the soft stop of its open end, which was pulled at all of its edges."""
+    edges = LEFT_EDGE, RIGHT_EDGE, np.array([0.0, 0.0, 0.19]), np.array([0.0, 0.0, -0.19])
+    pulls = [Pull(edge, OUT, False, 0.004, True) for edge in edges]
+    belief = posterior(prior(0.8), FRONT, pulls)
+    assert belief.chances[0] < 0.1
+    assert chance(belief, np.zeros(3), IN) > 0.4
+    assert all(chance(belief, edge, OUT) < 0.1 for edge in edges)
 
 
 def test_what_stopped_early_rather_goes_back():
-    ended = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, False, True)])
-    further = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, False, False)])
+    ended = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, 0.2, True)])
+    further = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, 0.3, False)])
     assert ended.chances[0] < 0.2
     back = chance(ended, LEFT_EDGE, IN)
     assert back > chance(further, LEFT_EDGE, IN) > chance(ended, LEFT_EDGE, OUT)
     assert chance(further, LEFT_EDGE, OUT) > 0.6 > chance(ended, LEFT_EDGE, OUT)
+
+
+def test_what_stopped_at_once_is_held_rather_than_at_its_end():
+    """A lid that a latch held after a centimetre goes where the lever is longer."""
+    middle = np.array([0.0, 0.05, 0.0])
+    soon, late = (
+        posterior(prior(0.9), FRONT, [Pull(middle, OUT, True, travel, True)])
+        for travel in (0.01, 0.2)
+    )
+    assert chance(soon, LEFT_EDGE, OUT) > 3.0 * chance(late, LEFT_EDGE, OUT)
+    assert chance(soon, middle, IN) < chance(late, middle, IN)
+    assert chance(soon, middle, OUT) < 0.05  # it has withstood that

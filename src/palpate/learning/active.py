@@ -34,9 +34,8 @@ FEWEST = 10  # points of a part that a hand can be put to
 REACH = 0.3  # m that a hand goes
 UNKNOWN = 0.3  # of its reach that a hand is expected to take a part beyond where it was seen
 INSET = 0.12  # of a surface, from its edge to where a hand takes hold
-PLAY = 0.0015  # m: a hand that got so far has felt something give
 ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an end
-ASIDE = 0.7  # how much to the side of the normal a hand also pulls, which tries two joints at once
+ASIDE = 0.3  # how much to the side of the normal a hand also pulls, which tries two joints at once
 
 Choice = Callable[[Twin, np.random.Generator], Push]
 Points = Float[np.ndarray, "n 3"]
@@ -86,17 +85,22 @@ def _tries(
     before = guess(features_of(cloud, every))
     for surface, chance in zip(every, before, strict=True):
         on_part = surface.part >= 0
-        there = [one for one in twin.handled if _at(one, surface, cloud)]
+        # what moved a part that is known says nothing of a surface beside it
+        there = [
+            one
+            for one, (held, _) in zip(twin.handled, twin.held, strict=True)
+            if _at(one, surface, cloud) and not (one.moved and (on_part or held >= 0))
+        ]
         pulls = [
             movable.Pull(
                 one.push.point,
                 one.push.direction,
                 moved=one.moved,
-                gave=one.travel > PLAY,
+                travel=one.travel,
                 ended=one.travel < ENDED * one.push.travel,
             )
             for one in there
-            if one.held and not (one.moved and on_part)
+            if one.held
         ]
         belief = movable.posterior(movable.prior(float(chance)), surface, pulls)
         points, directions = _grips(cloud, surface)

@@ -18,14 +18,20 @@ from palpate.perception.surfaces import Surface
 HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
 # Share of what moves that goes both ways, only the way of the axis or only against it: along the
 # normal that is outwards, as what is closed goes.
+SENSES = 3
 SENSES_OUT, SENSES_SIDE = (0.45, 0.5, 0.05), (0.3, 0.35, 0.35)
-RESISTANCE = 0.05, 0.7  # of a hand's force at the best place: least and most that moves a part
+# Of a hand's force at the best place: least and most that moves a part. Its logarithm is uniform:
+# most parts go easily, and a lid may need nearly all of it.
+RESISTANCE = 0.03, 1.0
 HEAVY = 0.03  # probability that none moves it
-AT_END = 0.6  # probability that what stopped early is at its end, and not too hard to move on
+PLAYED = 0.0015  # m: a hand that got so far has felt something give
+CATCH = 0.03  # m: a part that stops so far from where it was is as likely held there, by a latch
+# or as it is too heavy, as it is at its end, which may be anywhere
 STRAYED = 0.05  # probability that something else went with the hand
-# Probability that a hand feels a little play where a part is held by a latch or by friction, and
-# where all stands still.
+# Probability that a hand feels a little play where a part is held by a latch, by friction or by a
+# soft stop at its end, and where all stands still.
 PLAY, PLAY_STILL = 0.2, 0.01
+FELT = 0.05  # share of a hand's force along a joint that makes it play
 
 Chances = Float[np.ndarray, " hypotheses"]
 
@@ -39,13 +45,13 @@ class Belief(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """Where a hand pulled and which way, and what came of it: whether something moved, or gave a
-    little."""
+    """Where a hand pulled and which way, and what came of it: how far it got, and whether something
+    moved."""
 
     point: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
     moved: bool
-    gave: bool
+    travel: float  # m
     ended: bool  # before the hand had gone as far as it would
 
 
@@ -84,7 +90,7 @@ def _goes(
     least, most = RESISTANCE
 
     def below(share: np.ndarray) -> np.ndarray:
-        return (1.0 - HEAVY) * np.clip((share - least) / (most - least), 0.0, 1.0)
+        return (1.0 - HEAVY) * np.log(np.clip(share, least, most) / least) / np.log(most / least)
 
     known = below(withstood)
     return np.maximum(below(shares) - known, 0.0) / (1.0 - known)
@@ -111,13 +117,16 @@ def posterior(belief: Belief, surface: Surface, pulls: Sequence[Pull]) -> Belief
             goes[0] = STRAYED
             chances = chances * goes
         else:
-            play = np.where(shares > RESISTANCE[0], PLAY, PLAY_STILL)
-            chances = chances * (1.0 - goes) * (play if pull.gave else 1.0 - play)
+            along = np.repeat(np.abs(_forces(surface, point, direction)[0]), SENSES)
+            play = np.where(np.concatenate([[0.0], along]) > FELT, PLAY, PLAY_STILL)
+            chances = chances * (1.0 - goes) * (play if pull.travel > PLAYED else 1.0 - play)
+        if pull.ended or not pull.moved:
             withstood = np.maximum(withstood, shares)
         if pull.moved and pull.ended:
-            joints = chances[1:].reshape(-1, 3).sum(axis=1)
+            at_end = pull.travel / (pull.travel + CATCH)
+            joints = chances[1:].reshape(-1, SENSES).sum(axis=1)
             ahead = _forces(surface, point, direction)[0] > 0.0
             back = np.stack([0.0 * joints, joints * ~ahead, joints * ahead], axis=1)
-            chances[1:] = AT_END * back.ravel() + (1.0 - AT_END) * chances[1:]
+            chances[1:] = at_end * back.ravel() + (1.0 - at_end) * chances[1:]
         chances = chances / chances.sum()
     return Belief(chances, withstood)

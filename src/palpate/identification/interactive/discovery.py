@@ -26,6 +26,7 @@ STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see 
 AROUND = 0.3  # m from a hand to the points by which a joint on a carrier is sought
 TURNS, ARMS = 12, (0.0, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7)  # directions, and m
 TRIED = 3  # of those joints, the best, which are refined
+ROUNDS = 4  # of a joint and of what has moved with it, each from the other
 SEEN = 0.2  # of evidence, for each point: less is no difference
 CARRIED = 0.15  # rad or m that a part has to go to show what it carries
 STILLER = 0.05  # rad or m
@@ -110,7 +111,7 @@ def _best(
         gone = float(screw.position_of(start, way)[-3:].mean())
         estimate = Estimate(screw, np.array([0.0, gone]), np.eye(4), 0.0, 0.0)
         masks: list[np.ndarray] = []
-        for _ in range(2):
+        for _ in range(ROUNDS):
             candidate = _candidate(estimate, back, before, after)
             masks = [
                 np.flatnonzero(tree.probabilities(look, candidate).argmax(0) == len(tree.parts) + 1)
@@ -214,7 +215,7 @@ def _carries(
 
 
 def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
-    """Hang on a part what it carries, which has gone along since a look.
+    """Hang on a part what it carries, which has gone along since a look; take off what has not.
 
     So it is if the part was seen where the carrier has taken it, and not where it was. Where both
     explain what was seen, as of doors above each other on one hinge, it has to stand on the carrier
@@ -222,9 +223,7 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
     """
     places = tree.parts[carrier].positions
     for number, part in enumerate(tree.parts):
-        if number in (carrier, *tree.carriers(carrier)) or part.parent == carrier:
-            continue
-        if new not in (-1, number):
+        if number in (carrier, *tree.carriers(carrier)) or new not in (-1, number):
             continue
         first = part.ways[0][0]
         shown = {other for other, chosen in part.seen.items() if len(chosen) >= FEWEST}
@@ -237,25 +236,34 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
         gone = gone[:: max(1, len(gone) // ENOUGH)]
         if not gone:
             continue
-        onto = tree.pose(carrier, first).inverse @ tree.pose(part.parent, first)
-        hung = dataclasses.replace(
-            part,
-            parent=carrier,
-            positions=list(part.positions),
-            estimate=dataclasses.replace(part.estimate, screw=part.screw.moved(onto)),
-            support=(onto.at(part.support[0]), onto.turned(part.support[1])),
+        carried = part.parent == carrier
+        now = dataclasses.replace(part, positions=list(part.positions))
+        other = _hung(tree, part, tree.parts[carrier].parent if carried else carrier, first)
+        before = _seen(tree, number, now, gone)  # as free to be elsewhere as on the carrier
+        gain = _seen(tree, number, other, gone) - before
+        beside = (
+            not carried
+            and _travel(other, look) + STILLER < _travel(part, look)
+            and _share_beside(tree, number, carrier, look) > WITHIN
         )
-        free = dataclasses.replace(part, positions=list(part.positions))
-        before = _seen(tree, number, free, gone)  # as free to be elsewhere as on the carrier
-        gain = _seen(tree, number, hung, gone) - before
-        stiller = _travel(hung, look) + STILLER < _travel(part, look)
-        beside = stiller and _share_beside(tree, number, carrier, look) > WITHIN
         if gain > SEEN or (gain > -SEEN and beside):
-            hung.settle(tree.estimate(hung))
-            for other in gone:
-                tree.relabel(other)
+            other.settle(tree.estimate(other))
+            for one in gone:
+                tree.relabel(one)
         else:
             tree.parts[number] = part
+
+
+def _hung(tree: PartTree, part: Part, parent: int, look: int) -> Part:
+    """A part as it is in a look, on another parent."""
+    onto = tree.pose(parent, look).inverse @ tree.pose(part.parent, look)
+    return dataclasses.replace(
+        part,
+        parent=parent,
+        positions=list(part.positions),
+        estimate=dataclasses.replace(part.estimate, screw=part.screw.moved(onto)),
+        support=(onto.at(part.support[0]), onto.turned(part.support[1])),
+    )
 
 
 def _seen(tree: PartTree, number: int, part: Part, looks: list[int]) -> float:

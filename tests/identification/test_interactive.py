@@ -11,10 +11,11 @@ from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.labels import evidence, smoothed
+from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.twin import Twin
-from palpate.learning.active import CHOICES
+from palpate.learning.active import CHOICES, FORCES, WORTHS
 from palpate.models.articulated.assembly import assembled
 from palpate.models.articulated.urdf import read_urdf, write_urdf
 from palpate.perception.clouds import Cloud, cloud_of
@@ -211,6 +212,21 @@ def test_every_choice_points_at_something_that_was_seen(handled):
         push = choose(twin, np.random.default_rng(0))
         assert np.linalg.norm(push.direction) == pytest.approx(1.0)
         assert twin.looks[-1].tree.query(push.point)[0] < 1e-9
+
+
+def test_a_long_way_is_worth_more_of_a_part_that_was_hardly_moved(handled):
+    twin = _copy(handled[1])
+    twin.observe(handled[2])
+    part, screw = twin.parts[0], twin.screw(0, 1)
+    look, way = part.ways[0]
+    little = dataclasses.replace(part, ways=[(look, way[:3])])
+    point = screw.point + 0.4 * screw.across[0]
+
+    def worth(part: Part, go: float) -> float:
+        return WORTHS["information"].of_repeat(part, screw, go, point, point[None], 0.1)
+
+    assert worth(little, 0.5) - worth(part, 0.5) == pytest.approx(FORCES)
+    assert worth(little, 0.1) == pytest.approx(worth(part, 0.1))
 
 
 def test_a_part_that_is_hardly_seen_while_a_hand_pulls_in_vain_is_kept(handled):

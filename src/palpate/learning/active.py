@@ -27,6 +27,8 @@ from palpate.perception.surface_features import features_of
 from palpate.perception.surfaces import STANDS_OFF, Surface, surfaces
 
 JOINT = 10.0  # nats that a joint is worth which was not known
+FORCES = 5.0  # nats that masses and resistance are worth which no long way has told
+LONG = 0.1  # m of a way that tells them
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
 BESIDE = 0.05  # m from a surface at which a hand was still on it
 BEHIND = 0.03  # m
@@ -205,10 +207,15 @@ def _information_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.
 def _information_of_repeat(
     part: Part, screw: Screw, go: float, point: np.ndarray, points: np.ndarray, share: float
 ) -> float:
-    """Nats by which a joint's four numbers become more certain from one more way of a hand."""
+    """Nats by which a joint's four numbers become more certain from one more way of a hand.
+
+    Of a part that has only been taken a little the forces are to be told as well.
+    """
+    way = _way(screw, point, go)
     before = np.linalg.inv(part.estimate.covariance + 1e-10 * np.eye(4))
-    more = way_information(screw, _way(screw, point, go))
-    return float(0.5 * (np.linalg.slogdet(before + more)[1] - np.linalg.slogdet(before)[1]))
+    more = way_information(screw, way)
+    gain = float(0.5 * (np.linalg.slogdet(before + more)[1] - np.linalg.slogdet(before)[1]))
+    return gain + FORCES * (part.longest_way < LONG < math.dist(way[0], way[-1]))
 
 
 def _loss_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray:

@@ -11,11 +11,11 @@ from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.labels import evidence, smoothed
-from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.twin import Twin
-from palpate.learning.active import CHOICES, FORCES, WORTHS
+from palpate.learning.active import CHOICES, FORCES, WORTHS, Repeat, _tries
+from palpate.learning.movable_guess import MovableGuess, load_guess
 from palpate.models.articulated.assembly import assembled
 from palpate.models.articulated.urdf import read_urdf, write_urdf
 from palpate.perception.clouds import Cloud, cloud_of
@@ -24,6 +24,7 @@ from palpate.trials.appliance.interaction import interact
 from palpate.trials.appliance.score import difference, figures_of, score
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
+INFORMATION = WORTHS["information"]
 QUIET = 3  # the seed of a microwave with a door and a drawer
 
 
@@ -214,19 +215,44 @@ def test_every_choice_points_at_something_that_was_seen(handled):
         assert twin.looks[-1].tree.query(push.point)[0] < 1e-9
 
 
-def test_a_long_way_is_worth_more_of_a_part_that_was_hardly_moved(handled):
+def test_a_long_way_tells_of_forces_and_less_each_time(handled):
     twin = _copy(handled[1])
     twin.observe(handled[2])
     part, screw = twin.parts[0], twin.screw(0, 1)
-    look, way = part.ways[0]
-    little = dataclasses.replace(part, ways=[(look, way[:3])])
     point = screw.point + 0.4 * screw.across[0]
 
-    def worth(part: Part, go: float) -> float:
-        return WORTHS["information"].of_repeat(part, screw, go, point, point[None], 0.1)
+    def worth(gone: float, felt: int) -> float:
+        pull = Repeat(part, screw, gone, point, felt, point[None], 0.1)
+        return INFORMATION.of_repeat(pull)
 
-    assert worth(little, 0.5) - worth(part, 0.5) == pytest.approx(FORCES)
-    assert worth(little, 0.1) == pytest.approx(worth(part, 0.1))
+    assert worth(0.5, 0) - worth(0.5, 1) == pytest.approx(0.75 * FORCES)
+    assert worth(0.5, 1) > worth(0.5, 2)
+    assert worth(0.1, 0) == pytest.approx(worth(0.1, 1))  # too short
+
+
+class Even(MovableGuess):
+    """Says of every surface that it rather moves."""
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        return np.full(len(features), 0.6)
+
+
+def test_a_guess_that_was_wrong_is_trusted_less_beside_it(handled):
+    twin, known = _copy(handled[1]), load_guess()
+    guess = Even(known.mean, known.deviation, known.network)
+
+    def values() -> list[float]:
+        random, look = np.random.default_rng(0), len(twin.looks) - 1
+        return sorted(value for value, _ in _tries(twin, look, random, guess, INFORMATION))
+
+    before = values()
+    cloud, times = twin.looks[-1], np.arange(5.0)
+    place = cloud.points[np.argmax(cloud.points[:, 2])]
+    still = place + np.zeros((5, 3))
+    twin.observe(Handling(Push(place, np.eye(3)[2]), cloud, cloud, times, still, 0.0 * still))
+    after = values()
+    assert len(after) == len(before) > 2
+    assert after[-1] < 0.95 * before[-1]  # that of a surface which nobody has tried
 
 
 def test_a_part_that_is_hardly_seen_while_a_hand_pulls_in_vain_is_kept(handled):

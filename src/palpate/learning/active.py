@@ -27,7 +27,7 @@ from palpate.perception.surface_features import features_of
 from palpate.perception.surfaces import STANDS_OFF, Surface, surfaces
 
 JOINT = 10.0  # nats that a joint is worth which was not known
-FORCES = 5.0  # nats that masses and resistance are worth which no long way has told
+FORCES = 4.0  # nats that are worth masses and what resists one way, where no long way went there
 LONG = 0.1  # m of a way that tells them
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
 BESIDE = 0.05  # m from a surface at which a hand was still on it
@@ -43,17 +43,39 @@ Choice = Callable[[Twin, np.random.Generator], Push]
 Points = Float[np.ndarray, "n 3"]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Repeat:
+    """A pull that takes a part by its joint, as it is now, with a hand that begins at `point`.
+
+    `felt` long ways of hands went the same way before. `points` are some of the part's, and `share`
+    is its own of the cloud.
+    """
+
+    part: Part
+    screw: Screw
+    gone: float  # rad or m
+    point: Float[np.ndarray, "3"]
+    felt: int
+    points: Points
+    share: float
+
+    @property
+    def way(self) -> Float[np.ndarray, "25 3"]:
+        """Of the hand, m."""
+        gone = np.linspace(0.0, self.gone, 25)
+        return np.array([self.screw.pose(one).at(self.point[None])[0] for one in gone])
+
+
 @dataclasses.dataclass(frozen=True)
 class Worth:
     """What a pull is expected to be worth.
 
-    `of_try` is that of pulls at a surface of a cloud which move it with these probabilities;
-    `of_repeat` that of taking a part by its joint, as it is now, so far (rad or m) with a hand that
-    begins at a point; of the part some points are given, and its share of the cloud.
+    `of_try` is that of pulls at a surface of a cloud which move it with these probabilities, and
+    `of_repeat` that of taking a part that is known.
     """
 
     of_try: Callable[[Float[np.ndarray, " n"], Surface, Cloud], Float[np.ndarray, " n"]]
-    of_repeat: Callable[[Part, Screw, float, Float[np.ndarray, "3"], Points, float], float]
+    of_repeat: Callable[[Repeat], float]
 
 
 def choose_best(
@@ -85,14 +107,11 @@ def _tries(
     cloud, found = twin.looks[look], []
     every = surfaces(cloud, twin.labels[look], random)
     before = guess(features_of(cloud, every))
-    for surface, chance in zip(every, before, strict=True):
-        on_part = surface.part >= 0
-        # what moved a part that is known says nothing of a surface beside it
-        there = [
-            one
-            for one, (held, _) in zip(twin.handled, twin.held, strict=True)
-            if _at(one, surface, cloud) and not (one.moved and (on_part or held >= 0))
-        ]
+    tried = [_handled_at(twin, surface, cloud) for surface in every]
+    # a guess that was wrong of this appliance is trusted less in the rest of it
+    failed = sum(float(chance) for chance, there in zip(before, tried, strict=True) if there)
+    trust = (1.0 + len(twin.parts)) / (1.0 + len(twin.parts) + failed)
+    for surface, chance, there in zip(every, trust * before, tried, strict=True):
         pulls = [
             movable.Pull(
                 one.push.point,
@@ -140,6 +159,16 @@ def _grips(
     return np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1))
 
 
+def _handled_at(twin: Twin, surface: Surface, cloud: Cloud) -> list[Handling]:
+    """What hands did at a surface, but for what moved a part that is known: it says nothing of a
+    surface beside it."""
+    return [
+        one
+        for one, (held, _) in zip(twin.handled, twin.held, strict=True)
+        if _at(one, surface, cloud) and not (one.moved and (surface.part >= 0 or held >= 0))
+    ]
+
+
 def _at(one: Handling, surface: Surface, cloud: Cloud) -> bool:
     """Whether a handling was at a surface, or at what stands off it there.
 
@@ -171,16 +200,18 @@ def _repeats(
             furthest = np.argsort(arms)[int(0.85 * len(arms))]
             point, reach = options[furthest], REACH / max(float(arms[furthest]), 0.1)
         along, share = screw.velocity(point), len(members) / len(cloud.points)
+        ways = [twin.way_from(part.parent, *way) for way in part.ways]
+        gone = [
+            float(part.screw.position_of(way[0], way[-1:])[0])
+            for way in ways
+            if math.dist(way[0], way[-1]) > LONG
+        ]
         for sign in (-1.0, 1.0):
             go = sign * min(reach, _room(twin, number, look, sign, reach))
-            value = worth.of_repeat(part, screw, go, point, options, share)
+            felt = sum(one * sign > 0.0 for one in gone)
+            value = worth.of_repeat(Repeat(part, screw, go, point, felt, options, share))
             found.append((value, Push(point, sign * along / np.linalg.norm(along))))
     return found
-
-
-def _way(screw: Screw, point: Float[np.ndarray, "3"], gone: float) -> Float[np.ndarray, "25 3"]:
-    """Of a hand that holds a point while the joint moves so far."""
-    return np.array([screw.pose(one).at(point[None])[0] for one in np.linspace(0.0, gone, 25)])
 
 
 def _room(twin: Twin, number: int, look: int, sign: float, reach: float) -> float:
@@ -204,18 +235,16 @@ def _information_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.
     return goes * JOINT - inner * np.log(inner) - (1.0 - inner) * np.log(1.0 - inner)
 
 
-def _information_of_repeat(
-    part: Part, screw: Screw, go: float, point: np.ndarray, points: np.ndarray, share: float
-) -> float:
+def _information_of_repeat(pull: Repeat) -> float:
     """Nats by which a joint's four numbers become more certain from one more way of a hand.
 
-    Of a part that has only been taken a little the forces are to be told as well.
+    To them comes what a long way tells of masses and of what resists, less each time.
     """
-    way = _way(screw, point, go)
-    before = np.linalg.inv(part.estimate.covariance + 1e-10 * np.eye(4))
-    more = way_information(screw, way)
+    way = pull.way
+    before = np.linalg.inv(pull.part.estimate.covariance + 1e-10 * np.eye(4))
+    more = way_information(pull.screw, way)
     gain = float(0.5 * (np.linalg.slogdet(before + more)[1] - np.linalg.slogdet(before)[1]))
-    return gain + FORCES * (part.longest_way < LONG < math.dist(way[0], way[-1]))
+    return gain + FORCES / (1.0 + pull.felt) ** 2 * (math.dist(way[0], way[-1]) > LONG)
 
 
 def _loss_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray:
@@ -223,16 +252,15 @@ def _loss_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray
     return goes * len(surface.members) / len(cloud.points) * REACH**2
 
 
-def _loss_of_repeat(
-    part: Part, screw: Screw, go: float, point: np.ndarray, points: np.ndarray, share: float
-) -> float:
+def _loss_of_repeat(pull: Repeat) -> float:
     """Mean square (m^2) by which the cloud is missed, as uncertain as the part's joint is."""
-    there, step = screw.pose(go).at(points), 1e-5
-    slopes = np.stack(
-        [(screw.varied(one).pose(go).at(points) - there) / step for one in step * np.eye(4)]
-    )
-    squares = np.einsum("ink,ij,jnk->n", slopes, part.estimate.covariance, slopes)
-    return share * float(squares.mean())
+    there, step = pull.screw.pose(pull.gone).at(pull.points), 1e-5
+    slopes = np.stack([
+        (pull.screw.varied(one).pose(pull.gone).at(pull.points) - there) / step
+        for one in step * np.eye(4)
+    ])  # fmt: skip
+    squares = np.einsum("ink,ij,jnk->n", slopes, pull.part.estimate.covariance, slopes)
+    return pull.share * float(squares.mean())
 
 
 WORTHS = {

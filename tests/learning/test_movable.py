@@ -60,7 +60,7 @@ def test_what_withstood_a_pull_moves_only_under_a_stronger_one():
     middle = Pull(np.array([0.0, -0.12, 0.0]), OUT, False, 0.0, True)
     belief = posterior(certain(1), FRONT, [middle])
     assert chance(belief, middle.point, OUT) == 0.0
-    assert chance(belief, LEFT_EDGE, OUT) > 0.8
+    assert chance(belief, LEFT_EDGE, OUT) > 0.9
     again = posterior(belief, FRONT, [middle])
     assert again.withstood == pytest.approx(belief.withstood)
     assert again.chances == pytest.approx(belief.chances)
@@ -69,7 +69,7 @@ def test_what_withstood_a_pull_moves_only_under_a_stronger_one():
 def test_what_gives_a_little_moves_rather_than_what_does_not():
     pulls = [Pull(np.zeros(3), OUT, False, travel, True) for travel in (0.004, 0.0)]
     gave, still = (posterior(prior(0.2), FRONT, [pull]).chances[0] for pull in pulls)
-    assert gave < 0.6 < 0.8 < still
+    assert gave < 0.5 < 0.8 < still
 
 
 def test_what_gives_a_little_and_withstands_every_pull_outwards_goes_back():

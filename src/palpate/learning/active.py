@@ -186,7 +186,7 @@ def _at(one: Handling, surface: Surface, cloud: Cloud) -> bool:
 def _repeats(
     twin: Twin, look: int, random: np.random.Generator, worth: Worth
 ) -> list[tuple[float, Push]]:
-    """Of every part that is known, the pulls either way that would make its joint more certain."""
+    """Of every part that is known, the pulls either way that would tell of its joint and forces."""
     cloud, found = twin.looks[look], []
     for number, part in enumerate(twin.parts):
         members = np.flatnonzero(twin.labels[look] == number)

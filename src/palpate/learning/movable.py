@@ -23,14 +23,14 @@ SENSES_OUT, SENSES_SIDE = (0.45, 0.5, 0.05), (0.3, 0.35, 0.35)
 # Of a hand's force at the best place: least and most that moves a part. Its logarithm is uniform:
 # most parts go easily, and a lid may need nearly all of it.
 RESISTANCE = 0.03, 1.0
-HEAVY = 0.03  # probability that none moves it
+HEAVY = 0.01  # probability that none moves it: of 218 generated parts that were seen, of none
 PLAYED = 0.0015  # m: a hand that got so far has felt something give
 CATCH = 0.03  # m: a part that stops so far from where it was is as likely held there, by a latch
 # or as it is too heavy, as it is at its end, which may be anywhere
 STRAYED = 0.05  # probability that something else went with the hand
 # Probability that a hand feels a little play where a part is held by a latch, by friction or by a
-# soft stop at its end, and where all stands still.
-PLAY, PLAY_STILL = 0.2, 0.01
+# soft stop at its end, and where all stands still: 32 of 178 pulls, and 1 of 467.
+PLAY, PLAY_STILL = 0.2, 0.003
 FELT = 0.05  # share of a hand's force along a joint that makes it play
 
 Chances = Float[np.ndarray, " hypotheses"]

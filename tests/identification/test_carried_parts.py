@@ -14,6 +14,7 @@ from palpate.identification.interactive.labels import prior, scores, smoothed
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Sighting, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, Screw
+from palpate.identification.interactive.splitting import split
 from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import Pinhole
@@ -142,6 +143,47 @@ def test_a_flap_is_found_on_a_door_that_moves_with_it(room) -> None:
         assert centimetres < 3.0
     positions = np.array([one.positions for one in twin.parts])
     assert np.abs(positions[:, -1] - positions[:, 1]) == pytest.approx([0.4, 0.7], abs=0.1)
+
+
+def test_a_flap_that_swings_along_is_found_though_the_hand_is_on_the_door(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    room.pull(twin, DOOR, (-0.6, 0.0), (-0.25, 0.6))
+    assert [part.parent for part in twin.parts] == [-1, 0]
+    assert [len(part.ways) for part in twin.parts] == [2, 0]
+    assert room.error(twin, 0, 0)[0] < 2.0
+    assert room.error(twin, 1, 1)[0] < 8.0  # no hand was on it
+    positions = twin.parts[1].positions
+    assert abs(positions[3] - positions[2]) == pytest.approx(0.6, abs=0.1)
+    room.pull(twin, FLAP, (-0.25, 0.6), (-0.25, 0.1))
+    assert [part for part, _ in twin.held] == [0, 0, 1]
+    assert room.error(twin, 1, 1)[0] < 2.0
+
+
+def test_a_door_that_is_elsewhere_than_was_believed_is_no_flap(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    twin.parts[0].positions[1] += 0.4
+    twin.parts[0].positions[2] += 0.4
+    assert not split(twin, [1, 2])
+    assert len(twin.parts) == 1
+
+
+def test_a_joint_that_is_hardly_known_tells_of_no_flap(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    room.at(-0.25, 0.6)
+    known = twin.parts[0].estimate
+    for covariance, found in ((1e-3 * np.eye(4), False), (1e-6 * np.eye(4), True)):
+        twin.parts[0].estimate = dataclasses.replace(known, covariance=covariance)
+        twin.look(room.look())
+        assert split(twin, [len(twin.looks) - 1]) == found
 
 
 def test_a_flap_that_is_known_is_hung_on_the_door_that_takes_it_along(room) -> None:

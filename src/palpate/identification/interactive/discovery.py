@@ -11,7 +11,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
-from palpate.identification.interactive.explanation import labels_near
+from palpate.identification.interactive.explanation import FURTHER, labels_near
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import LEAST_MOTION, evidence, telling
 from palpate.identification.interactive.part import Part, support_of
@@ -55,7 +55,7 @@ def discover(tree: PartTree, before: int, after: int, handling: Handling) -> boo
         options = (_on_carrier(tree, before, after, carrier, way) for carrier in near)
         found = next((one for one in options if one is not None), None)
     if found is not None:
-        _insert(tree, before, after, found, way)
+        insert(tree, before, after, found, way)
     return found is not None
 
 
@@ -140,10 +140,14 @@ def _candidate(estimate: Estimate, back: Pose, before: int, after: int) -> Candi
     return Candidate(back.inverse @ estimate.screw.pose(gone), before, after)
 
 
-def _insert(
-    tree: PartTree, before: int, after: int, new: Discovery, way: Float[np.ndarray, "times 3"]
+def insert(
+    tree: PartTree,
+    before: int,
+    after: int,
+    new: Discovery,
+    way: Float[np.ndarray, "times 3"] | None = None,
 ) -> None:
-    """Put a new part, with a hand's way on it, where it belongs in the tree."""
+    """Put a new part where it belongs in the tree, with the way of the hand that took it."""
     labels, mask = tree.labels[before], np.zeros(len(tree.labels[before]), bool)
     mask[new.masks[0]] = True
     parent, carried, same = new.carrier, [], []
@@ -174,10 +178,12 @@ def _insert(
     support = support_of((tree.looks[before], tree.looks[after]), new.masks, poses)
     estimate = dataclasses.replace(new.estimate, screw=screw)
     seen = {before: new.masks[0], after: new.masks[1]}
-    guessed = new.carrier >= 0
-    tree.parts.append(Part(parent, estimate, positions, seen, [(before, way)], support, guessed))
-    for look in range(before):  # a pull that told nothing may have moved it
-        tree.find(number, look)
+    ways = [] if way is None else [(before, way)]
+    guessed = new.carrier >= 0 and way is not None
+    tree.parts.append(Part(parent, estimate, positions, seen, ways, support, guessed))
+    for look in reversed(range(before)):  # a pull that told nothing may have moved it, and far
+        tree.parts[number].positions[look] = tree.parts[number].positions[look + 1]
+        tree.find(number, look, beyond=FURTHER)
     for look in range(after + 1, len(tree.looks)):
         tree.parts[number].positions[look] = tree.parts[number].positions[look - 1]
         tree.find(number, look)
@@ -225,7 +231,7 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
     for number, part in enumerate(tree.parts):
         if number in (carrier, *tree.carriers(carrier)) or new not in (-1, number):
             continue
-        first = part.ways[0][0]
+        first = part.shown
         shown = {other for other, chosen in part.seen.items() if len(chosen) >= FEWEST}
         shown.add(look + 1)  # it may be taken for the carrier there
         gone = [

@@ -19,7 +19,7 @@ EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss t
 
 def moved_part(tree: PartTree, before: int, after: int, handling: Handling) -> int:
     """The part that moved with the hand, which has one way more; -1 if none that is known has."""
-    for explain in (_by_way, _by_all_ways, _by_clouds):
+    for explain in (_by_way, _by_clouds, _by_all_ways):
         if (part := explain(tree, before, after, handling)) >= 0:
             return part
     return -1

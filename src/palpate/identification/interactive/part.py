@@ -37,6 +37,13 @@ class Part:
         return self.estimate.screw
 
     @property
+    def shown(self) -> int:
+        """A look that shows it: the one before a hand took it first, or that with most of it."""
+        if self.ways:
+            return self.ways[0][0]
+        return max(self.seen, key=lambda look: len(self.seen[look]))
+
+    @property
     def longest_way(self) -> float:
         """How far a hand has taken it at most, m."""
         return max((float(np.linalg.norm(way[-1] - way[0])) for _, way in self.ways), default=0.0)

@@ -10,6 +10,7 @@ import numpy as np
 from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
 from palpate.identification.interactive.explanation import FURTHER, may_have_moved, moved_part
 from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.splitting import split
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
 
@@ -42,6 +43,9 @@ class Twin(PartTree):
             self._hang(before, after)
         self.refit(self.held[-1][0] if handling.moved else -1)
         self._merge()
+        if split(self, [before, after]):
+            self._explain_earlier()
+            self.refit(-1)
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""
@@ -90,8 +94,10 @@ class Twin(PartTree):
         for least, part in enumerate(order):
             for known in reversed(order[least + 1 :]):
                 old, number = self.parts.index(part), self.parts.index(known)
-                if old not in self.carriers(number) and all(
-                    may_have_moved(self, number, look, way) for look, way in part.ways
+                if (
+                    part.ways
+                    and old not in self.carriers(number)
+                    and all(may_have_moved(self, number, look, way) for look, way in part.ways)
                 ):
                     known.ways += part.ways
                     for look in range(len(self.looks)):
@@ -101,7 +107,7 @@ class Twin(PartTree):
 
     def _explain_earlier(self) -> None:
         """Explain what moved and was of no part, now that one more is known that may carry it."""
-        for number, handling in enumerate(self.handled[:-1]):
+        for number, handling in enumerate(self.handled):
             held, before = self.held[number]
             if held >= 0 or not handling.moved:
                 continue

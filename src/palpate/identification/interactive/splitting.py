@@ -1,0 +1,273 @@
+"""Parts on parts that clouds alone show: what has gone otherwise than its carrier, as a flap does.
+
+A hand that pulls at a flap of a door moves both, by no line and no circle. But once the joint of
+the door is known, a flat piece of it that is in the open wherever that joint has taken it has moved
+by itself, about one of its edges (the mask that shrank: SAGCI, Eqn. 13).
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from palpate.identification.interactive.discovery import Discovery, insert
+from palpate.identification.interactive.explanation import FURTHER
+from palpate.identification.interactive.labels import ON, TOLERANCE, evidence
+from palpate.identification.interactive.part import Part
+from palpate.identification.interactive.refinement import NEAR, refine, sighting
+from palpate.identification.interactive.screws import NOWHERE, Screw
+from palpate.identification.interactive.tree import FEWEST, UNEXPLAINED, PartTree
+from palpate.perception.clouds import Cloud
+from palpate.perception.surfaces import Surface, surfaces
+
+MOVED = 0.15  # rad or m that a carrier has moved between two looks, or a part on it
+STRANGE = 0.35  # share of a piece's points that no known motion explains
+MEETS = 0.6  # share of a piece's points that meet a surface where the joint takes it
+GAIN = 1.0  # of evidence, for each point: how much better a joint on a carrier explains a piece
+POINTS = 120  # of a piece, by which it is tried
+TURNS = np.arange(-2.2, 2.21, 0.1)  # rad
+TRIED = 3  # of the options, the best
+ENOUGH = 200.0  # of evidence, of all points and looks
+SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enough
+LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
+HINGE = 0.05  # m between the axes of what turns about one hinge
+MOST = 0.75  # share of a carrier's points that a part on it may take
+
+
+class Piece(NamedTuple):
+    """A flat piece of a cloud, and the points by which it is tried."""
+
+    surface: Surface
+    members: Int[np.ndarray, " n"]
+
+
+@dataclasses.dataclass
+class Option:
+    """An edge of a piece that it may have turned about on a carrier, as it was in the piece's look.
+
+    `turns` (rad) says how far it has turned in each look which that explains better than what is
+    known, and `gains` by how much (evidence, of all points).
+    """
+
+    look: int
+    piece: Piece
+    carrier: int
+    screw: Screw
+    turns: dict[int, float] = dataclasses.field(default_factory=dict)
+    gains: dict[int, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def gain(self) -> float:
+        """Of all looks."""
+        return float(sum(self.gains.values()))
+
+
+def split(tree: PartTree, looks: list[int]) -> bool:
+    """Whether some looks show a part on a known one that is not known yet; it is the last then.
+
+    They are held against all looks in which a known part is elsewhere.
+    """
+    if not tree.parts:
+        return False
+    places = np.array([one.positions for one in tree.parts])
+    _, distinct = np.unique(np.round(places / MOVED), axis=1, return_index=True)
+    pairs = [(one, int(other)) for one in looks for other in distinct if other not in looks]
+    found: dict[tuple[int, int, int], list[Option]] = {}
+    for look, other in [*pairs, *(pair[::-1] for pair in pairs)]:
+        _add_options(tree, look, other, found)
+    options = [one for each in found.values() for one in each if one.gain > ENOUGH]
+    options.sort(key=lambda option: -option.gain)
+    return any(_insert(tree, option) for option in options[:TRIED])
+
+
+@functools.lru_cache(maxsize=128)
+def _pieces(cloud: Cloud) -> list[Piece]:
+    """The flat pieces of a look, whatever they are of."""
+    whole = np.zeros(len(cloud.points), int)
+    return [
+        Piece(one, one.members[:: max(1, len(one.members) // POINTS)])
+        for one in surfaces(cloud, whole, np.random.default_rng(0))
+        if len(one.members) >= FEWEST
+    ]
+
+
+def _add_options(
+    tree: PartTree, look: int, other: int, found: dict[tuple[int, int, int], list[Option]]
+) -> None:
+    """Hinges, by look, piece and carrier, of what another look does not show where known parts have
+    gone."""
+    moved = [
+        number
+        for number, part in enumerate(tree.parts)
+        if abs(part.positions[look] - part.positions[other]) > MOVED and _is_sure(part)
+    ]
+    pieces = _pieces(tree.looks[look]) if moved else []
+    if not pieces:
+        return
+    known = _known(tree, look, other, pieces)
+    # the carrier has to be seen where it has gone: else it is elsewhere, and what is on it as well
+    whose = tree.labels[look]
+    carriers = [
+        carrier
+        for carrier in moved
+        if any(
+            np.mean(whose[one.members] == carrier) > MEETS
+            and np.mean(each[carrier + 1] < UNEXPLAINED) < STRANGE
+            and each[0].mean() < each[carrier + 1].mean() - GAIN
+            for one, each in zip(pieces, known, strict=True)
+        )
+    ]
+    strange = [
+        number
+        for number, each in enumerate(known)
+        if np.mean(each.max(axis=0) < UNEXPLAINED) > STRANGE
+    ]
+    if not carriers or not strange:
+        return
+    others = _explained(tree, other, look)
+    for number in strange:
+        best = float(known[number].mean(axis=1).max())
+        for carrier in carriers:
+            options = found.setdefault(
+                (look, number, carrier),
+                [
+                    Option(look, pieces[number], carrier, screw)
+                    for screw in _edges(pieces[number].surface)
+                ],
+            )
+            for option in options:
+                _compare(tree, option, other, best, others)
+
+
+def _is_sure(part: Part) -> bool:
+    """Whether a joint is known well enough that what does not follow it has moved by itself."""
+    turned, aside = part.estimate.intervals
+    return turned < SURE[0] and (aside < SURE[1] or part.screw.joint == "prismatic")
+
+
+def _known(
+    tree: PartTree, look: int, other: int, pieces: list[Piece]
+) -> list[Float[np.ndarray, "labels n"]]:
+    """The evidence of another look for each piece's points, if they went with each label."""
+    motions = [tree.motion(part, look, other) for part in range(-1, len(tree.parts))]
+    chosen = np.concatenate([one.members for one in pieces])
+    ends = np.cumsum([len(one.members) for one in pieces])[:-1]
+    points, normals = tree.looks[look].points[chosen], tree.looks[look].normals[chosen]
+    each = np.stack([
+        evidence(tree.looks[other], pose.at(points), pose.turned(normals)) for pose in motions
+    ])  # fmt: skip
+    return np.split(each, ends, axis=1)
+
+
+def _edges(surface: Surface) -> list[Screw]:
+    middle, found = 0.5 * (surface.low + surface.high), []
+    for side in (0, 1):
+        for end in (surface.low[side], surface.high[side]):
+            place = middle.copy()
+            place[side] = end
+            point = surface.centre + place @ surface.sides
+            found.append(Screw("revolute", surface.sides[1 - side], point))
+    return found
+
+
+def _explained(tree: PartTree, look: int, other: int) -> Bool[np.ndarray, " points"]:
+    """Which points of a look another one shows where something known has gone."""
+    cloud, found = tree.looks[look], np.zeros(len(tree.looks[look].points), bool)
+    for part in range(-1, len(tree.parts)):
+        pose = tree.motion(part, look, other)
+        rest = np.flatnonzero(~found)
+        points, normals = cloud.points[rest], cloud.normals[rest]
+        found[rest] = evidence(tree.looks[other], pose.at(points), pose.turned(normals)) == ON
+    return found
+
+
+def _compare(
+    tree: PartTree,
+    option: Option,
+    other: int,
+    known: float,
+    others: Bool[np.ndarray, " points"],
+) -> None:
+    """Note whether a hinge explains a piece in another look better than what is `known` (evidence).
+
+    Points of that look that are of `others` are not the piece's.
+    """
+    piece = option.piece
+    cloud = tree.looks[option.look]
+    points, normals = cloud.points[piece.members], cloud.normals[piece.members]
+    carried = tree.motion(option.carrier, option.look, other)
+    poses = [carried @ option.screw.pose(float(turn)) for turn in TURNS]
+    moved = np.concatenate([pose.at(points) for pose in poses])
+    turned = np.concatenate([pose.turned(normals) for pose in poses])
+    each = evidence(tree.looks[other], moved, turned, others).reshape(len(poses), len(points))
+    best = int(each.mean(axis=1).argmax())
+    better = float(each[best].mean()) - known
+    turned_by = abs(float(TURNS[best]))
+    if better > GAIN and np.mean(each[best] == ON) > MEETS and turned_by > MOVED:
+        option.turns[other] = float(TURNS[best])
+        option.gains[other] = better * len(piece.surface.members)
+
+
+def _discovery(tree: PartTree, option: Option, first: int, second: int) -> Discovery:
+    """A hinge between two looks, one of them the piece's, from the piece and what it meets."""
+    look, screw, turn = option.look, option.screw, option.turns[second + first - option.look]
+    other = second + first - look
+    carried, mine = tree.motion(option.carrier, look, other), option.piece.surface.members
+    pose, cloud, there = carried @ screw.pose(turn), tree.looks[look], tree.looks[other]
+    reach = NEAR[0] + TOLERANCE * there.error
+    distance, index = there.tree.query(pose.at(cloud.points[mine]), distance_upper_bound=reach)
+    met = np.unique(index[np.isfinite(distance)])
+    masks = {look: mine, other: met}
+    if other == first:
+        screw, turn = screw.moved(pose), -turn
+    back = tree.motion(option.carrier, second, first)
+    seen = [
+        sighting(tree.looks[at], masks[at], to)
+        for at, to in ((first, NOWHERE), (second, back))
+    ]  # fmt: skip
+    estimate = refine(screw, np.array([0.0, turn]), seen, [])
+    return Discovery(option.carrier, estimate, [masks[first], masks[second]])
+
+
+def _insert(tree: PartTree, option: Option) -> bool:
+    """Put a part into the tree, and keep it if it has points of its own and its carrier as well."""
+    look = option.look
+    first, second = sorted((look, max(option.gains, key=lambda one: option.gains[one])))
+    new = _discovery(tree, option, first, second)
+    before = {at: tree.labels[at] == option.carrier for at in (look, *option.turns)}
+    insert(tree, first, second, new)
+    number = len(tree.parts) - 1
+    part = tree.parts[number]
+    sign = np.sign(part.screw.axis @ option.screw.moved(tree.pose(part.parent, look).inverse).axis)
+    turns = {look: 0.0} | option.turns
+    for at in range(len(tree.looks)):
+        nearest = min(turns, key=lambda one: abs(one - at))
+        part.positions[at] = part.positions[look] + float(sign) * turns[nearest]
+        tree.find(number, at, beyond=FURTHER)
+    taken = whole = 0
+    for at, carrier in before.items():
+        tree.relabel(at)
+        taken += int(np.sum(tree.labels[at][carrier] == number))
+        whole += int(carrier.sum())
+    if taken > MOST * whole or max(len(part.seen[at]) for at in before) < FEWEST:
+        tree.remove(number, part.parent)
+        return False
+    part.settle(tree.estimate(part))
+    _replace_same(tree, number)
+    return True
+
+
+def _replace_same(tree: PartTree, number: int) -> None:
+    """Take out parts that turn about the same hinge on the same carrier, as one that has gone
+    further than it was sought."""
+    part = tree.parts[number]
+    for old in reversed(range(number)):
+        one, apart = tree.parts[old], part.screw.point - tree.parts[old].screw.point
+        alike = abs(one.screw.axis @ part.screw.axis) > LIKE
+        beside = np.linalg.norm(np.cross(apart, one.screw.axis)) < HINGE
+        if one.parent == part.parent and one.screw.joint == "revolute" and alike and beside:
+            part.ways = one.ways + part.ways
+            tree.remove(old, number)
+            number -= 1

@@ -252,6 +252,22 @@ def test_a_joint_that_a_short_way_left_open_is_mended_and_not_found_again(room) 
     assert room.error(twin, 0, 0)[0] < 2.0
 
 
+def test_a_little_way_at_what_stands_is_none_of_a_door_that_stands_as_well(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    wall, out = np.array([0.13, 0.74, 1.1]), np.array([-1.0, 0.0, 0.0])
+    way = wall + np.linspace(0.0, 0.012, 40)[:, None] * out
+    twin.observe(
+        Handling(
+            Push(wall, out), twin.looks[-1], room.look(), np.linspace(0, 1, 40), way, 0.0 * way
+        )
+    )
+    assert [part for part, _ in twin.held] == [0, -1]
+    assert len(twin.parts[0].ways) == 1
+
+
 def sheet(corner: float) -> Sighting:
     """What is seen of a sheet in the plane z = 0, which is the same wherever it has slid to."""
     x, y = np.meshgrid(np.arange(0.2, 0.8, 0.02), np.arange(0.0, 0.5, 0.02))

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.labels import LEAST_MOTION
 from palpate.identification.interactive.refinement import Estimate, Way, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
 from palpate.identification.interactive.tree import NOT_MOVED, Candidate, PartTree
@@ -140,12 +141,13 @@ def _joint_of(ways: list[Way], looks: int) -> Estimate | None:
 def _by_clouds(tree: PartTree, before: int, after: int, handling: Handling) -> int:
     """The part that the clouds show to have moved as the hand has, which has one way more."""
     start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
-    misses = [
-        float(np.linalg.norm(tree.motion(part, before, after).at(start[None])[0] - end))
-        for part in range(len(tree.parts))
-    ]
-    if not misses or min(misses) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
+    misses = {
+        number: float(np.linalg.norm(tree.motion(number, before, after).at(start[None])[0] - end))
+        for number, part in enumerate(tree.parts)
+        if abs(part.positions[after] - part.positions[before]) > LEAST_MOTION
+    }
+    if not misses or min(misses.values()) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
         return -1
-    part = int(np.argmin(misses))
+    part = min(misses, key=lambda number: misses[number])
     tree.parts[part].ways.append((before, handling.points))
     return part

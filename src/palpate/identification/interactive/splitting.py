@@ -6,8 +6,8 @@ by itself, about one of its edges (the mask that shrank: SAGCI, Eqn. 13).
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -41,6 +41,9 @@ class Piece(NamedTuple):
 
     surface: Surface
     members: Int[np.ndarray, " n"]
+
+
+_SOUGHT: WeakKeyDictionary[Cloud, list[Piece]] = WeakKeyDictionary()
 
 
 @dataclasses.dataclass
@@ -82,15 +85,16 @@ def split(tree: PartTree, looks: list[int]) -> bool:
     return any(_insert(tree, option) for option in options[:TRIED])
 
 
-@functools.lru_cache(maxsize=128)
 def _pieces(cloud: Cloud) -> list[Piece]:
-    """The flat pieces of a look, whatever they are of."""
-    whole = np.zeros(len(cloud.points), int)
-    return [
-        Piece(one, one.members[:: max(1, len(one.members) // POINTS)])
-        for one in surfaces(cloud, whole, np.random.default_rng(0))
-        if len(one.members) >= FEWEST
-    ]
+    """The flat pieces of a look, whatever they are of; sought once."""
+    if cloud not in _SOUGHT:
+        whole = np.zeros(len(cloud.points), int)
+        _SOUGHT[cloud] = [
+            Piece(one, one.members[:: max(1, len(one.members) // POINTS)])
+            for one in surfaces(cloud, whole, np.random.default_rng(0))
+            if len(one.members) >= FEWEST
+        ]
+    return _SOUGHT[cloud]
 
 
 def _add_options(
@@ -162,6 +166,7 @@ def _known(
 
 
 def _edges(surface: Surface) -> list[Screw]:
+    """Hinges at the four edges of a piece."""
     middle, found = 0.5 * (surface.low + surface.high), []
     for side in (0, 1):
         for end in (surface.low[side], surface.high[side]):
@@ -237,21 +242,23 @@ def _insert(tree: PartTree, option: Option) -> bool:
     first, second = sorted((look, max(option.gains, key=lambda one: option.gains[one])))
     new = _discovery(tree, option, first, second)
     before = {at: tree.labels[at] == option.carrier for at in (look, *option.turns)}
+    count = len(tree.parts)
     insert(tree, first, second, new)
     number = len(tree.parts) - 1
     part = tree.parts[number]
     sign = np.sign(part.screw.axis @ option.screw.moved(tree.pose(part.parent, look).inverse).axis)
-    turns = {look: 0.0} | option.turns
+    here, turns = part.positions[look], {look: 0.0} | option.turns
     for at in range(len(tree.looks)):
         nearest = min(turns, key=lambda one: abs(one - at))
-        part.positions[at] = part.positions[look] + float(sign) * turns[nearest]
+        part.positions[at] = here + float(sign) * turns[nearest]
         tree.find(number, at, beyond=FURTHER)
     taken = whole = 0
     for at, carrier in before.items():
         tree.relabel(at)
         taken += int(np.sum(tree.labels[at][carrier] == number))
         whole += int(carrier.sum())
-    if taken > MOST * whole or max(len(part.seen[at]) for at in before) < FEWEST:
+    refused = taken > MOST * whole or max(len(part.seen[at]) for at in before) < FEWEST
+    if refused and number == count:  # else it has replaced another
         tree.remove(number, part.parent)
         return False
     part.settle(tree.estimate(part))

@@ -274,6 +274,9 @@ class FreeParameters(eqx.Module):
             reference = value_of(self.reference, path)
             value, before = value_of(legal, path), value_of(proposed, path)
             coordinate = declaration.prior.to_free(value, reference)
+            # A few roundings inside: what they leave just beyond a limit would not come back.
+            rounding = 4 * jnp.finfo(coordinate.dtype).eps * jnp.maximum(jnp.abs(coordinate), 1)
+            coordinate -= jnp.sign(free[path] - coordinate) * rounding
             # What was legal stays as it is: the way back through a value may overflow.
             coordinate = jnp.where(value == before, free[path], coordinate)
             projected[path] = jnp.mean(coordinate) if declaration.shared else coordinate

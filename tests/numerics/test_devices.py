@@ -1,5 +1,8 @@
 """How a batch is divided among the processors."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -14,7 +17,7 @@ from palpate.numerics.devices import one_on_each, over_devices
 @pytest.fixture
 def two(monkeypatch):
     """Two devices, however many there are: at least two, says `conftest`."""
-    devices = jax.devices()[:2]
+    devices = jax.devices("cpu")[:2]
     assert len(devices) == 2
     monkeypatch.setattr(jax, "devices", lambda: devices)
     return devices
@@ -70,3 +73,34 @@ def test_what_a_piece_of_work_raises_is_raised_and_no_other_begins(two):
     with pytest.raises(ValueError, match="piece 0"):
         one_on_each(failing, range(100))
     assert len(begun) < 100
+
+
+IMPORTED = """
+import jax.numpy as jnp
+if {computed}: jnp.ones(3).sum()
+import jax, palpate, os
+print(jax.config.jax_default_matmul_precision, len(jax.devices("cpu")))
+"""
+
+
+@pytest.mark.parametrize(
+    ("chosen", "computed", "expected"),
+    [
+        ({}, False, "highest 3"),
+        ({}, True, "highest 1"),
+        (
+            {"JAX_DEFAULT_MATMUL_PRECISION": "bfloat16", "JAX_NUM_CPU_DEVICES": "5"},
+            False,
+            "bfloat16 5",
+        ),
+    ],
+)
+def test_back_ends_are_set_up_as_far_as_the_user_has_not(chosen, computed, expected):
+    ours = ("JAX_DEFAULT_MATMUL_PRECISION", "JAX_NUM_CPU_DEVICES", "XLA_FLAGS")
+    environment = {name: value for name, value in os.environ.items() if name not in ours} | chosen
+    cores = "import os; os.sched_getaffinity = lambda process: range(3)\n"
+    program = cores + IMPORTED.format(computed=computed)
+    ran = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.strip() == expected

@@ -12,31 +12,34 @@ from queue import SimpleQueue
 from typing import Any
 
 # These let XLA compile a loop over small arrays as one function with full vectors (measured with
-# JAX 0.10 on CPUs: 12x on a single rope). A flag that XLA does not know ends the process, so they
-# are set for the versions they were tried with and for no other.
+# JAX 0.10 on CPUs: 12x on a single rope; JAX 0.12 does so by itself). A flag that XLA does not know
+# ends the process, and an option raises, so they are set for the versions that need them.
 _FLAGS = (
     "--xla_cpu_prefer_vector_width=512",
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000",
 )
-_TRIED = ("0.10.",)
+_NEED = ("0.10.",)
 
 
-def _tried() -> bool:
-    """Whether JAX is of a version that the flags were tried with."""
+def _needs_flags() -> bool:
+    """Whether JAX is of a version that the flags make faster."""
     try:
-        return version("jax").startswith(_TRIED)
+        return version("jax").startswith(_NEED)
     except PackageNotFoundError:
         return False
 
 
 def prepare() -> None:
-    """Set up JAX's CPU back end before it starts: compiler flags, one device per core.
+    """Set up JAX's back ends before they start: compiler flags, one CPU device per core.
 
-    Called when palpate is imported. Leaves alone what the user has set, and has no effect once JAX
-    has computed something: then the same results come, slower.
+    Called when palpate is imported. Leaves alone what the user has set, and has no effect on CPUs
+    once JAX has computed something: then the same results come, slower. On GPUs matrices are
+    multiplied in float32 as on CPUs: JAX else rounds what goes in to 10 bits there, which is too
+    coarse for physics.
     """
+    _multiply_in_full()
     flags = os.environ.get("XLA_FLAGS", "")
-    if _tried():
+    if _needs_flags():
         for flag in _FLAGS:
             if flag.partition("=")[0] not in flags:
                 flags = f"{flags} {flag}".strip()
@@ -50,6 +53,20 @@ def prepare() -> None:
 
     with contextlib.suppress(RuntimeError):  # the back end has started
         jax.config.update("jax_num_cpu_devices", cores())
+
+
+def _multiply_in_full() -> None:
+    """No less than float32 for products of float32 matrices, unless the user has chosen."""
+    if "JAX_DEFAULT_MATMUL_PRECISION" in os.environ:
+        return
+    if "jax" not in sys.modules:
+        os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = "highest"
+        return
+    import jax
+
+    chosen = jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]
+    if chosen is None:
+        jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def cores() -> int:
@@ -80,7 +97,7 @@ def compiled_at_once(function: Callable[..., Any]) -> Callable[..., Any]:
 def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
     import equinox as eqx
 
-    keywords: dict[str, Any] = {"compiler_options": options} if _tried() else {}
+    keywords: dict[str, Any] = {"compiler_options": options} if _needs_flags() else {}
     return eqx.filter_jit(function, **keywords)
 
 

@@ -12,7 +12,7 @@ from depth_scenes import depth_of
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.labels import prior, scores, smoothed
 from palpate.identification.interactive.part import Part
-from palpate.identification.interactive.refinement import Sighting, refine, surprise
+from palpate.identification.interactive.refinement import Estimate, Sighting, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.splitting import split
 from palpate.identification.interactive.tree import PartTree
@@ -443,3 +443,27 @@ def test_a_way_on_a_part_whose_carrier_has_moved_counts_by_its_ends(room) -> Non
     turned = still.position_of(local[0], local[-1:])[0]
     assert abs(turned) == pytest.approx(0.7, abs=0.1)
     assert twin.way_from(-1, look, way) is way
+
+
+@pytest.mark.parametrize(
+    ("by", "joint", "refuted"),
+    [
+        ((0.0, 0.0, 0.02, 0.0), "revolute", False),
+        ((0.0, 0.0, 0.06, 0.0), "revolute", True),
+        ((0.0, 0.1, 0.0, 0.0), "revolute", False),
+        ((0.3, 0.0, 0.0, 0.0), "revolute", True),
+        ((0.3, 0.0, 0.2, 0.0), "prismatic", False),
+    ],
+)
+def test_a_joint_refutes_what_is_many_intervals_away_and_of_its_kind(by, joint, refuted):
+    screw = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.2, 0.1, 0.0]))
+    spread = np.array([0.03, 0.03, 0.006, 0.006])
+    known = Estimate(screw, np.zeros(2), np.diag(spread**2), 0.0, 0.0)
+    assert known.refutes(dataclasses.replace(screw.varied(np.array(by)), joint=joint)) == refuted
+
+
+def test_a_slide_refutes_by_its_direction_alone():
+    screw = Screw("prismatic", np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    known = Estimate(screw, np.zeros(2), np.diag([1e-4, 1e-4, 0.0, 0.0]), 0.0, 0.0)
+    assert not known.refutes(screw.varied(np.array([0.0, 0.0, 1.0, 0.0])))
+    assert known.refutes(screw.varied(np.array([0.2, 0.0, 0.0, 0.0])))

@@ -117,7 +117,8 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
         ways = [*one.ways, (before, handling.points)]
         local = [(look, tree.way_from(one.parent, look, way)) for look, way in ways]
         joint = _joint_of(local, len(tree.looks))
-        if joint is None:
+        # two joints that move at once may do as one, elsewhere
+        if joint is None or one.estimate.refutes(joint.screw):
             continue
         kept = one.estimate, one.positions
         one.settle(dataclasses.replace(joint, positions=np.array(one.positions_of(joint.screw))))

@@ -30,6 +30,7 @@ AXES = 4  # numbers of a screw
 # What errors of labels add, as factors of standard deviations of directions and places: from the
 # errors of parts of thirty appliances of seeds 600000 to 600004, which no figure is measured on.
 INFLATION = 2.5, 2.5, 5.0, 5.0
+REFUTED = 4.0  # 90 % intervals from a joint: what is further away is another one
 FEWEST = 20  # points that say anything
 LEAST = 1e-3  # rad or m between two places
 ROUNDS, COARSE = 8, 3  # of Gauss-Newton, and those first ones that look further
@@ -79,6 +80,18 @@ class Estimate:
         """Half-widths of 90 % intervals, the wider of two: of the direction, deg, and place, m."""
         wide = 1.645 * np.sqrt(np.diag(self.covariance))
         return float(np.degrees(wide[:2].max())), float(wide[2:].max())
+
+    def refutes(self, screw: Screw) -> bool:
+        """Whether a joint of its kind is too far away to be the same; of another it cannot say."""
+        if screw.joint != self.screw.joint:
+            return False
+        sine = float(np.linalg.norm(np.cross(self.screw.axis, screw.axis)))
+        aside = float(np.linalg.norm(np.cross(screw.point - self.screw.point, self.screw.axis)))
+        turned, away = self.intervals
+        slides = screw.joint == "prismatic"
+        return math.degrees(math.asin(min(sine, 1.0))) > REFUTED * turned or (
+            aside > REFUTED * away and not slides
+        )
 
 
 def sighting(cloud: Cloud, chosen: Int[np.ndarray, " n"], back: Pose) -> Sighting:

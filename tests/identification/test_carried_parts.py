@@ -59,8 +59,25 @@ APART = """
   </worldbody>
 </mujoco>
 """
+# Two doors on one post, which open away from each other.
+POST = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".02 .9 .9" pos=".4 0 .9"/>
+    <body name="left" pos="0 0 .9">
+      <joint axis="0 0 1"/>
+      <geom type="box" size=".015 .22 .7" pos="0 .23 0"/>
+    </body>
+    <body name="right" pos="0 0 .9">
+      <joint axis="0 0 -1"/>
+      <geom type="box" size=".015 .22 .7" pos="0 -.23 0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
 ON_DOOR, ON_FLAP = np.array([-0.02, -0.4, 0.5]), np.array([-0.02, 0.0, 0.72])
 DOOR, FLAP = 1, 2
+LEFT, RIGHT = 1, 2
 
 
 class Room:
@@ -115,6 +132,16 @@ class Room:
         return difference(found, self.data.xaxis[joint], self.data.xanchor[joint])
 
 
+class Post(Room):
+    """Two doors on one post, and a hand at the edge of one of them."""
+
+    def __init__(self) -> None:
+        super().__init__(POST)
+
+    def place(self, body: int) -> np.ndarray:
+        return np.array([-0.015, 0.4 if body == LEFT else -0.4, 0.0])
+
+
 @pytest.fixture
 def room() -> Room:
     return Room()
@@ -127,6 +154,21 @@ def test_a_pull_that_moves_two_unknown_joints_tells_nothing_yet(room) -> None:
     room.pull(twin, FLAP, (0.0, 0.0), (-0.5, 0.6))
     assert not twin.parts
     assert twin.held == [(-1, 0)]
+
+
+def test_a_door_stays_where_it_is_while_another_is_found_that_looks_like_it() -> None:
+    room, twin = Post(), Twin()
+    room.at(0.9, 0.0)
+    twin.look(room.look())
+    room.pull(twin, LEFT, (0.9, 0.0), (1.05, 0.0))
+    room.pull(twin, RIGHT, (1.05, 0.0), (1.05, 1.6))
+    assert [part.parent for part in twin.parts] == [-1, -1]
+    assert [part for part, _ in twin.held] == [0, 1]
+    np.testing.assert_allclose(np.diff(twin.parts[0].positions)[1:], 0.0, atol=0.02)
+    for part in (0, 1):
+        turned, aside = room.error(twin, part, part)
+        assert turned < 2.0
+        assert aside < 2.0
 
 
 def test_a_flap_is_found_on_a_door_that_moves_with_it(room) -> None:

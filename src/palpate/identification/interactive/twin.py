@@ -10,6 +10,7 @@ import numpy as np
 from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
 from palpate.identification.interactive.explanation import FURTHER, may_have_moved, moved_part
 from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.labels import HIDDEN, evidence
 from palpate.identification.interactive.splitting import split
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
@@ -34,7 +35,10 @@ class Twin(PartTree):
         self.handled.append(handling)
         part, new = self._held(before, after, handling)
         self.held.append((part, before))
+        count = len(self.parts)
         self._keep(new, before, after)
+        if new and len(self.parts) == count:
+            self._put_back(before, after)
         self._hang(before, after)
         if new:
             self._drop_guesses()
@@ -56,6 +60,25 @@ class Twin(PartTree):
         moved = self.renumbering(part, heir)
         self.held = [(int(moved[held + 1]), look) for held, look in self.held]
         super().remove(part, heir)
+
+    def _put_back(self, before: int, after: int) -> None:
+        """Put back what was taken for moved as it is like the last part where that has gone.
+
+        Points that the last part may have had there are its own, now that it is known.
+        """
+        cloud, back = self.looks[after], self.motion(len(self.parts) - 1, after, before)
+        seen = evidence(self.looks[before], back.at(cloud.points), back.turned(cloud.normals))
+        own = seen >= HIDDEN
+        moved = False
+        for number, part in enumerate(self.parts[:-1]):
+            there = part.positions[after]
+            if abs(there - part.positions[before]) > CARRIED:
+                part.positions[after] = part.positions[before]
+                self.find(number, after, others=own)
+                moved |= abs(part.positions[after] - there) > CARRIED
+        if moved:
+            for look in (before, after):
+                self.relabel(look)
 
     def _hang(self, before: int, after: int) -> None:
         """Hang on each part that has moved what it carries."""

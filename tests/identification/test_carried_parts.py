@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from depth_scenes import depth_of
+from palpate.identification.interactive import splitting
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.labels import prior, scores, smoothed
 from palpate.identification.interactive.part import Part
@@ -226,6 +227,36 @@ def test_a_joint_that_is_hardly_known_tells_of_no_flap(room) -> None:
         twin.parts[0].estimate = dataclasses.replace(known, covariance=covariance)
         twin.look(room.look())
         assert split(twin, [len(twin.looks) - 1]) == found
+
+
+@pytest.mark.parametrize(("left", "right"), [(0.3, 1.0), (0.3, 1.3)])
+def test_a_door_beside_one_that_is_known_is_no_part_on_it(left, right) -> None:
+    room, twin = Post(), Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, LEFT, (0.0, 0.0), (0.9, 0.0))
+    known = twin.parts[0].estimate
+    twin.parts[0].estimate = dataclasses.replace(known, covariance=1e-6 * np.eye(4))
+    room.at(left, right)
+    twin.look(room.look())
+    assert not split(twin, [len(twin.looks) - 1])
+    assert len(twin.parts) == 1
+
+
+@pytest.mark.parametrize(("limit", "value"), [("LARGEST", 0.05), ("GROWN", 0.5), ("MOST", 0.02)])
+def test_a_flap_that_takes_too_much_is_none(room, monkeypatch, limit, value) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    known = twin.parts[0].estimate
+    twin.parts[0].estimate = dataclasses.replace(known, covariance=1e-6 * np.eye(4))
+    room.at(-0.25, 0.6)
+    twin.look(room.look())
+    monkeypatch.setattr(splitting, limit, value)
+    assert not split(twin, [len(twin.looks) - 1])
+    assert len(twin.parts) == 1
+    assert max(labels.max() for labels in twin.labels) == 0
 
 
 def test_a_flap_that_is_known_is_hung_on_the_door_that_takes_it_along(room) -> None:

@@ -33,6 +33,8 @@ ENOUGH = 200.0  # of evidence, of all points and looks
 SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enough
 LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
 HINGE = 0.05  # m between the axes of what turns about one hinge
+LARGEST = 0.5  # of a carrier's points in a look: a piece that is larger is no part on it
+GROWN = 2.5  # of a piece's points: a part that takes more there is not what was tried
 MOST = 0.75  # share of a carrier's points that a part on it may take
 
 
@@ -139,6 +141,8 @@ def _add_options(
                 [
                     Option(look, pieces[number], carrier, screw)
                     for screw in _edges(pieces[number].surface)
+                    # about the carrier's own hinge it would be beside the carrier, not on it
+                    if not _is_same(screw, tree.screw(carrier, look))
                 ],
             )
             for option in options:
@@ -175,6 +179,13 @@ def _edges(surface: Surface) -> list[Screw]:
             point = surface.centre + place @ surface.sides
             found.append(Screw("revolute", surface.sides[1 - side], point))
     return found
+
+
+def _is_same(hinge: Screw, other: Screw) -> bool:
+    """Whether another joint turns about the same line as a hinge, as well as edges are known."""
+    aside = np.linalg.norm(np.cross(hinge.point - other.point, other.axis))
+    alike = abs(hinge.axis @ other.axis) > LIKE
+    return other.joint == "revolute" and bool(alike and aside < HINGE)
 
 
 def _explained(tree: PartTree, look: int, other: int) -> Bool[np.ndarray, " points"]:
@@ -238,7 +249,9 @@ def _discovery(tree: PartTree, option: Option, first: int, second: int) -> Disco
 
 def _insert(tree: PartTree, option: Option) -> bool:
     """Put a part into the tree, and keep it if it has points of its own and its carrier as well."""
-    look = option.look
+    look, size = option.look, len(option.piece.surface.members)
+    if size > LARGEST * np.sum(tree.labels[look] == option.carrier):
+        return False
     first, second = sorted((look, max(option.gains, key=lambda one: option.gains[one])))
     new = _discovery(tree, option, first, second)
     before = {at: tree.labels[at] == option.carrier for at in (look, *option.turns)}
@@ -258,6 +271,7 @@ def _insert(tree: PartTree, option: Option) -> bool:
         taken += int(np.sum(tree.labels[at][carrier] == number))
         whole += int(carrier.sum())
     refused = taken > MOST * whole or max(len(part.seen[at]) for at in before) < FEWEST
+    refused |= len(part.seen[look]) > GROWN * size
     if refused and number == count:  # else it has replaced another
         tree.remove(number, part.parent)
         return False
@@ -271,10 +285,8 @@ def _replace_same(tree: PartTree, number: int) -> None:
     further than it was sought."""
     part = tree.parts[number]
     for old in reversed(range(number)):
-        one, apart = tree.parts[old], part.screw.point - tree.parts[old].screw.point
-        alike = abs(one.screw.axis @ part.screw.axis) > LIKE
-        beside = np.linalg.norm(np.cross(apart, one.screw.axis)) < HINGE
-        if one.parent == part.parent and one.screw.joint == "revolute" and alike and beside:
+        one = tree.parts[old]
+        if one.parent == part.parent and _is_same(part.screw, one.screw):
             part.ways = one.ways + part.ways
             tree.remove(old, number)
             number -= 1

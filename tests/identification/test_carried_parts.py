@@ -305,14 +305,6 @@ def test_a_flap_that_was_guessed_from_two_ends_is_dropped_once_more_is_known(roo
     assert len(twin.parts) == 3
 
 
-def test_a_joint_is_at_zero_in_the_look_in_which_it_was_described() -> None:
-    slide = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3))
-    way = np.array([0.0, 0.5, 0.5]) + np.linspace(0.1, 0.2, 40)[:, None] * slide.axis
-    seen = [boxed(0.0), boxed(0.1), boxed(0.2)]
-    found = refine(slide, np.array([-0.095, 0.0, 0.1]), seen, [(1, way)])
-    assert found.positions == pytest.approx([-0.1, 0.0, 0.1], abs=1e-3)
-
-
 def test_a_joint_that_a_short_way_left_open_is_mended_and_not_found_again(room) -> None:
     twin = Twin()
     room.at(0.0, 0.0)

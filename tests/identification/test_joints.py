@@ -28,6 +28,14 @@ def boxed(gone: float) -> Sighting:
     return Sighting(points, normals, np.full(len(points), 1e-3), cKDTree(points))
 
 
+def test_a_joint_is_at_zero_in_the_look_in_which_it_was_described() -> None:
+    slide = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3))
+    way = np.array([0.0, 0.5, 0.5]) + np.linspace(0.1, 0.2, 40)[:, None] * slide.axis
+    seen = [boxed(0.0), boxed(0.1), boxed(0.2)]
+    found = refine(slide, np.array([-0.095, 0.0, 0.1]), seen, [(1, way)])
+    assert found.positions == pytest.approx([-0.1, 0.0, 0.1], abs=1e-3)
+
+
 def test_the_hand_says_how_far_a_sheet_has_slid_in_its_plane() -> None:
     way = np.linspace((0.5, 0.2, 0.01), (0.6, 0.2, 0.01), 40)
     way = np.concatenate([way[:1], way[:1], way, way[-1:], way[-1:]])  # at rest at both ends

@@ -242,8 +242,10 @@ def test_a_door_beside_one_that_is_known_is_no_part_on_it(left, right) -> None:
     assert len(twin.parts) == 1
 
 
-@pytest.mark.parametrize(("limit", "value"), [("LARGEST", 0.05), ("GROWN", 0.5), ("MOST", 0.02)])
-def test_a_flap_that_takes_too_much_is_none(room, monkeypatch, limit, value) -> None:
+@pytest.mark.parametrize(
+    ("limit", "value"), [("LARGEST", 0.05), ("GROWN", 0.5), ("MOST", 0.02), ("UNSURE", 0.01)]
+)
+def test_a_flap_too_large_or_hardly_known_is_none(room, monkeypatch, limit, value) -> None:
     twin = Twin()
     room.at(0.0, 0.0)
     twin.look(room.look())

@@ -55,6 +55,22 @@ def test_a_pull_that_failed_at_one_edge_leaves_the_other():
     assert belief.chances.sum() == pytest.approx(1.0)
 
 
+def test_a_pull_that_failed_on_one_half_hardly_tells_of_the_other():
+    """Two doors beside each other are one surface; each turns about its outer edge."""
+    left, right = np.array([0, 0.07, 0.0]), np.array([0, -0.07, 0.0])
+    belief = posterior(prior(0.9), FRONT, [Pull(right, OUT, False, 0.0, True)] * 3)
+    assert belief.chances[0] < 0.6
+    assert chance(belief, left, OUT) > 3.0 * chance(belief, right, OUT)
+
+
+def test_where_pieces_meet_a_pull_tells_less_of_either():
+    """Of the half whose hinge is at the right edge: in its middle, and where the other begins."""
+    half = certain(1 + 3 * 7 + 1)  # the first hinge of the piece after the whole, opening outwards
+    assert chance(half, np.array([0, -0.02, 0.0]), OUT) == pytest.approx(0.5 * (1.0 - HEAVY), 0.1)
+    assert chance(half, np.array([0, -0.05, 0.0]), OUT) == pytest.approx(1.0 - HEAVY, 0.1)
+    assert chance(half, np.array([0, 0.05, 0.0]), OUT) == 0.0
+
+
 def test_what_withstood_a_pull_moves_only_under_a_stronger_one():
     """Given that it is a hinge, the same pull again is in vain, and twice the lever is not."""
     middle = Pull(np.array([0.0, -0.12, 0.0]), OUT, False, 0.0, True)

@@ -35,7 +35,7 @@ BEHIND = 0.03  # m
 FEWEST = 10  # points of a part that a hand can be put to
 REACH = 0.3  # m that a hand goes
 UNKNOWN = 0.3  # of its reach that a hand is expected to take a part beyond where it was seen
-INSET = 0.12  # of a surface, from its edge to where a hand takes hold
+GRIPS = 0.12, 0.38, 0.5, 0.62, 0.88  # shares of a surface's sides at which a hand takes hold
 ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an end
 ASIDE = 0.3  # how much to the side of the normal a hand also pulls, which tries two joints at once
 
@@ -109,8 +109,9 @@ def _tries(
     before = guess(features_of(cloud, every))
     tried = [_handled_at(twin, surface, cloud) for surface in every]
     # a guess that was wrong of this appliance is trusted less in the rest of it
-    failed = sum(float(chance) for chance, there in zip(before, tried, strict=True) if there)
-    trust = (1.0 + len(twin.parts)) / (1.0 + len(twin.parts) + failed)
+    failed = before * [len(there) > 0 for there in tried]
+    known = 1.0 + len(twin.parts)
+    trust = known / (known + failed.sum() - failed)
     for surface, chance, there in zip(every, trust * before, tried, strict=True):
         pulls = [
             movable.Pull(
@@ -140,14 +141,9 @@ def _grips(
     cloud: Cloud, surface: Surface
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Where a hand may take hold of a surface, and which way it may pull: all pairs of them."""
-    low, high = surface.low, surface.high
-    inner = INSET * (high - low)
-    middle = 0.5 * (low + high)
-    ends = [low + inner, high - inner]
-    flat = [middle, *(np.array([end[0], middle[1]]) for end in ends)]
-    flat += [np.array([middle[0], end[1]]) for end in ends]
-    flat += [np.array([one[0], other[1]]) for one in ends for other in ends]
-    wanted = surface.centre + np.array(flat) @ surface.sides
+    shares = np.array([*itertools.product(GRIPS, GRIPS)])
+    flat = surface.low + shares * (surface.high - surface.low)
+    wanted = surface.centre + flat @ surface.sides
     own = cloud.points[surface.members]
     nearest = np.linalg.norm(own[None] - wanted[:, None], axis=2).argmin(axis=1)
     points = np.concatenate([surface.handles, own[nearest]])

@@ -1,9 +1,9 @@
 """What is believed of a surface: whether it moves, about or along what, and how hard it goes.
 
-A surface stands still, or it turns about one of the edges of its rectangle, or slides along its
-normal or a side of it. How likely it is to move is guessed by how it stands in the scene
-(`movable_guess`); what a hand found that pulled at it, and felt it stand still or go, weighs the
-joints anew (Bayes).
+A surface stands still, or all of it or a piece (two doors beside each other are one surface to a
+camera) turns about one of the edges of its rectangle, or slides along its normal or a side of it.
+How likely it is to move is guessed by how it stands in the scene (`movable_guess`); what a hand
+found that pulled at it, and felt it stand still or go, weighs the joints anew (Bayes).
 """
 
 from collections.abc import Sequence
@@ -16,6 +16,19 @@ from palpate.perception.surfaces import Surface
 
 # Shares of the joints: each of four, of one, and each of two.
 HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
+JOINTS = 7
+# Pieces of a surface, from one share of a side of its rectangle to another, and how many parts are
+# so much of their surface: of 200 generated ones 130 are all of it.
+WHOLE, HALF, QUARTER = 0.64, 0.045, 0.0225  # each of these and of those of three quarters
+SPANS = ((0.0, 0.5), (0.5, 1.0), (0.0, 0.25), (0.75, 1.0), (0.0, 0.75), (0.25, 1.0))
+PIECES = np.array(
+    [[(0.0, 1.0), (0.0, 1.0)]]
+    + [[span, (0.0, 1.0)] for span in SPANS]
+    + [[(0.0, 1.0), span] for span in SPANS]
+)
+SIZES = np.array([WHOLE, *2 * [HALF, HALF, QUARTER, QUARTER, QUARTER, QUARTER]])
+BORDER = 0.06  # of a side: so near the end of a piece within the surface a hand may be beside it,
+BESIDE = 0.5  # with this probability
 # Share of what moves that goes both ways, only the way of the axis or only against it: along the
 # normal that is outwards, as what is closed goes.
 SENSES = 3
@@ -56,22 +69,41 @@ class Pull(NamedTuple):
 
 
 def prior(chance: float) -> Belief:
-    """Of standing still, and of each joint and sense, given the probability to move."""
+    """Of standing still, and of each piece's joints and senses, given the probability to move."""
     joints = np.array([HINGE] * 4 + [ALONG_NORMAL] + [ALONG_SIDE] * 2)
     senses = np.array([SENSES_OUT] * 5 + [SENSES_SIDE] * 2)
-    moving = chance * (joints[:, None] * senses).ravel()
+    moving = chance * (SIZES[:, None, None] * joints[:, None] * senses).ravel()
     chances = np.concatenate([[1.0 - moving.sum()], moving])
     return Belief(chances, np.zeros(len(chances)))
 
 
 def _forces(surface: Surface, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Share of each pull's force that turns or slides each joint (n, 7), signed."""
-    place = (points - surface.centre) @ surface.sides.T
+    """Share of each pull's force that turns or slides each piece by each of its joints, signed;
+    (n, 7 * pieces)."""
+    low, high = PIECES[..., 0], PIECES[..., 1]
+    # of the way to the upper edges
+    share = np.clip((_places(surface, points) - low) / (high - low), 0.0, 1.0)
+    out = np.broadcast_to((directions @ surface.normal)[:, None, None], (*share.shape[:2], 1))
+    sideways = np.broadcast_to((directions @ surface.sides.T)[:, None], share.shape)
+    forces = [out * share, out * (1.0 - share), out, sideways]
+    return np.concatenate(forces, axis=2).reshape(len(points), -1)
+
+
+def _places(surface: Surface, points: np.ndarray) -> Float[np.ndarray, "n 1 2"]:
+    """Where points are along the sides of a surface's rectangle, from 0 to 1."""
     extent = np.maximum(surface.high - surface.low, 1e-3)
-    share = np.clip((place - surface.low) / extent, 0.0, 1.0)  # of the way to the upper edges
-    out = (directions @ surface.normal)[:, None]
-    levers = np.concatenate([share, 1.0 - share], axis=1)
-    return np.concatenate([out * levers, out, directions @ surface.sides.T], axis=1)
+    place = (points - surface.centre) @ surface.sides.T
+    return np.clip((place - surface.low) / extent, 0.0, 1.0)[:, None]
+
+
+def _held(surface: Surface, points: np.ndarray) -> Float[np.ndarray, "n hypotheses"]:
+    """Probability that a hand at each point has hold of the piece of each hypothesis."""
+    place, low, high = _places(surface, points), PIECES[..., 0], PIECES[..., 1]
+    within = np.minimum(
+        np.where(low > 0.0, place - low, 1.0), np.where(high < 1.0, high - place, 1.0)
+    ).min(axis=2)
+    held = np.where(within > BORDER, 1.0, np.where(within > -BORDER, 1.0 - BESIDE, 0.0))
+    return np.pad(np.repeat(held, JOINTS * SENSES, axis=1), [(0, 0), (1, 0)], constant_values=1.0)
 
 
 def _shares(
@@ -103,7 +135,8 @@ def moves(
     directions: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, " n"]:
     """Probability that each pull moves the surface."""
-    return _goes(_shares(surface, points, directions), belief.withstood) @ belief.chances
+    goes = _goes(_shares(surface, points, directions), belief.withstood)
+    return (_held(surface, points) * goes) @ belief.chances
 
 
 def posterior(belief: Belief, surface: Surface, pulls: Sequence[Pull]) -> Belief:
@@ -111,17 +144,18 @@ def posterior(belief: Belief, surface: Surface, pulls: Sequence[Pull]) -> Belief
     chances, withstood = belief
     for pull in pulls:
         point, direction = pull.point[None], pull.direction[None]
-        shares = _shares(surface, point, direction)[0]
-        goes = _goes(shares, withstood)
+        shares, held = _shares(surface, point, direction)[0], _held(surface, point)[0]
+        goes = held * _goes(shares, withstood)
         if pull.moved:
             goes[0] = STRAYED
             chances = chances * goes
         else:
             along = np.repeat(np.abs(_forces(surface, point, direction)[0]), SENSES)
-            play = np.where(np.concatenate([[0.0], along]) > FELT, PLAY, PLAY_STILL)
+            feels = held * (np.concatenate([[0.0], along]) > FELT)
+            play = PLAY_STILL + feels * (PLAY - PLAY_STILL)
             chances = chances * (1.0 - goes) * (play if pull.travel > PLAYED else 1.0 - play)
         if pull.ended or not pull.moved:
-            withstood = np.maximum(withstood, shares)
+            withstood = np.maximum(withstood, shares * (held == 1.0))
         if pull.moved and pull.ended:
             at_end = pull.travel / (pull.travel + CATCH)
             joints = chances[1:].reshape(-1, SENSES).sum(axis=1)

@@ -31,6 +31,7 @@ TURNS = np.arange(-2.2, 2.21, 0.1)  # rad
 TRIED = 3  # of the options, the best
 ENOUGH = 200.0  # of evidence, of all points and looks
 SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enough
+UNSURE = 45.0  # deg: a part whose axis is less known than so is shown by no two looks
 LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
 HINGE = 0.05  # m between the axes of what turns about one hinge
 LARGEST = 0.5  # of a carrier's points in a look: a piece that is larger is no part on it
@@ -271,11 +272,12 @@ def _insert(tree: PartTree, option: Option) -> bool:
         taken += int(np.sum(tree.labels[at][carrier] == number))
         whole += int(carrier.sum())
     refused = taken > MOST * whole or max(len(part.seen[at]) for at in before) < FEWEST
-    refused |= len(part.seen[look]) > GROWN * size
+    estimate = tree.estimate(part)
+    refused |= len(part.seen[look]) > GROWN * size or estimate.intervals[0] > UNSURE
     if refused and number == count:  # else it has replaced another
         tree.remove(number, part.parent)
         return False
-    part.settle(tree.estimate(part))
+    part.settle(estimate)
     _replace_same(tree, number)
     return True
 

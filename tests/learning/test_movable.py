@@ -64,7 +64,7 @@ def test_a_pull_that_failed_on_one_half_hardly_tells_of_the_other():
 
 
 def test_where_pieces_meet_a_pull_tells_less_of_either():
-    """Of the half whose hinge is at the right edge: in its middle, and where the other begins."""
+    """Of the half whose hinge is at the right edge: where the other begins, before it and on it."""
     half = certain(1 + 3 * 7 + 1)  # the first hinge of the piece after the whole, opening outwards
     assert chance(half, np.array([0, -0.02, 0.0]), OUT) == pytest.approx(0.5 * (1.0 - HEAVY), 0.1)
     assert chance(half, np.array([0, -0.05, 0.0]), OUT) == pytest.approx(1.0 - HEAVY, 0.1)

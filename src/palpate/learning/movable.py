@@ -18,17 +18,15 @@ from palpate.perception.surfaces import Surface
 HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
 JOINTS = 7
 # Pieces of a surface, from one share of a side of its rectangle to another, and how many parts are
-# so much of their surface: of 200 generated ones 130 are all of it.
-WHOLE, HALF, QUARTER = 0.64, 0.045, 0.0225  # each of these and of those of three quarters
-SPANS = ((0.0, 0.5), (0.5, 1.0), (0.0, 0.25), (0.75, 1.0), (0.0, 0.75), (0.25, 1.0))
-PIECES = np.array(
-    [[(0.0, 1.0), (0.0, 1.0)]]
-    + [[span, (0.0, 1.0)] for span in SPANS]
-    + [[(0.0, 1.0), span] for span in SPANS]
-)
-SIZES = np.array([WHOLE, *2 * [HALF, HALF, QUARTER, QUARTER, QUARTER, QUARTER]])
-BORDER = 0.06  # of a side: so near the end of a piece within the surface a hand may be beside it,
-BESIDE = 0.5  # with this probability
+# such a piece along either side; the others are all of their surface, 130 of 200 generated ones.
+SPANS = {(0.0, 0.5): 0.045, (0.5, 1.0): 0.045}
+SPANS |= dict.fromkeys([(0.0, 0.25), (0.75, 1.0), (0.0, 0.75), (0.25, 1.0)], 0.0225)
+ALL = (0.0, 1.0)
+PIECES = np.array([(ALL, ALL), *((one, ALL) for one in SPANS), *((ALL, one) for one in SPANS)])
+SIZES = np.array([1.0 - 2.0 * sum(SPANS.values()), *SPANS.values(), *SPANS.values()])
+# Of a side: so near the end of a piece within the surface a hand may be beside the piece, with this
+# probability.
+BORDER, BESIDE = 0.06, 0.5
 # Share of what moves that goes both ways, only the way of the axis or only against it: along the
 # normal that is outwards, as what is closed goes.
 SENSES = 3

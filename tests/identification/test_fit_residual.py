@@ -168,6 +168,17 @@ def test_a_cut_off_fit_goes_on_to_the_same_result(tmp_path, monkeypatch):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.parametrize(("count", "judges"), [(3, 2), (4, 3), (5, 4), (8, 4), (16, 4), (40, 10)])
+def test_few_trials_rather_judge_than_teach(count, judges):
+    """Two held-out trials agree by chance too often: one correction in three of those kept so made
+    the motion of an oven worse."""
+    ones = np.ones((count, 1, 1))
+    aligned = Aligned(0.1, ones, ones, np.ones(count, int))
+    fitted, held_out = residual._split(aligned, ResidualSettings())
+    assert len(held_out) == judges
+    assert sorted([*fitted, *held_out]) == list(range(count))
+
+
 def test_what_cannot_be_fitted_is_refused():
     physics, aligned, settings = dropped_case()
 

@@ -38,6 +38,7 @@ from palpate.runs.progress import interruptible, progress
 
 CHECK = 20  # iterations between looks at the held-out trials
 CONFIDENCE = 0.95  # that the gain on held-out trials is not chance, one-sided
+JUDGES = 4  # held-out trials at least, where there are so many: two agree by chance too often
 MIN_GAIN = 0.02  # of the physics' error, below which a correction is not worth carrying
 AVERAGED = 30  # iterations whose networks are averaged (Polyak): one alone is noisy
 # Share of what the physics changes below which a correction mends no physics: it makes up for how
@@ -52,8 +53,8 @@ class ResidualSettings:
 
     `share`: the most it adds to a velocity in a control period, relative to the root mean square
     of what the physics changes there. `horizons` are shares of the longest that every trial
-    offers; `held_out` is the share of the trials that stop and decide, `patience` how many looks
-    at them without progress end the descent.
+    offers; `held_out` is the share of the trials that stop and decide, and at least `JUDGES` of
+    them where there are more; `patience` looks at them without progress end the descent.
     """
 
     share: float = 0.3
@@ -150,7 +151,7 @@ def check_correctable(model: Model, aligned: Aligned) -> None:
 def _split(aligned: Aligned, settings: ResidualSettings) -> tuple[np.ndarray, np.ndarray]:
     count = len(aligned.length)
     order = np.random.default_rng(settings.seed).permutation(count)
-    judges = min(max(2, round(settings.held_out * count)), count - 1)
+    judges = min(max(JUDGES, round(settings.held_out * count)), count - 1)
     return np.sort(order[judges:]), np.sort(order[:judges])
 
 

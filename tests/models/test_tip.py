@@ -130,6 +130,15 @@ def test_friction_holds_what_pushes_less_than_it_and_lets_go_of_what_pushes_more
         assert not sticks or np.asarray(states.force)[-1, 1] == pytest.approx(-pull * 5.0, rel=0.02)
 
 
+def test_where_a_wall_holds_the_tip_the_sensor_feels_all_of_the_pull_and_the_arm_holds_nothing():
+    """About 40 N on the wall would hold 12 N; the arm would take 0.6 N of the pull if it slid."""
+    tip = walled([LEFT], friction=0.3, arm_friction=0.6, arm_creep=1e-3, stiffness=1e3)
+    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([0.08, 0.01], [1e3, 500.0], 400))
+    pull = 500.0 * (0.01 - states.position[-1, 1])
+    assert 2.0 < float(pull) < 12.0
+    np.testing.assert_allclose(states.force[-1, 1], -pull, rtol=0.01)
+
+
 def test_dry_friction_of_the_arm_slows_a_free_tip_straight_to_a_stop():
     tip = walled([LEFT], mass=2.0, arm_friction=0.6, arm_creep=1e-5, position=-9.0)
     states = run(tip, moving([0.0, 0.0], [0.3, 0.4]), held([0.0, 0.0], [0.0, 0.0], 400))

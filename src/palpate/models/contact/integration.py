@@ -90,17 +90,18 @@ def advance(
     force = jnp.maximum(push - yielding * _along(normal, mean), 0.0)
     total = jnp.sum(normal * force[..., None], axis=-2)
 
-    # Friction as a further force, of the size that the velocity at the end asks for: of the arm,
-    # then of one wall after the other, as in a corner each acts on the rest.
-    sliding = 2.0 * mean - velocity
-    speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=-1) + 1e-18)
-    along = sliding / speed[..., None]
-    mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
+    # Friction as a further force, of the size that the velocity at the end asks for: of one wall
+    # after the other, as in a corner each acts on the rest. Of the arm last: where a wall holds the
+    # tip, nothing is left for the arm to hold, and the sensor feels all of it.
     for wall in range(normal.shape[-2]):
         tangent = jnp.broadcast_to(_turned(normal[..., wall, :]), mean.shape)
         most = (friction * force)[..., wall]
         mean, rubbing = _rubbed(mean, velocity, tangent, most, inverse, slip)
         total = total - tangent * rubbing[..., None]
+    sliding = 2.0 * mean - velocity
+    speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=-1) + 1e-18)
+    along = sliding / speed[..., None]
+    mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
     return position + time * mean, 2.0 * mean - velocity, total
 
 

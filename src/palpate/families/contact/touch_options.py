@@ -65,6 +65,7 @@ class IdentifyContact(Identify):
 
     family: ClassVar[str] = "contact"
     observation: ClassVar[str] = "position"
+    one_object: ClassVar[bool] = True
     piece: ClassVar[float] = 1.25  # s
 
     walls: Annotated[

@@ -137,22 +137,6 @@ def _inverse(information: Float[np.ndarray, "starts free free"]) -> np.ndarray:
     return 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
 
 
-def search(
-    curvature: Callable[[Array], tuple[ArrayLike, ...]],
-    position: Float[np.ndarray, "starts free"],
-    moving: Bool[np.ndarray, " free"],
-    watch: Watch = unwatched,
-) -> Modes:
-    """Climb from many starts for a few steps, and from where the best of them are to the top.
-
-    Most starts of a body that may stick end where it sticks for ever, and climb no further. Only
-    `moving` coordinates climb at first: scales that are free as well would grow until all that
-    happened is the model's discrepancy, and leave most climbs there.
-    """
-    screened = climb_each(curvature, position, SCREENING, moving, watch)
-    return climb_each(curvature, np.asarray(screened.position[:FOLLOWED]), CLIMBING, None, watch)
-
-
 def look(
     target: Target, position: Float[np.ndarray, "starts free"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -195,6 +179,15 @@ def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
     return over_devices(lambda target, part: target.curvatures(part))(target, position)
 
 
+def _screened(
+    target: MotionPosterior, position: Float[np.ndarray, "starts free"], watch: Watch
+) -> Float[np.ndarray, "followed free"]:
+    """Where the best climbs arrive in a few steps; scales stay where they are."""
+    parameters = np.arange(target.dimension) < target.parameters
+    climbed = climb_each(functools.partial(_each, target), position, SCREENING, parameters, watch)
+    return np.asarray(climbed.position[:FOLLOWED])
+
+
 def settle(
     target: MotionPosterior, key: PRNGKeyArray, watch: Watch = unwatched
 ) -> tuple[MotionPosterior, Modes]:
@@ -206,8 +199,17 @@ def settle(
     noise = jax.random.normal(key, (STARTS, target.dimension))
     position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
     parameters = np.arange(target.dimension) < target.parameters
-    position = np.where(parameters, position, WIDE)
-    modes = _found(target, search(functools.partial(_each, target), position, parameters, watch))
+    # Most starts of a body that may stick end where it sticks for ever, and climb no further: the
+    # best of them go on. Only parameters climb at first: scales that are free as well would grow
+    # until all that happened is the model's discrepancy, and leave most climbs there.
+    screened = _screened(target, np.where(parameters, position, WIDE), watch)
+    if target.error is not None:
+        # They would also grow to make up for errors of the start that a far model propagates: from
+        # the best so far these are propagated anew, and parameters climb once more.
+        target = target.linearised(screened[0], MENDING)
+        screened = _screened(target, np.where(parameters, screened, 0.0), watch)
+    modes = climb_each(functools.partial(_each, target), screened, CLIMBING, None, watch)
+    modes = _found(target, modes)
     if target.sensitivity is None:
         return target, modes
     for _ in range((ROUNDS if target.error is None else MENDED) - 1):

@@ -73,6 +73,6 @@ def test_figures_are_medians_and_the_share_of_intervals_that_hold(tmp_path, monk
     assert not figures["gradient.coverage_90_over"].met
     assert figures["posterior.coverage_90"].value == pytest.approx(2 / 3)
     assert "straight line" in (figures["gradient.friction_error"].rival or "")
-    assert result.seeds == [3, 300_003]
+    assert result.seeds == [3, contact_model.FIRST + 3]
     assert result.settings["missed"]["posterior"] == [["friction", "friction"]]
     assert result.wall_time_s == pytest.approx(6.0)

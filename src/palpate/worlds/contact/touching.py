@@ -10,6 +10,7 @@ from palpate.recordings import Channel, Quantity, Recording, Role, Trial
 from palpate.worlds.contact.plates import CONTROL_PERIOD, DISTANCE, NOMINAL, PlatesWorld
 
 EVERY = 5  # control periods between two frames
+STILL = 0.2  # s at the start of a trial, as a sensor is tared: nobody has to find how it began
 STIFF = 300.0, 900.0  # N/m, of the impedance, log-uniform, along each axis for a whole trial
 BEHIND = 0.01, 0.045  # m behind a plate's nominal place, where a set-point presses
 BEFORE = 0.02, 0.04  # m in front of it, where the tip is free
@@ -22,18 +23,18 @@ NORMALS = "wall normals"  # a fact: nominal directions of the outward normals, r
 def touches(seed: int, duration: float) -> Float[np.ndarray, "periods 4"]:
     """Actions at the control rate: touch a plate, slide along it and leave it, again and again.
 
-    Each touch is of one plate or of both; the set-point moves from point to point by minimum jerk
-    (Flash and Hogan, J. Neurosci. 5, 1985), and starts at the origin. Raises `PalpateError` for a
-    time shorter than one move.
+    Each touch is of one plate or of both; the set-point rests at the origin, and then moves from
+    point to point by minimum jerk (Flash and Hogan, J. Neurosci. 5, 1985). Raises `PalpateError`
+    for a time shorter than the rest and one move.
     """
-    if not (math.isfinite(duration) and duration >= LASTS[1]):
-        raise PalpateError(f"touching takes {LASTS[1]} s or longer, not {duration} s")
+    if not (math.isfinite(duration) and duration >= STILL + LASTS[1]):
+        raise PalpateError(f"touching takes {STILL + LASTS[1]} s or longer, not {duration} s")
     random = np.random.default_rng([seed, 2])
     steps = round(duration / CONTROL_PERIOD)
     outward = np.array([[math.cos(angle), math.sin(angle)] for angle in NOMINAL])
     low, high = np.log(STIFF)
     stiffness = np.exp(random.uniform(low, high, 2))
-    here, way = np.zeros(2), []
+    here, way = np.zeros(2), [np.zeros((round(STILL / CONTROL_PERIOD), 2))]
     while sum(map(len, way)) < steps:
         touched = random.permutation(2)[: random.choice([1, 2], p=[0.75, 0.25])]
         targets = []

@@ -180,11 +180,18 @@ def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
 
 
 def _screened(
-    target: MotionPosterior, position: Float[np.ndarray, "starts free"], watch: Watch
+    target: MotionPosterior,
+    position: Float[np.ndarray, "starts free"],
+    scale: float,
+    watch: Watch,
 ) -> Float[np.ndarray, "followed free"]:
-    """Where the best climbs arrive in a few steps; scales stay where they are."""
+    """Where the best climbs of the parameters arrive in a few steps; `scale` is that of scales.
+
+    Scales that are free as well would grow until all that happened is the model's discrepancy.
+    """
     parameters = np.arange(target.dimension) < target.parameters
-    climbed = climb_each(functools.partial(_each, target), position, SCREENING, parameters, watch)
+    begun = np.where(parameters, position, scale)
+    climbed = climb_each(functools.partial(_each, target), begun, SCREENING, parameters, watch)
     return np.asarray(climbed.position[:FOLLOWED])
 
 
@@ -198,16 +205,14 @@ def settle(
     """
     noise = jax.random.normal(key, (STARTS, target.dimension))
     position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
-    parameters = np.arange(target.dimension) < target.parameters
     # Most starts of a body that may stick end where it sticks for ever, and climb no further: the
-    # best of them go on. Only parameters climb at first: scales that are free as well would grow
-    # until all that happened is the model's discrepancy, and leave most climbs there.
-    screened = _screened(target, np.where(parameters, position, WIDE), watch)
+    # best of them go on.
+    screened = _screened(target, np.asarray(position), WIDE, watch)
     if target.error is not None:
-        # They would also grow to make up for errors of the start that a far model propagates: from
-        # the best so far these are propagated anew, and parameters climb once more.
-        target = target.linearised(screened[0], MENDING)
-        screened = _screened(target, np.where(parameters, screened, 0.0), watch)
+        # Errors of the start that a far model propagates explain nothing, and discrepancy grows in
+        # their place: from the best so far they are propagated anew.
+        target = target.linearised(jnp.asarray(screened[0]), MENDING)
+        screened = _screened(target, screened, 0.0, watch)
     modes = climb_each(functools.partial(_each, target), screened, CLIMBING, None, watch)
     modes = _found(target, modes)
     if target.sensitivity is None:

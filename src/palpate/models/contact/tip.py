@@ -19,7 +19,7 @@ Number = Float[Array, "*batch"]
 Walls = Float[Array, "*batch walls"]
 Point = Float[Array, "*batch 2"]
 
-SUBSTEP = 1.25e-3  # s, of the integration, at most: twice that is felt as .5 % of a stiffness
+SUBSTEP = 1.25e-3  # s, of the integration, at most: of twice that stiffnesses were .2 % further off
 UNROLLED = 4  # so many of them in a control period are written out
 OF_WALLS = "position", "tilt", "stiffness", "damping", "friction", "wall_mass"
 SLIP = 1e-5  # m/s, the sliding velocity at which a wall's friction has half its size

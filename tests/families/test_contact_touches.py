@@ -10,6 +10,7 @@ from palpate.errors import PalpateError
 from palpate.experiments.contact.contact_model import truth_of
 from palpate.families.contact.touch_options import IdentifyContact, RecordContact
 from palpate.families.contact.touches import directions_of, problems, starting_tip, with_channels
+from palpate.identification.posterior.comparison import begins_at_rest, cut_pieces
 from palpate.recordings.files import read_recording
 from palpate.worlds.contact.plates import plates_of
 
@@ -38,6 +39,17 @@ def test_walls_begin_where_the_force_begins_to_grow_with_depth(recording):
     assert "may not be in m" in problems(wrong)[0]
     with pytest.raises(PalpateError, match=r"faces to 90 degrees is felt in .* is the sign"):
         starting_tip(aligned, np.array([math.pi / 2]))
+
+
+def test_touches_begin_at_rest_though_their_force_sensor_drifts(recording):
+    aligned = recording.align(5e-3, ("position", "force"), ("setpoint", "stiffness"))
+    tip = starting_tip(aligned, directions_of(recording, ()))
+    assert begins_at_rest(aligned, tip)
+    segments = cut_pieces(aligned, tip, 2.0, one_object=True)
+    assert segments.count == 3
+    assert not segments.rate_deviation.any()
+    moving = aligned.observation + 1e-4 * np.arange(aligned.observation.shape[1])[:, None]
+    assert not begins_at_rest(dataclasses.replace(aligned, observation=moving), tip)
 
 
 def test_directions_are_those_told_or_those_recorded(recording):

@@ -171,7 +171,7 @@ def test_the_discrepancy_is_twice_integrated_from_an_acceleration_that_is_forgot
 def test_the_discrepancy_of_a_force_comes_and_goes_and_that_of_a_place_grows():
     """A likelihood that takes a sensor's lasting noise for white counts it many times."""
     seen = np.ones((2, 15, 3), bool)
-    vectors, values, _ = eigenvectors(seen, 0.02, ("m", "N", "N"))
+    vectors, values, _ = eigenvectors(seen, 0.02, np.array([False, True, True]))
     kernel = np.einsum("wcts,wcs,wcus->wctu", vectors, values, vectors)
     time = 0.02 * np.arange(1, 16)
     forgotten = np.exp(-np.abs(time[:, None] - time) / MEMORY)

@@ -7,13 +7,15 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Bool
 
 from palpate.errors import PalpateError
 from palpate.parameters import Parameter, table
 
 State = TypeVar("State")
 
+FORCES = "N", "N m"  # units of what a sensor shows of itself, and no motion adds up to
 SOLVED = "solved"  # `checkpoint_name` of a solver's result, which nothing is to solve for again
 
 
@@ -46,6 +48,11 @@ class Model(eqx.Module):
     def observation_units(self) -> tuple[str, ...]:
         """Unit of each element of an observation's last axis; empty where the model names none."""
         return ("",) * self.observation_shape[-1]
+
+    @property
+    def observes_force(self) -> Bool[np.ndarray, " last"]:
+        """Which elements of an observation's last axis are forces, by their units."""
+        return np.isin(self.observation_units, FORCES)
 
     @abstractmethod
     def step(self, state: Any, action: Array) -> Any:

@@ -287,6 +287,17 @@ def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.
     return np.asarray(model.difference(jnp.asarray(predicted), jnp.asarray(observed)), np.float64)
 
 
+def stands_still(model: Model, early: np.ndarray, late: np.ndarray, noise: np.ndarray) -> bool:
+    """Whether the means of frames early and late, equally many, differ no more than noise does.
+
+    Forces count only where nothing else is observed: they change at rest, as their sensors drift.
+    """
+    moved = np.abs(difference(model, late.mean(axis=0), early.mean(axis=0)))
+    still = moved <= MOVED * noise * np.sqrt(2.0 / len(early))
+    moving = ~model.observes_force
+    return bool(np.all(still[..., moving] if moving.any() else still))
+
+
 def _rest(observed: np.ndarray, model: Model, spread: np.ndarray, period: float) -> int:
     """For how many frames of a trial that begins at rest nothing moves beyond the noise; or one.
 
@@ -294,11 +305,9 @@ def _rest(observed: np.ndarray, model: Model, spread: np.ndarray, period: float)
     the second half of a trial: one that rests to its end shows something, too.
     """
     frames = max(2, round(STILL / period))
-    first = observed[:frames].mean(axis=0)
-    rest = frames
+    first, rest = observed[:frames], frames
     while rest + frames <= len(observed):
-        moved = difference(model, observed[rest : rest + frames].mean(axis=0), first)
-        if not np.all(np.abs(moved) <= MOVED * spread * np.sqrt(2.0 / frames)):
+        if not stands_still(model, first, observed[rest : rest + frames], spread):
             break
         rest += frames
     return max(1, min(rest - frames, len(observed) // 2))

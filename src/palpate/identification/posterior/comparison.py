@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
-from palpate.identification.data.segments import MOVED, Segments, cut, difference, noise_scale
+from palpate.identification.data.segments import Segments, cut, noise_scale, stands_still
 from palpate.identification.posterior.likelihood import (
     MotionPosterior,
     inferred_scales,
@@ -108,7 +108,6 @@ def begins_at_rest(aligned: Aligned, model: Model) -> bool:
         early, late = observed[:frames], observed[frames : 2 * frames]
         if len(late) < frames or not (np.isfinite(early).all() and np.isfinite(late).all()):
             return False  # nobody knows
-        moved = difference(model, late.mean(axis=0), early.mean(axis=0))
-        if np.any(np.abs(moved) > MOVED * noise * np.sqrt(2.0 / frames)):
+        if not stands_still(model, early, late, noise):
             return False
     return True

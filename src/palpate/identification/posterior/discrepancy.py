@@ -6,7 +6,6 @@ no motion adds up to, it is soon forgotten itself: Ornstein-Uhlenbeck, as the no
 """
 
 import functools
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -35,30 +34,24 @@ def force_covariance(time: Float[np.ndarray, " time"]) -> Float[np.ndarray, "tim
 
 
 COVARIANCES = discrepancy_covariance, force_covariance  # by whether it is of a force
-FORCES = "N", "N m"  # units of what a sensor shows of itself, and no motion adds up to
-
-
-def of_force(units: Sequence[str]) -> Bool[np.ndarray, " last"]:
-    """Which entries of the last axis of an observation, in these units, are forces."""
-    return np.isin(units, FORCES)
 
 
 def eigenvectors(
     seen: Bool[np.ndarray, "segments time ..."],
     period: float,
-    units: Sequence[str],
+    observes_force: Bool[np.ndarray, " last"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the unit discrepancy over the frames seen: vectors, values, and one where there is data.
 
     (segments, channels, time, time) and (segments, channels, time), in float64; of unit s^3, or of
-    one where an entry of the last axis of what is seen has the unit of a force. Frames not seen
-    have zero columns.
+    one where an entry of the last axis of what is seen is a force. Frames not seen have zero
+    columns.
     """
     count, horizon = seen.shape[:2]
     masks = np.moveaxis(seen.reshape(count, horizon, -1), 1, 2)
     time = period * np.arange(1, horizon + 1)
     kernels = [covariance(time) for covariance in COVARIANCES]
-    force = np.broadcast_to(of_force(units), seen.shape[2:]).ravel()
+    force = np.broadcast_to(observes_force, seen.shape[2:]).ravel()
 
     @functools.cache
     def decomposed(mask: bytes, force: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -31,9 +31,9 @@ from jaxtyping import Array, Float
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import predict, residuals
 from palpate.identification.data.segments import Segments
-from palpate.identification.posterior.discrepancy import FORCES, eigenvectors, of_force
+from palpate.identification.posterior.discrepancy import eigenvectors
 from palpate.identification.samplers.target import Target
-from palpate.models.model import Model
+from palpate.models.model import FORCES, Model
 from palpate.numerics.devices import compiled_at_once
 from palpate.numerics.small_systems import cholesky, solve, solve_lower
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
@@ -267,7 +267,7 @@ class MotionPosterior(Target):
         """
         if not np.all(self.counted):
             return self
-        force = of_force(self.coordinates.reference.observation_units)
+        force = self.coordinates.reference.observes_force
         channels = 1 if np.all(force) or not np.any(force) else None
         return eqx.tree_at(lambda t: t.rotation, self, self.rotation[:1, :channels])
 
@@ -343,7 +343,7 @@ def motion_posterior(
             f"but the pieces have {found[0]} and {found[1]}"
         )
     seen, period = np.asarray(segments.seen), model.control_period
-    rotation, spectrum, counted = eigenvectors(seen, period, model.observation_units)
+    rotation, spectrum, counted = eigenvectors(seen, period, model.observes_force)
     dtype = jnp.zeros(()).dtype
     deviations = np.asarray(segments.pose_deviation), np.asarray(segments.rate_deviation)
     uncertain = any(np.any(deviation > 0) for deviation in deviations)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import or_nan
 from palpate.identification.data.segments import Segments, difference
-from palpate.identification.posterior.discrepancy import COVARIANCES, of_force
+from palpate.identification.posterior.discrepancy import COVARIANCES
 from palpate.identification.posterior.likelihood import MotionPosterior, from_start
 
 LANES = 2048  # pieces times draws that are simulated at a time
@@ -81,8 +81,8 @@ def predict(
     # A little of the identity: in the first frames nothing has grown yet.
     little = 1e-9 * time[-1] ** 3 * np.eye(len(time))
     roots = [np.linalg.cholesky(covariance(time) + little) for covariance in COVARIANCES]
-    units = target.coordinates.reference.observation_units
-    root = jnp.asarray(np.stack(roots)[of_force(units).astype(int)], jnp.zeros(()).dtype)
+    force = target.coordinates.reference.observes_force
+    root = jnp.asarray(np.stack(roots)[force.astype(int)], jnp.zeros(()).dtype)
     chunk = max(1, LANES // segments.count)
     keys = jax.random.split(jax.random.key(seed), len(position))
     parts = []

@@ -202,6 +202,33 @@ def test_a_plate_that_is_met_takes_its_share_of_the_momentum():
     assert float(states.velocity[-1, 0]) == pytest.approx(-speed, rel=2e-3)
 
 
+@pytest.mark.parametrize("period", [2e-4, 1.25e-3])
+def test_a_plate_takes_as_much_wherever_in_a_step_it_is_met(period):
+    tip = walled([LEFT], **FREE, mass=1.0, wall_mass=0.25, stiffness=500.0)
+    tip = dataclasses.replace(tip, control_period=period)
+    before = 0.5 * period * np.array([1e-3, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
+    start = np.stack([-before, 0.0 * before], axis=1)
+    velocity = np.broadcast_to([0.5, 0.0], start.shape)
+    rest = jnp.zeros((len(start), round(0.3 / period), 6))
+    states = run(tip, TipState(*map(jnp.asarray, (start, velocity, 0.0 * start))), rest)
+    np.testing.assert_allclose(states.velocity[:, -1, 0], -0.5 / 1.25, rtol=5e-4)
+
+
+def test_what_is_observed_is_continuous_in_where_a_wall_is_met():
+    """Also as the impact moves from one step to another, where it would jump by 1.5 N at once."""
+    where = -0.02 - 1e-6 * np.arange(1500)  # across two substeps
+    tip = walled([LEFT], wall_mass=0.02, tool_mass=0.3, stiffness=1000.0, damping=25.0)
+    tip = with_values(tip, {"position": jnp.asarray(where)[:, None]})
+    start = jnp.zeros((len(where), 2))
+    velocity = jnp.broadcast_to(jnp.array([0.5, 0.1]), start.shape)
+    actions = jnp.broadcast_to(held([0.05, 0.0], [300.0, 300.0], 12), (len(where), 12, 6))
+    states = run(tip, TipState(start, velocity, start), actions)
+    seen = np.asarray(jax.vmap(tip.observe, in_axes=1, out_axes=1)(states))
+    assert np.ptp(seen[:, :, 2], axis=0).max() > 1.5  # N: some are about to touch, and some do
+    assert np.abs(np.diff(seen[:, :, 2:], axis=0)).max() < 0.06
+    assert np.abs(np.diff(seen[:, :, :2], axis=0)).max() < 4e-6
+
+
 def test_the_error_of_a_bounce_falls_with_the_square_of_the_step():
     tip = walled([LEFT], **FREE | {"damping": 8.0}, stiffness=1000.0, position=-0.02)
     ends = []

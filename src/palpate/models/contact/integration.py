@@ -14,6 +14,10 @@ from jaxtyping import Array, Float
 Vector = Float[Array, "*batch 2"]
 Numbers = Float[Array, "*batch walls"]
 
+# s, in which a plate that is met takes on the tip's velocity. At once, what a sensor shows would
+# jump as a parameter moves the impact from one step to another, and a likelihood's logarithm by 30.
+IMPACT = 2e-4
+
 
 class Surfaces(NamedTuple):
     """Walls as the integration needs them.
@@ -52,10 +56,12 @@ def advance(
     velocity: Vector,
     time: float,
     slip: float,
-) -> tuple[Vector, Vector, Vector]:
-    """Position, velocity, and the mean force of the walls on the tip in N, `time` seconds later.
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Position and velocity `time` seconds later, and the force of the walls on the tip till then.
 
-    `slip` (m/s) is the sliding velocity at which a wall's friction has half its size.
+    Its mean in N, and in N s its first moment about the middle of the step: a wall that is met late
+    in the step pushes late. `slip` (m/s) is the sliding velocity at which a wall's friction has
+    half its size.
     """
     normal, place, stiffness, damping, friction, plate = surfaces
     mass = impedance.mass
@@ -70,9 +76,19 @@ def advance(
     share = jnp.where(stiffness * pressed + damping * rate >= 0.0, share, 0.0)
     implicit = jnp.where(after > 0.0, 0.5 * share, 0.0)
     spring = stiffness * (jnp.where(depth > 0.0, 0.5 * share, 0.0) + implicit) * depth
-    # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy.
-    inertia = jnp.where(share > 0.0, plate / time, 0.0)
-    moved = jnp.where(depth > 0.0, 2.0, 1.0) * inertia * -rate
+    # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy. So much
+    # of it moves with the tip at the beginning of the step and at its end: there as the next step
+    # will see it, once the plate has slowed the tip and the step has become shorter.
+    speed = jnp.abs(rate) + 1e-9
+    first = jnp.clip(depth / (IMPACT * speed), 0.0, 1.0)
+    since = (after + time * jnp.where(depth > 0.0, jnp.maximum(rate, 0.0), 0.0)) / speed
+    slowing = jnp.where(rate > 0.0, plate, 0.0)
+    needed = IMPACT * (mass + slowing * first) + slowing * (0.5 * time - since)
+    last = (since * mass + 0.5 * time * slowing * first) / jnp.maximum(needed, 1e-9)
+    last = jnp.where(share > 0.0, jnp.clip(last, 0.0, 1.0), 0.0)
+    inertia = plate * last / time
+    carried = plate * jnp.minimum(first, last) / time
+    moved = (inertia + carried) * -rate
     # N s/m of the mean velocity
     yielding = time * stiffness * implicit + damping * share + 2.0 * inertia
 
@@ -89,6 +105,15 @@ def advance(
     mean = _product(inverse, right)
     force = jnp.maximum(push - yielding * _along(normal, mean), 0.0)
     total = jnp.sum(normal * force[..., None], axis=-2)
+    # How much later than the middle of the step each wall pushes: the spring while it is touched,
+    # and a plate that is met as it takes on the tip's velocity. Of the force the latter is `jolt`.
+    free = time * (1.0 - share)
+    before = jnp.where(depth > 0.0, 0.0, free)
+    jolt = (inertia - carried) * jnp.maximum(-_along(normal, 2.0 * mean - velocity), 0.0)
+    jolt = jnp.clip(jolt / (force + 1e-9), 0.0, 1.0)
+    impact = before + 0.5 * (jnp.minimum(IMPACT, time - before) - time)
+    later = (1.0 - jolt) * (before - 0.5 * free) + jolt * impact
+    late = jnp.sum(normal * (later * force)[..., None], axis=-2)
 
     # Friction as a further force, of the size that the velocity at the end asks for: of one wall
     # after the other, as in a corner each acts on the rest. Of the arm last: where a wall holds the
@@ -98,11 +123,12 @@ def advance(
         most = (friction * force)[..., wall]
         mean, rubbing = _rubbed(mean, velocity, tangent, most, inverse, slip)
         total = total - tangent * rubbing[..., None]
+        late = late - tangent * (later[..., wall] * rubbing)[..., None]
     sliding = 2.0 * mean - velocity
     speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=-1) + 1e-18)
     along = sliding / speed[..., None]
     mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
-    return position + time * mean, 2.0 * mean - velocity, total
+    return position + time * mean, 2.0 * mean - velocity, total, late
 
 
 def _rubbed(

@@ -160,6 +160,7 @@ class Tip(Model):
         time = self.control_period / count
         late = jnp.exp(-time / self.sensor_lag)[..., None]
         tool = self.tool_mass[..., None] / time
+        reaching = (1.0 - self.tool_mass / self.mass)[..., None] / self.sensor_lag[..., None]
         moments = time * (np.arange(count) + 0.5) - 0.5 * self.control_period
 
         def step(state: TipState, action: Array) -> TipState:
@@ -173,10 +174,12 @@ class Tip(Model):
 
             def advanced(state: TipState, moment: Array) -> tuple[TipState, None]:
                 here = impedance._replace(setpoint=setpoint + moment * moves)
-                position, velocity, force = advance(
+                position, velocity, force, later = advance(
                     surfaces, here, state.position, state.velocity, time, self.slip
                 )
                 force -= tool * (velocity - state.velocity)
+                # What the walls do late in a step has had less time to reach the sensor.
+                force += reaching * later
                 sensed = force + late * (state.force - force)
                 return TipState(position, velocity, sensed), None
 

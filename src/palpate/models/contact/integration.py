@@ -79,9 +79,9 @@ def advance(
     # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy. So much
     # of it moves with the tip at the beginning of the step and at its end: there as the next step
     # will see it, once the plate has slowed the tip and the step has become shorter.
-    speed = jnp.abs(rate) + 1e-9
-    first = jnp.clip(depth / (IMPACT * speed), 0.0, 1.0)
-    since = (after + time * jnp.where(depth > 0.0, jnp.maximum(rate, 0.0), 0.0)) / speed
+    approach = jnp.abs(rate) + 1e-9
+    first = jnp.clip(depth / (IMPACT * approach), 0.0, 1.0)
+    since = (after + time * jnp.where(depth > 0.0, jnp.maximum(rate, 0.0), 0.0)) / approach
     slowing = jnp.where(rate > 0.0, plate, 0.0)
     needed = IMPACT * (mass + slowing * first) + slowing * (0.5 * time - since)
     last = (since * mass + 0.5 * time * slowing * first) / jnp.maximum(needed, 1e-9)

@@ -29,8 +29,8 @@ def walled(directions, **values) -> Tip:
     return facing(directions, **nothing | values)
 
 
-def moving(position, velocity) -> TipState:
-    return TipState(jnp.asarray(position, float), jnp.asarray(velocity, float), jnp.zeros(2))
+def moving(tip, position, velocity) -> TipState:
+    return tip.state(jnp.asarray(position, float), jnp.asarray(velocity, float))
 
 
 def held(setpoint, stiffness, steps: int):
@@ -44,7 +44,7 @@ def test_it_keeps_the_contract_of_a_model():
 def test_without_contact_the_impedance_swings_as_its_closed_form():
     """An underdamped oscillator along each axis, of another stiffness each."""
     tip = walled([LEFT], mass=2.0, damping_ratio=0.4, position=-9.0)
-    states = run(tip, moving([0.0, 0.0], [0.0, 0.1]), held([0.1, 0.0], [200.0, 50.0], 200))
+    states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.1]), held([0.1, 0.0], [200.0, 50.0], 200))
     time = tip.control_period * np.arange(1, 201)
     for axis, (stiffness, x, v, goal) in enumerate([(200.0, 0.0, 0.0, 0.1), (50.0, 0.0, 0.1, 0.0)]):
         natural = np.sqrt(stiffness / 2.0)
@@ -65,7 +65,7 @@ def test_a_set_point_that_moves_within_a_period_pulls_as_one_that_is_ordered_mor
     force, lag = {}, {}
     for speed in (0.3, 0.0):
         rows = [middle, still, still + 300.0, still + 300.0, still + speed, still]
-        states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), jnp.asarray(np.stack(rows, axis=1)))
+        states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), jnp.asarray(np.stack(rows, axis=1)))
         force[speed] = float(jnp.abs(states.force[-1, 0]))
         lag[speed] = 0.3 * tip.control_period * 100 - float(states.position[-1, 0])
     damping = 2.0 * 0.8 * math.sqrt(300.0 * 1.2)
@@ -91,7 +91,7 @@ def test_a_controller_that_holds_its_force_is_one_that_acts_late_by_half_as_long
     for delay in (0.0, 0.5 * hold):
         tip = walled([LEFT], mass=mass, damping_ratio=ratio, control_delay=delay, position=-9.0)
         actions = held([0.05, 0.0], [stiffness, stiffness], len(expected))
-        states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), actions)
+        states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), actions)
         off[delay] = np.abs(np.asarray(states.position)[:, 0] - expected).max()
     assert off[0.0] > 5e-4
     assert off[0.5 * hold] < 0.2 * off[0.0]
@@ -101,7 +101,7 @@ def test_a_controller_that_holds_its_force_is_one_that_acts_late_by_half_as_long
 def test_it_comes_to_rest_as_deep_as_the_force_over_the_stiffness(stiffness):
     """Wall and impedance as two springs in a row; a far stiffer wall than the step resolves too."""
     tip = walled([LEFT], position=-0.05, stiffness=stiffness, damping=stiffness**0.5)
-    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([0.1, 0.0], [300.0, 300.0], 1000))
+    states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), held([0.1, 0.0], [300.0, 300.0], 1000))
     force = 300.0 * stiffness / (300.0 + stiffness) * 0.05
     assert float(states.position[-1, 0]) - 0.05 == pytest.approx(force / stiffness, rel=1e-6)
     np.testing.assert_allclose(states.force[-1], [-force, 0.0], rtol=1e-6, atol=1e-9)
@@ -111,7 +111,9 @@ def test_a_tip_that_slides_is_slowed_by_friction_times_normal_force():
     """Pressed by a set-point behind the wall, soft along it: constant deceleration, then rest."""
     tip = walled([LEFT], mass=1.5, friction=0.4, stiffness=1e4, damping_ratio=0.0, damping=200.0)
     depth = 10.0 / 1e4
-    states = run(tip, moving([depth, 0.0], [0.0, 0.8]), held([1.0 + depth, 0.0], [10.0, 0.0], 120))
+    states = run(
+        tip, moving(tip, [depth, 0.0], [0.0, 0.8]), held([1.0 + depth, 0.0], [10.0, 0.0], 120)
+    )
     normal, along = np.asarray(states.force).T
     time = tip.control_period * np.arange(1, 121)
     slides = time < 0.8 / (0.4 * 10.0 / 1.5)
@@ -124,7 +126,7 @@ def test_friction_holds_what_pushes_less_than_it_and_lets_go_of_what_pushes_more
     tip = walled([LEFT], friction=0.5, stiffness=1e4)
     for pull, sticks in ((0.9, True), (1.1, False)):
         action = held([0.1 + 10.0 / 1e4, pull * 0.5 * 10.0 / 50.0], [100.0, 50.0], 400)
-        states = run(tip, moving([10.0 / 1e4, 0.0], [0.0, 0.0]), action)
+        states = run(tip, moving(tip, [10.0 / 1e4, 0.0], [0.0, 0.0]), action)
         went = float(jnp.linalg.norm(states.position[-1] - jnp.array([10.0 / 1e4, 0.0])))
         assert (went < 3e-3) == sticks
         assert not sticks or np.asarray(states.force)[-1, 1] == pytest.approx(-pull * 5.0, rel=0.02)
@@ -133,7 +135,7 @@ def test_friction_holds_what_pushes_less_than_it_and_lets_go_of_what_pushes_more
 def test_where_a_wall_holds_the_tip_the_sensor_feels_all_of_the_pull_and_the_arm_holds_nothing():
     """About 40 N on the wall would hold 12 N; the arm would take 0.6 N of the pull if it slid."""
     tip = walled([LEFT], friction=0.3, arm_friction=0.6, arm_creep=1e-3, stiffness=1e3)
-    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([0.08, 0.01], [1e3, 500.0], 400))
+    states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), held([0.08, 0.01], [1e3, 500.0], 400))
     pull = 500.0 * (0.01 - states.position[-1, 1])
     assert 2.0 < float(pull) < 12.0
     np.testing.assert_allclose(states.force[-1, 1], -pull, rtol=0.01)
@@ -141,7 +143,7 @@ def test_where_a_wall_holds_the_tip_the_sensor_feels_all_of_the_pull_and_the_arm
 
 def test_dry_friction_of_the_arm_slows_a_free_tip_straight_to_a_stop():
     tip = walled([LEFT], mass=2.0, arm_friction=0.6, arm_creep=1e-5, position=-9.0)
-    states = run(tip, moving([0.0, 0.0], [0.3, 0.4]), held([0.0, 0.0], [0.0, 0.0], 400))
+    states = run(tip, moving(tip, [0.0, 0.0], [0.3, 0.4]), held([0.0, 0.0], [0.0, 0.0], 400))
     slowed_down = np.maximum(0.5 - 0.3 * tip.control_period * np.arange(1, 401), 0.0)
     expected = np.outer(slowed_down, [0.6, 0.8])
     np.testing.assert_allclose(states.velocity, expected, atol=1e-3)
@@ -169,7 +171,7 @@ def test_a_bounce_has_the_restitution_of_the_linear_spring_and_damper(ratio):
     expected = np.exp(-decay / swing * (np.pi - phase))
     tip = walled([LEFT], **FREE | {"damping": 2 * mass * decay}, mass=mass, stiffness=stiffness)
     tip = dataclasses.replace(tip, control_period=2e-4)
-    states = run(tip, moving([-0.01, 0.0], [0.5, 0.0]), held([0.0, 0.0], [0.0, 0.0], 600))
+    states = run(tip, moving(tip, [-0.01, 0.0], [0.5, 0.0]), held([0.0, 0.0], [0.0, 0.0], 600))
     assert float(states.velocity[-1, 0]) / -0.5 == pytest.approx(expected, rel=5e-3)
 
 
@@ -182,8 +184,7 @@ def test_no_contact_creates_energy_however_stiff_the_wall_and_wherever_a_step_me
     start[:, 0] = -np.linspace(0.01, 0.0106, len(stiffness))
     velocity = np.broadcast_to([0.6, 0.2], start.shape)
     rest = jnp.zeros((len(stiffness), 400, 6))
-    states = run(tip, TipState(jnp.asarray(start), jnp.asarray(velocity), jnp.zeros_like(start)),
-                 rest)  # fmt: skip
+    states = run(tip, moving(tip, start, velocity), rest)
     after = np.asarray(states.velocity[:, -1])
     assert np.all(after[:, 0] < 0.0)
     kept = -after[:, 0] / 0.6
@@ -196,7 +197,7 @@ def test_a_plate_that_is_met_takes_its_share_of_the_momentum():
     """Inelastic, as of two masses; then they swing together on the spring until it is relaxed."""
     tip = walled([LEFT], **FREE, mass=1.0, wall_mass=0.25, stiffness=500.0)
     tip = dataclasses.replace(tip, control_period=2e-4)
-    states = run(tip, moving([-1e-6, 0.0], [0.5, 0.0]), held([0.0, 0.0], [0.0, 0.0], 1000))
+    states = run(tip, moving(tip, [-1e-6, 0.0], [0.5, 0.0]), held([0.0, 0.0], [0.0, 0.0], 1000))
     depth, speed = np.asarray(states.position[:, 0]), 0.5 / 1.25
     assert depth.max() == pytest.approx(speed * np.sqrt(1.25 / 500.0), rel=2e-3)
     assert float(states.velocity[-1, 0]) == pytest.approx(-speed, rel=2e-3)
@@ -210,7 +211,7 @@ def test_a_plate_takes_as_much_wherever_in_a_step_it_is_met(period):
     start = np.stack([-before, 0.0 * before], axis=1)
     velocity = np.broadcast_to([0.5, 0.0], start.shape)
     rest = jnp.zeros((len(start), round(0.3 / period), 6))
-    states = run(tip, TipState(*map(jnp.asarray, (start, velocity, 0.0 * start))), rest)
+    states = run(tip, moving(tip, start, velocity), rest)
     np.testing.assert_allclose(states.velocity[:, -1, 0], -0.5 / 1.25, rtol=5e-4)
 
 
@@ -222,11 +223,28 @@ def test_what_is_observed_is_continuous_in_where_a_wall_is_met():
     start = jnp.zeros((len(where), 2))
     velocity = jnp.broadcast_to(jnp.array([0.5, 0.1]), start.shape)
     actions = jnp.broadcast_to(held([0.05, 0.0], [300.0, 300.0], 12), (len(where), 12, 6))
-    states = run(tip, TipState(start, velocity, start), actions)
+    states = run(tip, moving(tip, start, velocity), actions)
     seen = np.asarray(jax.vmap(tip.observe, in_axes=1, out_axes=1)(states))
     assert np.ptp(seen[:, :, 2], axis=0).max() > 1.5  # N: some are about to touch, and some do
     assert np.abs(np.diff(seen[:, :, 2:], axis=0)).max() < 0.06
     assert np.abs(np.diff(seen[:, :, :2], axis=0)).max() < 4e-6
+
+
+def test_a_plate_that_is_left_comes_back_as_its_damper_lets_it():
+    """By exp(-k t / d) without a mass; a tip that follows it back later meets it on its way."""
+    tip = walled([LEFT], **FREE | {"damping": 40.0}, mass=1.0, stiffness=500.0)
+    start = moving(tip, [0.01, 0.0], [-1.0, 0.0])
+    states = run(tip, start, held([0.0, 0.0], [0.0, 0.0], 40))
+    time = tip.control_period * np.arange(1, 41)
+    expected = 0.01 * np.exp(-500.0 / 40.0 * time)
+    np.testing.assert_allclose(states.plates.depth[:, 0], expected, rtol=1e-3)
+    assert not states.plates.carried.any()
+    back = jax.tree.map(lambda part: part[-1], states)
+    back = back._replace(position=jnp.array([-1e-4, 0.0]), velocity=jnp.array([0.1, 0.0]))
+    again = run(tip, back, held([0.0, 0.0], [0.0, 0.0], 6))
+    met = np.argmax(np.asarray(again.plates.carried[:, 0]) > 0.0)
+    depth = 0.1 * time - 1e-4
+    assert met == np.argmax(depth > expected[-1] * np.exp(-12.5 * time))
 
 
 def test_the_error_of_a_bounce_falls_with_the_square_of_the_step():
@@ -236,7 +254,7 @@ def test_the_error_of_a_bounce_falls_with_the_square_of_the_step():
         period = 1e-3 / 2**halved
         fine = dataclasses.replace(tip, control_period=period)
         actions = held([0.05, 0.0], [100.0, 100.0], round(0.5 / period))
-        ends.append(float(run(fine, moving([0.0, 0.0], [0.3, 0.0]), actions).position[-1, 0]))
+        ends.append(float(run(fine, moving(tip, [0.0, 0.0], [0.3, 0.0]), actions).position[-1, 0]))
     errors = np.abs(np.array(ends[:-2]) - ends[-1])
     order = np.polyfit(np.arange(len(errors)), -np.log2(errors), 1)[0]
     assert 1.5 < order < 2.8
@@ -244,7 +262,7 @@ def test_the_error_of_a_bounce_falls_with_the_square_of_the_step():
 
 def test_a_corner_holds_the_tip_by_both_walls():
     tip = walled([LEFT, -math.pi / 2], position=[-0.05, -0.04], stiffness=[2e3, 5e3], friction=0.3)
-    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([0.1, 0.1], [200.0, 200.0], 800))
+    states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), held([0.1, 0.1], [200.0, 200.0], 800))
     force = np.asarray(states.force)[-1]
     pull = 200.0 * (0.1 - np.asarray(states.position)[-1])
     # Friction of one wall acts after the normal force of the other is known: off by a step.
@@ -291,14 +309,14 @@ def test_an_arm_creeps_at_less_than_its_dry_friction():
     """Pulled by F: u = creep F / (friction - F), by its definition."""
     tip = walled([LEFT], arm_friction=0.6, arm_creep=2e-3, position=-9.0)
     tip = dataclasses.replace(tip, damping_ratio=jnp.asarray(0.0))
-    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([1e4, 0.0], [4e-5, 0.0], 200))
+    states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), held([1e4, 0.0], [4e-5, 0.0], 200))
     assert float(states.velocity[-1, 0]) == pytest.approx(2e-3 * 0.4 / 0.2, rel=1e-3)
 
 
 def test_the_sensor_at_the_wrist_feels_the_tool_resist():
     """In free motion a constant pull shows the tool's share of it, against the acceleration."""
     tip = walled([LEFT], mass=1.5, tool_mass=0.3, damping_ratio=0.0, position=-9.0)
-    states = run(tip, moving([0.0, 0.0], [0.0, 0.0]), held([1e4, 0.0], [3e-4, 0.0], 40))
+    states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), held([1e4, 0.0], [3e-4, 0.0], 40))
     np.testing.assert_allclose(states.force[-1], [-0.3 * 3.0 / 1.5, 0.0], rtol=1e-3, atol=1e-9)
 
 

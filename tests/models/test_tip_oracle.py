@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from palpate.models.contact import TipState, facing
+from palpate.models.contact import facing
 from palpate.models.model import rollout
 
 LAG = 2e-3  # s
@@ -33,7 +33,7 @@ def test_pressing_and_sliding_along_a_plate_on_a_spring_is_as_in_mujoco():
     way = np.stack([0.05 * np.sin(4.0 * time), 0.08 * np.sin(2.3 * time)], axis=1)
     stiffness = np.where(time[:, None] < 1.2, [400.0, 600.0], [800.0, 300.0])
     actions = np.concatenate([way, stiffness, np.zeros_like(way)], axis=1)
-    start = TipState(jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
+    start = tip.state(jnp.zeros(2), jnp.zeros(2))
     ours = tip.observe(jax.jit(rollout)(tip, start, jnp.asarray(actions, jnp.float32)))
     model = mujoco.MjModel.from_xml_string(SCENE)
     data = mujoco.MjData(model)

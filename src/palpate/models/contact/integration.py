@@ -31,6 +31,14 @@ class Surfaces(NamedTuple):
     damping: Numbers  # N s/m
     friction: Numbers
     mass: Numbers  # kg, of a plate, which moves with the tip while they touch
+    recovery: Numbers  # 1/s, at which a plate that is left comes back
+
+
+class Plates(NamedTuple):
+    """How far each is pressed in, in m, and what share of its mass moves with the tip."""
+
+    depth: Numbers
+    carried: Numbers
 
 
 class Impedance(NamedTuple):
@@ -52,43 +60,45 @@ class Impedance(NamedTuple):
 def advance(
     surfaces: Surfaces,
     impedance: Impedance,
+    plates: Plates,
     position: Vector,
     velocity: Vector,
     time: float,
     slip: float,
-) -> tuple[Vector, Vector, Vector, Vector]:
-    """Position and velocity `time` seconds later, and the force of the walls on the tip till then.
+) -> tuple[Plates, Vector, Vector, Vector, Vector]:
+    """Plates, position and velocity `time` s later, and the walls' force on the tip till then.
 
-    Its mean in N, and in N s its first moment about the middle of the step: a wall that is met late
-    in the step pushes late. `slip` (m/s) is the sliding velocity at which a wall's friction has
-    half its size.
+    Of that the mean in N, and in N s the first moment about the middle of the step: a wall that is
+    met late in the step pushes late. `slip` (m/s) is the sliding velocity at which a wall's
+    friction has half its size.
     """
-    normal, place, stiffness, damping, friction, plate = surfaces
+    normal, place, stiffness, damping, friction, plate, recovery = surfaces
     mass = impedance.mass
     depth = place - _along(normal, position)
     rate = -_along(normal, velocity)
-    pressed = jnp.maximum(depth, 0.0)
+    touched = (plates.carried > 0.0) & (depth > 0.0)
+    # A plate that is left comes back by itself, and may be met, or meet the tip, before it is back.
+    free = plates.depth * jnp.exp(-time * recovery)
+    over = jnp.where(touched, depth, depth - plates.depth)
     # How deep it will be, by the energy that is in the spring and in the velocity.
+    pressed = jnp.maximum(depth, 0.0)
     leaving = jnp.sqrt(jnp.square(rate) + stiffness * jnp.square(pressed) / mass + 1e-12) - rate
-    after = depth + time * jnp.where(depth > 0.0, -0.5 * leaving, rate)
-    share = (pressed + jnp.maximum(after, 0.0)) / (jnp.abs(depth) + jnp.abs(after) + 1e-12)
+    after = depth + jnp.where(touched, -0.5 * time * leaving, time * rate - free)
+    share = jnp.maximum(over, 0.0) + jnp.maximum(after, 0.0)
+    share = share / (jnp.abs(over) + jnp.abs(after) + 1e-12)
+    begun = jnp.where(touched, depth, free + share * (plates.depth - free))
     # A wall that recovers more slowly than the tip leaves it does not pull it back.
-    share = jnp.where(stiffness * pressed + damping * rate >= 0.0, share, 0.0)
-    implicit = jnp.where(after > 0.0, 0.5 * share, 0.0)
-    spring = stiffness * (jnp.where(depth > 0.0, 0.5 * share, 0.0) + implicit) * depth
-    # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy. So much
-    # of it moves with the tip at the beginning of the step and at its end: there as the next step
-    # will see it, once the plate has slowed the tip and the step has become shorter.
-    approach = jnp.abs(rate) + 1e-9
-    first = jnp.clip(depth / (IMPACT * approach), 0.0, 1.0)
-    since = (after + time * jnp.where(depth > 0.0, jnp.maximum(rate, 0.0), 0.0)) / approach
-    slowing = jnp.where(rate > 0.0, plate, 0.0)
-    needed = IMPACT * (mass + slowing * first) + slowing * (0.5 * time - since)
-    last = (since * mass + 0.5 * time * slowing * first) / jnp.maximum(needed, 1e-9)
-    last = jnp.where(share > 0.0, jnp.clip(last, 0.0, 1.0), 0.0)
-    inertia = plate * last / time
-    carried = plate * jnp.minimum(first, last) / time
-    moved = (inertia + carried) * -rate
+    share = jnp.where(stiffness * begun + damping * rate >= 0.0, share, 0.0)
+    lasting = (after > 0.0) & (share > 0.0)
+    implicit = jnp.where(lasting, 0.5 * share, 0.0)
+    met = jnp.where(touched | lasting, 0.5 * share, 0.0)
+    spring = stiffness * (met * begun + implicit * depth)
+    # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy.
+    carried = jnp.clip(plates.carried + share * time / IMPACT, 0.0, 1.0)
+    carried = jnp.where(lasting, carried, 0.0)
+    inertia = plate * carried / time
+    kept = plate * jnp.minimum(plates.carried, carried) / time
+    moved = (inertia + kept) * -rate
     # N s/m of the mean velocity
     yielding = time * stiffness * implicit + damping * share + 2.0 * inertia
 
@@ -107,12 +117,12 @@ def advance(
     total = jnp.sum(normal * force[..., None], axis=-2)
     # How much later than the middle of the step each wall pushes: the spring while it is touched,
     # and a plate that is met as it takes on the tip's velocity. Of the force the latter is `jolt`.
-    free = time * (1.0 - share)
-    before = jnp.where(depth > 0.0, 0.0, free)
-    jolt = (inertia - carried) * jnp.maximum(-_along(normal, 2.0 * mean - velocity), 0.0)
+    idle = time * (1.0 - share)
+    before = jnp.where(touched, 0.0, idle)
+    jolt = (inertia - kept) * jnp.maximum(-_along(normal, 2.0 * mean - velocity), 0.0)
     jolt = jnp.clip(jolt / (force + 1e-9), 0.0, 1.0)
     impact = before + 0.5 * (jnp.minimum(IMPACT, time - before) - time)
-    later = (1.0 - jolt) * (before - 0.5 * free) + jolt * impact
+    later = (1.0 - jolt) * (before - 0.5 * idle) + jolt * impact
     late = jnp.sum(normal * (later * force)[..., None], axis=-2)
 
     # Friction as a further force, of the size that the velocity at the end asks for: of one wall
@@ -128,7 +138,11 @@ def advance(
     speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=-1) + 1e-18)
     along = sliding / speed[..., None]
     mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
-    return position + time * mean, 2.0 * mean - velocity, total, late
+    position = position + time * mean
+    within = jnp.maximum(place - _along(normal, position), 0.0)
+    left = jnp.where(touched, pressed * jnp.exp(-time * recovery), free)
+    plates = Plates(jnp.where(lasting, within, left), carried)
+    return plates, position, 2.0 * mean - velocity, total, late
 
 
 def _rubbed(

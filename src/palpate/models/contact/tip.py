@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
-from palpate.models.contact.integration import Impedance, Surfaces, advance
+from palpate.models.contact.integration import Impedance, Plates, Surfaces, advance
 from palpate.models.model import Model
 from palpate.parameters import LogNormal, Normal, Parameter, as_floating, parameter, parameters_of
 
@@ -30,11 +30,12 @@ def _data() -> Any:
 
 
 class TipState(NamedTuple):
-    """Position in m, velocity in m/s, and the force on the tip as sensed, N, each (2,)."""
+    """Position in m, velocity in m/s, the force on the tip as sensed, N, each (2,); the plates."""
 
     position: Point
     velocity: Point
     force: Point
+    plates: Plates
 
 
 class Tip(Model):
@@ -49,7 +50,7 @@ class Tip(Model):
     Each wall is a plate on a spring: where the tip is pressed in by u, it pushes with
     f_n = max(0, k u + d u' + m_w u''), along its outward normal, and rubs with Coulomb's friction
     mu f_n against the sliding velocity (regularised: half of it at `slip` m/s). Its mass m_w is met
-    at rest, and left behind without bouncing.
+    at rest, and left behind without bouncing: it comes back as slowly as k and d have it.
 
     How many walls there are, and the nominal `direction` (rad) of each outward normal, is data; a
     wall may be tilted about it. `position` is where the wall is along that direction, from the
@@ -148,7 +149,11 @@ class Tip(Model):
         abreast = jnp.sum(across * self.centre[..., None, :], axis=-1)
         point = nominal * self.position[..., None] + across * abreast[..., None]
         place = jnp.sum(normal * point, axis=-1)
-        return Surfaces(normal, place, self.stiffness, self.damping, self.friction, self.wall_mass)
+        stiffness, damping, mass = self.stiffness, self.damping, self.wall_mass
+        # The slower root of m s^2 + d s + k; where it swings, as fast as it does at most.
+        beyond = jnp.maximum(jnp.square(damping) - 4.0 * stiffness * mass, 0.0)
+        recovery = 2.0 * stiffness / (damping + jnp.sqrt(beyond + 1e-12))
+        return Surfaces(normal, place, stiffness, damping, self.friction, mass, recovery)
 
     def step(self, state: TipState, action: Float[Array, "*batch 6"]) -> TipState:
         """One control period later; x and y of the mean x_d (m), of K (N/m), and of x_d' (m/s)."""
@@ -174,14 +179,14 @@ class Tip(Model):
 
             def advanced(state: TipState, moment: Array) -> tuple[TipState, None]:
                 here = impedance._replace(setpoint=setpoint + moment * moves)
-                position, velocity, force, later = advance(
-                    surfaces, here, state.position, state.velocity, time, self.slip
+                plates, position, velocity, force, later = advance(
+                    surfaces, here, state.plates, state.position, state.velocity, time, self.slip
                 )
                 force -= tool * (velocity - state.velocity)
                 # What the walls do late in a step has had less time to reach the sensor.
                 force += reaching * later
                 sensed = force + late * (state.force - force)
-                return TipState(position, velocity, sensed), None
+                return TipState(position, velocity, sensed, plates), None
 
             unroll = count <= UNROLLED
             return jax.lax.scan(advanced, state, as_floating(moments), unroll=unroll)[0]
@@ -199,7 +204,18 @@ class Tip(Model):
         """At the last of a few frames, with the velocity between the last two; of one at rest."""
         last, before = observations[..., -1, :], observations[..., -2:, :][..., 0, :]
         velocity = (last[..., :2] - before[..., :2]) / self.control_period
-        return TipState(last[..., :2], velocity, last[..., 2:] - self.force_bias)
+        return self.state(last[..., :2], velocity, last[..., 2:] - self.force_bias)
+
+    def state(self, position: Point, velocity: Point, force: Point | None = None) -> TipState:
+        """The tip there (m), moving (m/s), and plates pressed in by it or relaxed.
+
+        What the sensor shows is zero unless `force` (N) is given.
+        """
+        normal, place = self.surfaces[:2]
+        pressed = jnp.maximum(place - jnp.sum(normal * position[..., None, :], axis=-1), 0.0)
+        plates = Plates(pressed, (pressed > 0.0).astype(pressed.dtype))
+        sensed = jnp.zeros_like(velocity) if force is None else force
+        return TipState(position, velocity, sensed, plates)
 
     def velocity(self, state: TipState) -> Point:
         """Of the tip, m/s."""

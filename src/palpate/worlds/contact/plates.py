@@ -2,9 +2,9 @@
 
 What is not told: where the plates are, how they are turned, their springs, and how they yield and
 rub. The force sensor sits at a wrist: it feels the tool beyond it resist every acceleration, is
-tared badly, and its noise lasts (Ornstein-Uhlenbeck, as the maze's). What a model of springs and
-masses does not have: an arm that creeps before it slides, plates that come back more slowly than
-the tip leaves, and a controller that holds its force for a millisecond.
+tared badly, and its noise lasts (Ornstein-Uhlenbeck, as the maze's). The arm creeps before it
+slides, plates come back more slowly than the tip leaves, and the controller holds its force for a
+millisecond.
 """
 
 import dataclasses

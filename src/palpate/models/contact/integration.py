@@ -72,35 +72,8 @@ def advance(
     met late in the step pushes late. `slip` (m/s) is the sliding velocity at which a wall's
     friction has half its size.
     """
-    normal, place, stiffness, damping, friction, plate, recovery = surfaces
-    mass = impedance.mass
-    depth = place - _along(normal, position)
-    rate = -_along(normal, velocity)
-    touched = (plates.carried > 0.0) & (depth > 0.0)
-    # A plate that is left comes back by itself, and may be met, or meet the tip, before it is back.
-    free = plates.depth * jnp.exp(-time * recovery)
-    over = jnp.where(touched, depth, depth - plates.depth)
-    # How deep it will be, by the energy that is in the spring and in the velocity.
-    pressed = jnp.maximum(depth, 0.0)
-    leaving = jnp.sqrt(jnp.square(rate) + stiffness * jnp.square(pressed) / mass + 1e-12) - rate
-    after = depth + jnp.where(touched, -0.5 * time * leaving, time * rate - free)
-    share = jnp.maximum(over, 0.0) + jnp.maximum(after, 0.0)
-    share = share / (jnp.abs(over) + jnp.abs(after) + 1e-12)
-    begun = jnp.where(touched, depth, free + share * (plates.depth - free))
-    # A wall that recovers more slowly than the tip leaves it does not pull it back.
-    share = jnp.where(stiffness * begun + damping * rate >= 0.0, share, 0.0)
-    lasting = (after > 0.0) & (share > 0.0)
-    implicit = jnp.where(lasting, 0.5 * share, 0.0)
-    met = jnp.where(touched | lasting, 0.5 * share, 0.0)
-    spring = stiffness * (met * begun + implicit * depth)
-    # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy.
-    carried = jnp.clip(plates.carried + share * time / IMPACT, 0.0, 1.0)
-    carried = jnp.where(lasting, carried, 0.0)
-    inertia = plate * carried / time
-    kept = plate * jnp.minimum(plates.carried, carried) / time
-    moved = (inertia + kept) * -rate
-    # N s/m of the mean velocity
-    yielding = time * stiffness * implicit + damping * share + 2.0 * inertia
+    normal, mass = surfaces.normal, impedance.mass
+    walls = _contacts(surfaces, plates, mass, position, velocity, time)
 
     # Of first order, K x and D v of a moment ago are K (x - delay v) and D (v - delay a): less
     # damping and less inertia, here in a form that stays positive.
@@ -109,20 +82,14 @@ def advance(
     held = 2.0 * lightened / time
     diagonal = held + impedance.damping + (0.5 * time - impedance.delay) * impedance.stiffness
     pull = impedance.stiffness * (impedance.setpoint - position)
-    inverse = _inverse(diagonal, normal, yielding)
-    push = spring + moved
-    right = held * velocity + pull + jnp.sum(normal * push[..., None], axis=-2)
+    inverse = _inverse(diagonal, normal, walls.yielding)
+    right = held * velocity + pull + jnp.sum(normal * walls.push[..., None], axis=-2)
     mean = _product(inverse, right)
-    force = jnp.maximum(push - yielding * _along(normal, mean), 0.0)
+    force = jnp.maximum(walls.push - walls.yielding * _along(normal, mean), 0.0)
     total = jnp.sum(normal * force[..., None], axis=-2)
-    # How much later than the middle of the step each wall pushes: the spring while it is touched,
-    # and a plate that is met as it takes on the tip's velocity. Of the force the latter is `jolt`.
-    idle = time * (1.0 - share)
-    before = jnp.where(touched, 0.0, idle)
-    jolt = (inertia - kept) * jnp.maximum(-_along(normal, 2.0 * mean - velocity), 0.0)
+    jolt = walls.struck * jnp.maximum(-_along(normal, 2.0 * mean - velocity), 0.0)
     jolt = jnp.clip(jolt / (force + 1e-9), 0.0, 1.0)
-    impact = before + 0.5 * (jnp.minimum(IMPACT, time - before) - time)
-    later = (1.0 - jolt) * (before - 0.5 * idle) + jolt * impact
+    later = (1.0 - jolt) * walls.middle + jolt * walls.impact
     late = jnp.sum(normal * (later * force)[..., None], axis=-2)
 
     # Friction as a further force, of the size that the velocity at the end asks for: of one wall
@@ -130,7 +97,7 @@ def advance(
     # tip, nothing is left for the arm to hold, and the sensor feels all of it.
     for wall in range(normal.shape[-2]):
         tangent = jnp.broadcast_to(_turned(normal[..., wall, :]), mean.shape)
-        most = (friction * force)[..., wall]
+        most = (surfaces.friction * force)[..., wall]
         mean, rubbing = _rubbed(mean, velocity, tangent, most, inverse, slip)
         total = total - tangent * rubbing[..., None]
         late = late - tangent * (later[..., wall] * rubbing)[..., None]
@@ -139,10 +106,68 @@ def advance(
     along = sliding / speed[..., None]
     mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
     position = position + time * mean
-    within = jnp.maximum(place - _along(normal, position), 0.0)
-    left = jnp.where(touched, pressed * jnp.exp(-time * recovery), free)
-    plates = Plates(jnp.where(lasting, within, left), carried)
+    within = jnp.maximum(surfaces.place - _along(normal, position), 0.0)
+    plates = Plates(jnp.where(walls.carried > 0.0, within, walls.free), walls.carried)
     return plates, position, 2.0 * mean - velocity, total, late
+
+
+class _Contacts(NamedTuple):
+    """What each wall does in a step: its force is `push` less `yielding` times the mean velocity.
+
+    `struck` is by how much mass over time (kg/s) the plate grows that moves with the tip; `impact`
+    and `middle` are how much later than the middle of the step that and all else happen, s. At the
+    end the share `carried` of a plate's mass moves with the tip; one that is left is at `free`, m.
+    """
+
+    push: Numbers  # N
+    yielding: Numbers  # N s/m
+    struck: Numbers
+    impact: Numbers
+    middle: Numbers
+    carried: Numbers
+    free: Numbers
+
+
+def _contacts(
+    surfaces: Surfaces, plates: Plates, mass: Array, position: Vector, velocity: Vector, time: float
+) -> _Contacts:
+    normal, place, stiffness, damping, _, plate, recovery = surfaces
+    depth = place - _along(normal, position)
+    rate = -_along(normal, velocity)
+    pressed = jnp.maximum(depth, 0.0)
+    touched = (plates.carried > 0.0) & (depth > 0.0)
+    # A plate that is left comes back by itself, and may be met, or meet the tip, before it is back.
+    begun = jnp.where(touched, depth, plates.depth)
+    free = begun * jnp.exp(-time * recovery)
+    over = depth - jnp.where(touched, 0.0, begun)
+    # How deep it will be, by the energy that is in the spring and in the velocity.
+    leaving = jnp.sqrt(jnp.square(rate) + stiffness * jnp.square(pressed) / mass + 1e-12) - rate
+    after = depth + jnp.where(touched, -0.5 * time * leaving, time * rate - free)
+    share = jnp.maximum(over, 0.0) + jnp.maximum(after, 0.0)
+    share = share / (jnp.abs(over) + jnp.abs(after) + 1e-12)
+    begun = jnp.where(touched, depth, free + share * (begun - free))
+    # A wall that recovers more slowly than the tip leaves it does not pull it back.
+    share = jnp.where(stiffness * begun + damping * rate >= 0.0, share, 0.0)
+    lasting = (after > 0.0) & (share > 0.0)
+    implicit = jnp.where(lasting, 0.5 * share, 0.0)
+    explicit = jnp.where(touched, 0.5 * share, implicit)
+    spring = stiffness * (explicit * begun + implicit * depth)
+    # A plate is at rest when it is met, and takes on the tip's velocity: that loses energy.
+    carried = jnp.clip(plates.carried + share * time / IMPACT, 0.0, 1.0)
+    carried = jnp.where(lasting, carried, 0.0)
+    inertia = plate * carried / time
+    kept = plate * jnp.minimum(plates.carried, carried) / time
+    idle = time * (1.0 - share)
+    before = jnp.where(touched, 0.0, idle)
+    return _Contacts(
+        push=spring - (inertia + kept) * rate,
+        yielding=time * stiffness * implicit + damping * share + 2.0 * inertia,
+        struck=inertia - kept,
+        impact=before + 0.5 * (jnp.minimum(IMPACT, time - before) - time),
+        middle=before - 0.5 * idle,
+        carried=carried,
+        free=free,
+    )
 
 
 def _rubbed(

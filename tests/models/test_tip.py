@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from palpate.errors import PalpateError
 from palpate.models.contact import Tip, TipState, facing
-from palpate.models.contact.integration import slowed
+from palpate.models.contact.integration import grip, slowed
 from palpate.models.contract import check_model
 from palpate.models.files import load_model, save_model
 from palpate.models.model import rollout
@@ -154,8 +154,7 @@ def test_friction_never_turns_round_and_takes_at_most_its_own():
     for most in (0.0, 1e-3, 0.3, 30.0):
         after = slowed(sliding, jnp.full_like(sliding, most), 1e-4)
         assert np.all(after * sliding >= 0.0)
-        np.testing.assert_allclose(after + most * after / (jnp.abs(after) + 1e-4), sliding,
-                                   atol=1e-12)  # fmt: skip
+        np.testing.assert_allclose(after + most * grip(after, 1e-4), sliding, atol=1e-12)
         slope = jax.vmap(jax.grad(slowed), (0, None, None))(sliding, jnp.asarray(most), 1e-4)
         assert np.all(np.isfinite(slope))
 
@@ -306,11 +305,11 @@ def test_derivatives_of_what_is_observed_are_those_of_finite_differences():
 
 
 def test_an_arm_creeps_at_less_than_its_dry_friction():
-    """Pulled by F: u = creep F / (friction - F), by its definition."""
+    """Pulled by F: u = 2 creep (1 - sqrt(1 - F / friction)), by its definition."""
     tip = walled([LEFT], arm_friction=0.6, arm_creep=2e-3, position=-9.0)
     tip = dataclasses.replace(tip, damping_ratio=jnp.asarray(0.0))
     states = run(tip, moving(tip, [0.0, 0.0], [0.0, 0.0]), held([1e4, 0.0], [4e-5, 0.0], 200))
-    assert float(states.velocity[-1, 0]) == pytest.approx(2e-3 * 0.4 / 0.2, rel=1e-3)
+    assert float(states.velocity[-1, 0]) == pytest.approx(4e-3 * (1 - np.sqrt(1 / 3)), rel=1e-3)
 
 
 def test_the_sensor_at_the_wrist_feels_the_tool_resist():

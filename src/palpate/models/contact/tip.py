@@ -22,7 +22,7 @@ Point = Float[Array, "*batch 2"]
 SUBSTEP = 1.25e-3  # s, of the integration, at most: of twice that stiffnesses were .2 % further off
 UNROLLED = 4  # so many of them in a control period are written out
 OF_WALLS = "position", "tilt", "stiffness", "damping", "friction", "wall_mass"
-SLIP = 1e-5  # m/s, the sliding velocity at which a wall's friction has half its size
+SLIP = 1e-5  # m/s, the sliding velocity at which three quarters of a wall's friction are there
 
 
 def _data() -> Any:
@@ -49,8 +49,9 @@ class Tip(Model):
 
     Each wall is a plate on a spring: where the tip is pressed in by u, it pushes with
     f_n = max(0, k u + d u' + m_w u''), along its outward normal, and rubs with Coulomb's friction
-    mu f_n against the sliding velocity (regularised: half of it at `slip` m/s). Its mass m_w is met
-    at rest, and left behind without bouncing: it comes back as slowly as k and d have it.
+    mu f_n against the sliding velocity (regularised: three quarters at `slip` m/s, and all at twice
+    that). Its mass m_w is met at rest, and left behind without bouncing: it comes back as slowly as
+    k and d have it.
 
     How many walls there are, and the nominal `direction` (rad) of each outward normal, is data; a
     wall may be tilted about it. `position` is where the wall is along that direction, from the
@@ -76,7 +77,9 @@ class Tip(Model):
         "N", prior=LogNormal(0.2, 1.0), spread=0.5, about="dry friction of the arm, at the tip"
     )
     arm_creep: Number = parameter(
-        "m/s", prior=LogNormal(1e-3, 1.0), about="at which the arm's friction has half its size"
+        "m/s",
+        prior=LogNormal(1e-3, 1.0),
+        about="at which three quarters of the arm's friction are there",
     )
     tool_mass: Number = parameter(
         "kg", prior=LogNormal(0.1, 1.0), about="beyond the force sensor, which feels its inertia"
@@ -94,6 +97,9 @@ class Tip(Model):
     )
     wall_mass: Walls = parameter(
         "kg", prior=LogNormal(0.02, 1.0), about="of each wall's plate, which moves with the tip"
+    )
+    impact_time: Number = parameter(
+        "s", prior=LogNormal(3e-4, 0.5), about="in which a plate takes on the tip's velocity"
     )
     force_bias: Point = parameter(
         "N", prior=Normal(0.0, 0.5), about="what the sensor shows without contact"
@@ -153,7 +159,8 @@ class Tip(Model):
         # The slower root of m s^2 + d s + k; where it swings, as fast as it does at most.
         beyond = jnp.maximum(jnp.square(damping) - 4.0 * stiffness * mass, 0.0)
         recovery = 2.0 * stiffness / (damping + jnp.sqrt(beyond + 1e-12))
-        return Surfaces(normal, place, stiffness, damping, self.friction, mass, recovery)
+        impact = self.impact_time[..., None]
+        return Surfaces(normal, place, stiffness, damping, self.friction, mass, recovery, impact)
 
     def step(self, state: TipState, action: Float[Array, "*batch 6"]) -> TipState:
         """One control period later; x and y of the mean x_d (m), of K (N/m), and of x_d' (m/s)."""

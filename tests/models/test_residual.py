@@ -256,7 +256,7 @@ class Marked(Pendulum):
 
     action_shape = (1,)
     observation_shape = (1,)
-    observation_units = ("rad",)
+    observation_units = ("N m",)
 
     def difference(self, predicted, observed):
         return jnp.sin(predicted - observed)
@@ -277,8 +277,9 @@ class Marked(Pendulum):
 ONE, STATE = jnp.ones(1), Marked(1.0, 0.2).initial_state(jnp.ones((2, 1)))
 FORWARDED = {
     "control_period": None, "action_shape": None, "observation_shape": None,
-    "observation_units": None, "observe": (STATE,), "difference": (ONE, 3.0 * ONE),
-    "initial_state": (jnp.ones((2, 1)),), "velocity": (STATE,), "drawing": (ONE,),
+    "observation_units": None, "observes_force": None, "observe": (STATE,),
+    "difference": (ONE, 3.0 * ONE), "initial_state": (jnp.ones((2, 1)),), "velocity": (STATE,),
+    "drawing": (ONE,),
 }  # fmt: skip
 CORRECTED = {"overrides", "step", "stepper", "independent_parts", "constrain"}
 

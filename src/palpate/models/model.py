@@ -137,6 +137,10 @@ class Wrapper(Model):
     def observation_units(self) -> tuple[str, ...]:
         return self.inner.observation_units
 
+    @property
+    def observes_force(self) -> Bool[np.ndarray, " last"]:
+        return self.inner.observes_force
+
     def observe(self, state: Any) -> Array:
         return self.inner.observe(state)
 

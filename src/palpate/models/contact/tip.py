@@ -99,7 +99,7 @@ class Tip(Model):
         "kg", prior=LogNormal(0.02, 1.0), about="of each wall's plate, which moves with the tip"
     )
     impact_time: Number = parameter(
-        "s", prior=LogNormal(3e-4, 0.5), about="in which a plate takes on the tip's velocity"
+        "s", prior=LogNormal(3e-4, 0.7), about="in which a plate takes on the tip's velocity"
     )
     force_bias: Point = parameter(
         "N", prior=Normal(0.0, 0.5), about="what the sensor shows without contact"

@@ -161,6 +161,10 @@ def plane(recording: Recording) -> Walls:
         columns = np.concatenate([columns, np.ones((len(columns), 1))], axis=1)
         climbs = np.linalg.lstsq(columns, force[touching] @ along)[0]
         tilt = np.arctan(climbs[1] / climbs[0])
+        if not _touching(
+            force, unit(np.array(angle + tilt)), unit(np.array(angle + tilt + np.pi / 2.0))
+        ).any():
+            tilt = 0.0  # nothing was felt from where the plane climbs to
         place, *others = _line(angle + tilt, position, force, velocity)
         found.append((place / np.cos(tilt), *others))
     return _listed(found)

@@ -34,7 +34,7 @@ FIRST = 340_000  # seed of the first pair of plates
 SETS, QUICK = 10, 1
 METHODS: dict[str, Method] = {"gradient": "levenberg-marquardt", "posterior": "local-global"}
 ENOUGH = {"gradient": {"iterations": (10, 10, 25)}, "posterior": {"draws": 30}}
-MINUTES = {"gradient": 1, "posterior": 4}  # of a set
+MINUTES = {"gradient": 3, "posterior": 9}  # of a set
 NEAR, WRONG, COVERED, COVERED_OVER = 1.0, 0.10, 0.80, 0.98  # the bars; mm and shares
 JUDGED = {  # what is found: how its error is called, in which unit, and its bar
     "position": ("mm", "mm", NEAR),

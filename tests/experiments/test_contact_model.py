@@ -37,6 +37,25 @@ def test_a_plane_finds_turned_plates_to_a_rough_size():
     assert np.all(found["friction"] < 0.4)
 
 
+def test_a_plane_keeps_the_direction_as_meant_where_nothing_is_felt_from_the_one_it_finds(
+    monkeypatch,
+):
+    """Pushed with forces that grow along the wall, as by friction: the plane climbs across."""
+    time = np.linspace(0.0, 1.0, 101)
+    normal, across = (contact_model.unit(np.array(angle)) for angle in (np.pi, 1.5 * np.pi))
+    wobble = np.sin(40.0 * time)
+    pressed = 6.0 + 4.0 * time + 1e-4 * wobble
+    position = np.outer(time, across) - np.outer(1e-3 * wobble, normal)
+    force = np.outer(pressed, normal) - np.outer(0.2 * pressed, across)
+    velocity = np.broadcast_to(across, position.shape)
+    monkeypatch.setattr(contact_model, "NOMINAL", (np.pi,))
+    monkeypatch.setattr(contact_model, "_states", lambda recording: (position, force, velocity))
+    stand_in = record_touches(PlatesWorld(), SEED, 1, 0.5)
+    found, straight = contact_model.plane(stand_in), contact_model.straight_line(stand_in)
+    for name in contact_model.FOUND:
+        np.testing.assert_array_equal(found[name], straight[name])
+
+
 def test_positions_are_those_of_the_turned_plate_abreast_of_a_point():
     hidden = plates_of(SEED)
     here, there = (contact_model.truth_of(hidden, np.full(2, at))["position"] for at in (0.0, 0.1))

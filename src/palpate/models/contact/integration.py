@@ -33,7 +33,7 @@ class Surfaces(NamedTuple):
     impact: Float[Array, "*batch 1"]
 
 
-class Plates(NamedTuple):
+class PlateState(NamedTuple):
     """How far each is pressed in, in m, and what share of its mass moves with the tip."""
 
     depth: Numbers
@@ -59,12 +59,12 @@ class Impedance(NamedTuple):
 def advance(
     surfaces: Surfaces,
     impedance: Impedance,
-    plates: Plates,
+    plates: PlateState,
     position: Vector,
     velocity: Vector,
     time: float,
     slip: float,
-) -> tuple[Plates, Vector, Vector, Vector, Vector]:
+) -> tuple[PlateState, Vector, Vector, Vector, Vector]:
     """Plates, position and velocity `time` s later, and the walls' force on the tip till then.
 
     Of that the mean in N, and in N s the first moment about the middle of the step: a wall that is
@@ -106,7 +106,7 @@ def advance(
     mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
     position = position + time * mean
     within = jnp.maximum(surfaces.place - _along(normal, position), 0.0)
-    plates = Plates(jnp.where(walls.carried > 0.0, within, walls.free), walls.carried)
+    plates = PlateState(jnp.where(walls.carried > 0.0, within, walls.free), walls.carried)
     return plates, position, 2.0 * mean - velocity, total, late
 
 
@@ -128,7 +128,12 @@ class _Contacts(NamedTuple):
 
 
 def _contacts(
-    surfaces: Surfaces, plates: Plates, mass: Array, position: Vector, velocity: Vector, time: float
+    surfaces: Surfaces,
+    plates: PlateState,
+    mass: Array,
+    position: Vector,
+    velocity: Vector,
+    time: float,
 ) -> _Contacts:
     normal, place, stiffness, damping, _, plate, recovery, impact = surfaces
     depth = place - _along(normal, position)

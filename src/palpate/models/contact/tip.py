@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
-from palpate.models.contact.integration import Impedance, Plates, Surfaces, advance
+from palpate.models.contact.integration import Impedance, PlateState, Surfaces, advance
 from palpate.models.model import Model
 from palpate.parameters import LogNormal, Normal, Parameter, as_floating, parameter, parameters_of
 
@@ -35,7 +35,7 @@ class TipState(NamedTuple):
     position: Point
     velocity: Point
     force: Point
-    plates: Plates
+    plates: PlateState
 
 
 class Tip(Model):
@@ -220,7 +220,7 @@ class Tip(Model):
         """
         normal, place = self.surfaces[:2]
         pressed = jnp.maximum(place - jnp.sum(normal * position[..., None, :], axis=-1), 0.0)
-        plates = Plates(pressed, (pressed > 0.0).astype(pressed.dtype))
+        plates = PlateState(pressed, (pressed > 0.0).astype(pressed.dtype))
         sensed = jnp.zeros_like(velocity) if force is None else force
         return TipState(position, velocity, sensed, plates)
 

@@ -245,7 +245,10 @@ def _check_names(path: str | Path, what: str, came: Any, expected: Any) -> None:
     if set(came) != set(expected):
         missing = sorted(set(expected) - set(came)) or "none"
         unknown = sorted(set(came) - set(expected)) or "none"
-        raise PalpateError(f"the {what} in {path} do not fit: missing {missing}, unknown {unknown}")
+        raise PalpateError(
+            f"the {what} in {path} do not fit: missing {missing}, unknown {unknown}; "
+            "identify it again if another version of palpate wrote it"
+        )
 
 
 def _alike(value: Any, default: Any) -> bool:

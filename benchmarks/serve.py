@@ -66,8 +66,8 @@ def robot(endpoint: str, markers: int, period: float, seconds: float, trials: in
         while not body.released or link.clock() - began < seconds:
             began = began if body.released else link.clock()
             body.advance()
-        told = [silence(link, still, seed, period) for seed in range(trials)]
-    print(json.dumps(told))
+        rows = [silence(link, still, seed, period) for seed in range(trials)]
+    print(json.dumps(rows))
 
 
 def silence(
@@ -124,9 +124,9 @@ def benchmark(seconds: float, trials: int) -> Result:
             with real_time() as prompt, ZenohLink(STATE, COMMAND, listen=endpoint) as link:
                 _await(link, other)
                 stolen = _stolen()
-                record = run_loop(first, link, period, lambda now: now < seconds, _told)
+                record = run_loop(first, link, period, lambda now: now < seconds, _show)
                 stolen = _stolen() - stolen
-                silent = run_loop(second, link, period, lambda now: other.poll() is None, _told)
+                silent = run_loop(second, link, period, lambda now: other.poll() is None, _show)
             said = other.communicate()[0]
             with real_time():
                 bare = _bare(seconds, period)
@@ -191,7 +191,7 @@ def _await(link: ZenohLink, other: subprocess.Popen) -> None:
 
 def _stolen() -> float:
     """Seconds for which a hypervisor has kept this machine's cores to itself, which no scheduling
-    in here can make up for; 0 where that is not told."""
+    in here can make up for; 0 where that is unknown."""
     try:
         fields = Path("/proc/stat").read_text().splitlines()[0].split()
     except OSError:
@@ -199,7 +199,7 @@ def _stolen() -> float:
     return int(fields[8]) / os.sysconf("SC_CLK_TCK")
 
 
-def _told(mode: Mode, reason: str) -> None:
+def _show(mode: Mode, reason: str) -> None:
     print(f"  {mode.name.lower()} {reason}", flush=True)
 
 

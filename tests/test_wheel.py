@@ -105,7 +105,7 @@ WORK = {
     "05_furniture": "duration=4.0, method='metropolis', draws=20, chains=2",
     "06_robot": "trained=out / '02_rope_controller' / 'trained', seconds=1.5",
 }
-TOLD = {  # among what the last of them says
+SAID = {  # among what the last of them says
     "06_robot": ["the tip, 4.0 s ahead", "at rest in", "running", "braking", "the gripper moves"],
     "04_own_model": ["inertia: 0.", "simulated with 0.8", "angle, in the model"],
     "03_own_rope": ["tried in MuJoCo ropes drawn around that of the model", "8 markers"],
@@ -144,7 +144,7 @@ def test_examples_run_with_the_wheel_alone(python, tmp_path: Path, names: list[s
     ]
     (tmp_path / "drive.py").write_text("\n".join([BRIEF, *calls]))
     told = python("drive.py")
-    for word in TOLD[names[-1]]:
+    for word in SAID[names[-1]]:
         assert word in told
 
 

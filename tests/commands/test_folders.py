@@ -88,13 +88,13 @@ def left(path):
     return {file.name for file in path.iterdir() if file.is_file()} - set(kept)
 
 
-TOLD = (folders.REPORT, folders.TABLE, "evidence.npz", "rendering.webp")
+REPORTED = (folders.REPORT, folders.TABLE, "evidence.npz", "rendering.webp")
 
 
 def test_fresh_removes_what_the_command_made_and_nothing_else(tmp_path):
     options = Options(out=tmp_path / "here")
     finish(folders.open_run(options, "work", {"seed": 1}, folders.MODEL))
-    products(options.out, folders.MODEL, folders.RECORDING, *TOLD)
+    products(options.out, folders.MODEL, folders.RECORDING, *REPORTED)
     fresh = Options(out=options.out, fresh=True)
     folders.open_run(fresh, "work", {"seed": 2}, folders.MODEL).close()
     assert left(options.out) == {"notes.txt", folders.RECORDING}
@@ -108,7 +108,7 @@ def test_fresh_removes_what_the_command_made_and_nothing_else(tmp_path):
 def test_starting_over_empties_the_runs_of_a_folder_and_nothing_else(tmp_path):
     stage = tmp_path / "deep" / "stage"
     finish(Run.open(stage, {"seed": 1}, command="palpate reproduce rope-model --seed 1"))
-    products(stage, folders.RECORDING, folders.MODEL, folders.POLICY, *TOLD)
+    products(stage, folders.RECORDING, folders.MODEL, folders.POLICY, *REPORTED)
     products(tmp_path, "result.json", folders.REPORT, "evidence.npz", folders.MODEL)
     with pytest.raises(PalpateError, match="--seed 1`, which --fresh would remove"):
         folders.start_over(tmp_path, "demo")

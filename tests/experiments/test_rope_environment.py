@@ -63,11 +63,11 @@ def test_ropes_are_drawn_within_their_spreads_and_seen_through_noise(episodes) -
             ratio = getattr(drawn, name) / jnp.where(getattr(model, name), getattr(model, name), 1)
             assert np.all(ratio < 1 + declaration.spread + 1e-5)
     assert len(np.unique(drawn.node_mass[:, 1])) == 4
-    told = episodes.actor.told(situation.command, TASK.features(situation.state, None))
+    inputs = episodes.actor.inputs(situation.command, TASK.features(situation.state, None))
     positions = slice(0, 9)  # of three nodes; their velocities are estimated, the command is known
-    away = (seen - told)[:, positions] * episodes.actor.scale[positions]
+    away = (seen - inputs)[:, positions] * episodes.actor.scale[positions]
     assert 0.5 * NOISE < np.std(away) < 2.5 * NOISE  # the gripper's noise is in all of them
-    np.testing.assert_allclose(seen[:, 18:], told[:, 18:], atol=1e-6)
+    np.testing.assert_allclose(seen[:, 18:], inputs[:, 18:], atol=1e-6)
 
 
 def test_an_actor_does_as_a_controller_what_it_does_in_the_environment(
@@ -79,7 +79,7 @@ def test_an_actor_does_as_a_controller_what_it_does_in_the_environment(
     features = jax.random.normal(jax.random.key(0), (5, 18))
     command = wild.initial_carry(jnp.zeros((5, 1, 3)))
     for step in range(1, 30):
-        action = jax.vmap(wild.network)(wild.told(command, features))
+        action = jax.vmap(wild.network)(wild.inputs(command, features))
         following, given = wild(command, features)
         np.testing.assert_allclose(given, wild.moved(command, action), atol=1e-6)
         change = np.linalg.norm(given - command, axis=-1)

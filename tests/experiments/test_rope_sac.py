@@ -35,7 +35,7 @@ def test_the_actor_is_the_librarys() -> None:
         jax.random.key(1), examples, actions=VELOCITY, period=0.01, width=8, depth=2,
     )  # fmt: skip
     ours = as_actor(untrained, theirs.state_dict())
-    told = np.array(ours.told(jnp.full((50, 1, 3), 0.3), examples))
+    told = np.array(ours.inputs(jnp.full((50, 1, 3), 0.3), examples))
     with torch.no_grad():
         expected = theirs(torch.as_tensor(told), deterministic=True).numpy()
     np.testing.assert_allclose(jax.vmap(ours.network)(told), expected, atol=1e-6)

@@ -42,31 +42,31 @@ def run(options: Export) -> Path:
     with folders.begin(options, "export", {"policy": file}) as run:
         if isinstance(policy, CommandPolicy):
             write_onnx(run.path / ONNX, policy)
-            apart = {ONNX: difference(run.path / ONNX, policy, STEPS, options.seed)}
+            differences = {ONNX: difference(run.path / ONNX, policy, STEPS, options.seed)}
             most = AGREES
         else:
-            apart = _actor_written(run.path, policy, deployment, options.seed)
+            differences = _actor_written(run.path, policy, deployment, options.seed)
             most = ACTOR_AGREES
-        for name, off in apart.items():
+        for name, off in differences.items():
             if not off <= most:
                 raise PalpateError(
                     f"{run.path / name} gives commands that differ from the policy's by {off:.2g} "
                     f"of their limits: expected at most {most:g}"
                 )
         targets = {ONNX: target, REFLEX: target.with_suffix(REFLEX.removeprefix("policy"))}
-        for name in apart:
+        for name in differences:
             write_bytes(targets[name], (run.path / name).read_bytes())
         if isinstance(policy, CommandPolicy):
             write_contract(beside, policy, manifest, target.name, deployment.filter)
         else:
-            reflex = targets[REFLEX].name if REFLEX in apart else None
+            reflex = targets[REFLEX].name if REFLEX in differences else None
             write_actor_contract(beside, policy, deployment, target.name, reflex)
-        off = max(apart.values())
+        off = max(differences.values())
         if not run.finished:
             figure = Figure("onnx_difference", off, "of the limit", bar=most)
             folders.finish(run, [figure])
         print(f"policy: {target} (commands differ by at most {off:.1g} of their limits)")
-        if REFLEX in apart:
+        if REFLEX in differences:
             print(f"its reflex: {targets[REFLEX]}")
         print(f"contract: {beside}")
         folders.hand_over(options, run, "A policy as ONNX")

@@ -94,10 +94,10 @@ def actor_difference(path: str | Path, policy: ActorPolicy, scaling: Scaling, se
         ours = policy.propose(seen)
     ours = np.where(sound, np.asarray(ours), 0.0)
     action, command = session.run([name, "command"], inputs)
-    told = np.where(sound, scaling.command(ours), scaling.rest)
+    commanded = np.where(sound, scaling.command(ours), scaling.rest)
     span = np.where(scaling.high > scaling.low, scaling.high - scaling.low, np.abs(scaling.high))
-    apart = np.stack([action - ours, (command.reshape(_ROWS, -1) - told) / span])[:, ~near]
-    return float(np.abs(np.where(np.isfinite(apart), apart, np.inf)).max())
+    deviation = np.stack([action - ours, (command.reshape(_ROWS, -1) - commanded) / span])[:, ~near]
+    return float(np.abs(np.where(np.isfinite(deviation), deviation, np.inf)).max())
 
 
 def _model(

@@ -208,7 +208,7 @@ def everywhere(tree: Any) -> Any:
     return jax.device_put(tree, placed)
 
 
-def compiled_apart(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled_alone(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function of arrays by itself, so that what it returns is stored.
 
     XLA's CPU compiler otherwise computes an intermediate again for each of its uses: three times

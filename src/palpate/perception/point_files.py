@@ -109,8 +109,8 @@ def _camera(clouds: Sequence[Points], viewpoint: Viewpoint) -> Pinhole:
         middle = middle + LEANING * float(np.linalg.norm(middle - viewpoint)) * np.eye(3)[0]
     rays = clouds[0] - viewpoint
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    apart = cKDTree(rays).query(rays[:: max(1, len(rays) // 5000)], 2)[0][:, 1]
-    focal = 1.0 / (PITCH * max(float(np.median(apart)), 1e-5))
+    spacing = cKDTree(rays).query(rays[:: max(1, len(rays) // 5000)], 2)[0][:, 1]
+    focal = 1.0 / (PITCH * max(float(np.median(spacing)), 1e-5))
     upright = Pinhole.looking_at(middle.tolist(), viewpoint.tolist(), 2, 2, 1.0)
     turned = away @ np.asarray(upright.world_from_camera)
     reach = np.abs(turned[:, :2] / turned[:, 2:]).max(axis=0)

@@ -88,10 +88,10 @@ class EnergyCosts(NamedTuple):
     lower: float  # J
     flow: float  # W
 
-    def of(self, told: Mapping[str, np.ndarray]) -> np.ndarray:
+    def of(self, info: Mapping[str, np.ndarray]) -> np.ndarray:
         """(worlds,) of the decision that has ended, by its "flow" and, with a tank, "level"."""
-        flow = told["flow"]
-        broken = {"eb": told.get("level", flow + np.inf) <= self.lower, "ef": flow > self.flow}
+        flow = info["flow"]
+        broken = {"eb": info.get("level", flow + np.inf) <= self.lower, "ef": flow > self.flow}
         return np.sum([broken[name] for name in self.costs], axis=0)
 
 
@@ -154,7 +154,7 @@ class Lockstep:
         return np.concatenate([seen, share[:, None].astype(np.float32)], axis=1)
 
     def decide(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
-        """Rewards, who terminated, who was cut off, and what else is told, each (worlds,).
+        """Rewards, who terminated, who was cut off, and what else is known of it, each (worlds,).
 
         A world whose episode ends within the decision stands still until the others are done.
         """
@@ -178,14 +178,14 @@ class Lockstep:
         cut = (end == HORIZON) | (end == DIVERGED)
         if motions is not None:
             motions.finish(end == VIOLATION, (end != "") & ~cut, end != DIVERGED)
-        told = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
-        told["force"] = force
-        told["progress"] = np.array([*map(task.progress, self._first, truths)])
+        info = {"cost": (end == VIOLATION).astype(np.float32), "end": end}
+        info["force"] = force
+        info["progress"] = np.array([*map(task.progress, self._first, truths)])
         if isinstance(law, MeteredLaw):
-            told |= self._drawn(law)
+            info |= self._drawn(law)
             if self.energy is not None:
-                told["cost"] = self.energy.of(told).astype(np.float32)
-        return reward, (end != "") & ~cut, cut, told
+                info["cost"] = self.energy.of(info).astype(np.float32)
+        return reward, (end != "") & ~cut, cut, info
 
     def _held(self) -> tuple[np.ndarray, np.ndarray] | None:
         """As `_stepped`, by a rollout; None where that cannot be."""
@@ -364,8 +364,8 @@ class GymnasiumWorld(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One decision, (actions,) in [-1, 1]."""
         action = _checked(action, self.action_space.shape or ())
-        reward, terminated, truncated, told = self.lockstep.decide(action[None])
-        info = {name: values.tolist()[0] for name, values in told.items()}
+        reward, terminated, truncated, info = self.lockstep.decide(action[None])
+        info = {name: values.tolist()[0] for name, values in info.items()}
         features = self.lockstep.features()[0]
         return features, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 

@@ -112,7 +112,7 @@ def summary_of_draws(
     """What draws say, and how far to trust them: two sentences."""
     errors = [figure for figure in figures if figure.name == f"rmse_{figure.unit}"]
     known = {figure.name: figure for figure in figures}
-    inside, apart = known["coverage_90"], known["rhat_max_predictions"].value
+    inside, rhat = known["coverage_90"], known["rhat_max_predictions"].value
     found = (
         f"Draws of the model ({settings['structure']}) predict {settings['scored_on']}, "
         f"{PIECE:g} s ahead, within {' and '.join(map(value_in_words, errors))} (root mean square)."
@@ -121,6 +121,6 @@ def summary_of_draws(
     if inside.value is not None and inside.value < LEVEL - SHORT:
         held += ", too little to rely on them"
     held += f". {informed_parameters(rows)}"
-    if apart is not None and apart >= MIXED:
-        held += f" Draw more: the chains do not agree yet (R-hat {apart:.3g})."
+    if rhat is not None and rhat >= MIXED:
+        held += f" Draw more: the chains do not agree yet (R-hat {rhat:.3g})."
     return [found, doubted(settings[folders.DOUBTS]) or held]

@@ -33,7 +33,7 @@ NAME = "contact-model"
 FIRST = 340_000  # seed of the first pair of plates
 SETS, QUICK = 10, 1
 METHODS: dict[str, Method] = {"gradient": "levenberg-marquardt", "posterior": "local-global"}
-ENOUGH = {"gradient": {"iterations": (10, 10, 25)}, "posterior": {"draws": 30}}
+EFFORT = {"gradient": {"iterations": (10, 10, 25)}, "posterior": {"draws": 30}}
 MINUTES = {"gradient": 3, "posterior": 9}  # of a set
 NEAR, WRONG, COVERED, COVERED_OVER = 1.0, 0.10, 0.80, 0.98  # the bars; mm and shares
 JUDGED = {  # what is found: how its error is called, in which unit, and its bar
@@ -75,7 +75,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         record.run(RecordContact(seed=plates, out=file))
         recording, hidden = read_recording(file), plates_of(plates)
         for name, method in METHODS.items():
-            where: dict[str, Any] = {"out": file.parent / name, **ENOUGH[name]}
+            where: dict[str, Any] = {"out": file.parent / name, **EFFORT[name]}
             asked = IdentifyContact(recordings=(file,), method=method, seed=plates, **where)
             result = read_result(identify.run(asked) / RESULT)
             experiment.seconds += result.wall_time_s
@@ -85,7 +85,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             rivals[name].append(Outcome(off, {}))
     settings = {
         "methods": METHODS,
-        "enough": ENOUGH,
+        "effort": EFFORT,
         "missed": {
             name: [
                 [of for of, held in one.held.items() for hit in held if not hit]

@@ -19,8 +19,8 @@ def draw(path: Path, trained: Mapping[str, Sequence[ArrayLike]]) -> None:
     """
     canvas = canvas_of(10, 4)
     goals, costs = canvas.subplots(1, 2)
-    for number, (name, told) in enumerate(trained.items()):
-        curves = [np.asarray(curve, float) for curve in told]
+    for number, (name, seeds) in enumerate(trained.items()):
+        curves = [np.asarray(curve, float) for curve in seeds]
         steps, colour = curves[0][0], f"C{number % 10}"
         style = "-" if number < 10 else "--"
         for axis, of in ((goals, 1), (costs, 2)):

@@ -41,7 +41,7 @@ TASKS: dict[str, tuple[Any, Any]] = {
 }
 OTHER_RATES = {5: 0.2, 20: 0.05}  # Hz: s of a decision in the maze, trained at 10 Hz
 MINUTES = {"maze": 100, "navigation": 8}  # of a seed
-RATIO, WORSE, ENOUGH, FAST = 0.2, -0.02, 200.0, 0.2  # the bars; the last in ms
+RATIO, WORSE, BASELINE, FAST = 0.2, -0.02, 200.0, 0.2  # the bars; the last in ms
 TIMED = 50  # decisions
 
 Found = dict[str, Any]  # of one training: its figures, and how its policy's episodes ended
@@ -161,7 +161,7 @@ def figures_of(task: str, found: dict[tuple[str, str], list[Found]]) -> list[Fig
     listed = [
         Figure(f"{task}.violations_ratio", ratio(own, other or None), "", RATIO),
         Figure(f"{task}.success_difference", better - worse, "", WORSE, better="higher"),
-        Figure(f"{task}.baseline_violations", other, "", ENOUGH, better="higher"),
+        Figure(f"{task}.baseline_violations", other, "", BASELINE, better="higher"),
         Figure(f"detail.{task}.violations_ratio_with_pretraining", whole, ""),
     ]
     for method in METHODS:

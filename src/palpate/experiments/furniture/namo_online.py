@@ -44,7 +44,7 @@ NAME = "namo-online"
 SOLVED_BAR, ALL_MOVABLE_BAR = 0.95, 0.60
 ROOMS = {"full": 100, "quick": 6}
 SEEDS = 970_000  # of rooms, used by nothing else
-OURS, TOLD, ALL, FLAG = "ours", "told_truth", "all_movable", "flag"
+OURS, INFORMED, ALL, FLAG = "ours", "told_truth", "all_movable", "flag"
 PICTURED = 3  # rooms whose episode is drawn
 FRAMES = 100  # of an animation, about
 COUNTED = ("time", "distance", "carried", "attempts", "failures", "planning_s")
@@ -56,7 +56,7 @@ def planners(room: Room) -> dict[str, Callable[[], Opinion]]:
     world = room.world()
     return {
         OURS: lambda: Learner(world.outlines, room.seed),
-        TOLD: lambda: Opinion(truth_of(room)),
+        INFORMED: lambda: Opinion(truth_of(room)),
         ALL: lambda: Opinion(dict.fromkeys(world.names, Constraint("free"))),
         FLAG: lambda: Flag(world.names),
     }
@@ -169,11 +169,12 @@ def show(folder: Path, room: Room, outcome: Episode) -> None:
 
 def figures(rows: list[dict], shown: Mapping[str, Mapping[str, Any]]) -> list[Figure]:
     """What is held against the bars, then what each planner needed, then the scenes."""
-    solvable = [row for row in rows if row[TOLD]["reached"]]
+    solvable = [row for row in rows if row[INFORMED]["reached"]]
     ours = [row for row in solvable if row[OURS]["reached"]]
     flag = [row for row in solvable if row[FLAG]["reached"]]
     rates = {
-        name: (sum(row[name]["reached"] for row in rows), len(rows)) for name in (TOLD, FLAG, OURS)
+        name: (sum(row[name]["reached"] for row in rows), len(rows))
+        for name in (INFORMED, FLAG, OURS)
     }
     believing = sum(row[ALL]["reached"] for row in rows)
     found = [
@@ -187,7 +188,7 @@ def figures(rows: list[dict], shown: Mapping[str, Mapping[str, Any]]) -> list[Fi
         *(share_of(f"success_rate_{name}", *rate) for name, rate in rates.items()),
     ]  # fmt: skip
     found.append(Figure("rooms", len(rows), "", better="higher"))
-    for name in (OURS, TOLD, ALL, FLAG):
+    for name in (OURS, INFORMED, ALL, FLAG):
         reached = [row[name] for row in rows if row[name]["reached"]]
         for key in COUNTED:
             value = statistics.mean(row[key] for row in reached) if reached else None

@@ -34,7 +34,7 @@ HANDLED = 10.0  # s
 MOVABLE = ("table", "cart", "couch", "bookshelf", "chair", "hinged")
 BOLTED = "bolted"
 SCENE = ("table", "cart", "couch", "chair", "bookshelf")
-APART = 4.0  # m between the pieces of the scene
+SPACING = 4.0  # m between the pieces of the scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ def recordings(kind: str, seed: int, pushes: int) -> tuple[Recording, Recording]
 
 def scene(kinds: Sequence[str], seed: int, pushes: int) -> tuple[Recording, Recording]:
     """Pieces in a room, all handled for the same ten seconds; and pushes of each in turn."""
-    places = [(APART * (i % 3), APART * (i // 3), 0.0) for i in range(len(kinds))]
+    places = [(SPACING * (i % 3), SPACING * (i // 3), 0.0) for i in range(len(kinds))]
     pieces = [Piece(kind, place) for kind, place in zip(kinds, places, strict=True)]
     world = FurnitureWorld(pieces)
     hands = Together([Wiggle(seed, body, HANDLED, body) for body in range(len(kinds))])

@@ -43,7 +43,7 @@ class Actor(CommandPolicy):
         )
         return dataclasses.replace(actor, network=network)
 
-    def told(
+    def inputs(
         self, command: Float[Array, "*batch driven 3"], features: Float[Array, "*batch features"]
     ) -> Float[Array, "*batch inputs"]:
         """What the network is given: scaled features, and the command as a share of its limit."""
@@ -58,7 +58,7 @@ class Actor(CommandPolicy):
 
     def _direction(self, carry: Array, observation: Array) -> Array:
         network = jax.vmap(self.network) if observation.ndim == 2 else self.network
-        return _within_ball(network(self.told(carry, observation)).reshape(carry.shape))
+        return _within_ball(network(self.inputs(carry, observation)).reshape(carry.shape))
 
 
 def _within_ball(action: Array) -> Array:
@@ -160,5 +160,5 @@ class Episodes(eqx.Module):
         position = position + self.noise * jax.random.normal(for_noise, position.shape)
         window, velocity = self._estimator.update(situation.window, position)
         features = self.task.features(RopeState(position, velocity), None)
-        seen = self.actor.told(situation.command, features)
+        seen = self.actor.inputs(situation.command, features)
         return dataclasses.replace(situation, window=window, key=key), seen

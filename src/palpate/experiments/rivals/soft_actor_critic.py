@@ -82,13 +82,13 @@ class _SideBySide(VecEnv):
         self._step += 1
         self._sum += rewards
         over = self._step == self._episodes.length
-        told: list[dict[str, Any]] = [{} for _ in seen]
+        infos: list[dict[str, Any]] = [{} for _ in seen]
         if over:
             # The value of where they got to is still asked for: only their time ran out.
-            told = [{"terminal_observation": last, "TimeLimit.truncated": True} for last in seen]
+            infos = [{"terminal_observation": last, "TimeLimit.truncated": True} for last in seen]
             self.rewards = self._sum / self._step
             seen = self.reset()
-        return seen, rewards, np.full(self.num_envs, over), told
+        return seen, rewards, np.full(self.num_envs, over), infos
 
     def close(self) -> None:
         pass

@@ -58,8 +58,8 @@ def probe(policy: ActorPolicy, environments: GymnasiumWorlds, seed: int) -> Prob
         risk[now], force[now] = risky[now], np.hypot(observation[now, 0], observation[now, 1])
         before = _pushed(worlds)
         action = np.where(ahead[:, None], proposed, executed)
-        observation, _, terminated, truncated, told = environments.step(action)
-        greatest[ahead] = np.maximum(greatest, told["force"])[ahead]
+        observation, _, terminated, truncated, info = environments.step(action)
+        greatest[ahead] = np.maximum(greatest, info["force"])[ahead]
         ended = terminated | truncated
         over |= ended & ahead
         pushing = (step < when) & ~ended & (_pushed(worlds) - before > PUSHED)
@@ -78,19 +78,19 @@ def figures(found: Probes, *, guarded: bool, free: bool) -> list[Figure]:
     """Of a `guarded` policy how well its risk orders the forces that follow, beside the present
     force; of one that is `free` to choose its stiffness how much stiffer it pushes along than
     across. Unknown (None) where nothing varies, or nothing was pushed."""
-    told = []
+    listed = []
     if guarded:
         knows = rank_correlation(found.risk, found.greatest)
         felt = rank_correlation(found.force, found.greatest)
         gain = None if knows is None or felt is None else knows - felt
-        told += [
+        listed += [
             Figure("risk_rank_correlation", knows, "", better="higher"),
             Figure("risk_gain_over_force", gain, "", better="higher"),
         ]
     if free:
         contrast = float(found.along.mean() / found.across.mean()) if len(found.along) else None
-        told.append(Figure("stiffness_contrast", contrast, "", better="higher"))
-    return told
+        listed.append(Figure("stiffness_contrast", contrast, "", better="higher"))
+    return listed
 
 
 def rank_correlation(one: Float[np.ndarray, " n"], other: Float[np.ndarray, " n"]) -> float | None:

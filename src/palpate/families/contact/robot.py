@@ -105,13 +105,13 @@ class TipRobot:
         if arrivals:
             self._heard_at, data = arrivals[-1]
             message = decode_command(data, 4)
-            told, before = message.action, self._under_way
-            self._under_way = message.session, message.state, tuple(told.tolist())
+            action, before = message.action, self._under_way
+            self._under_way = message.session, message.state, tuple(action.tolist())
             if self._under_way == before:
                 return
             low, high = STIFFNESS_RANGE
-            stiffness = 2 * (told[2:] - low) / (high - low) - 1
-            self._begin(np.concatenate([told[:2] / DISPLACEMENT_LIMIT, stiffness]))
+            stiffness = 2 * (action[2:] - low) / (high - low) - 1
+            self._begin(np.concatenate([action[:2] / DISPLACEMENT_LIMIT, stiffness]))
         elif self._link.clock() - self._heard_at > PAUSE * self.period:
             self._under_way = None
             self._begin(np.full(4, np.nan))  # damping alone

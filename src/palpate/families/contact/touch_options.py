@@ -88,7 +88,9 @@ class IdentifyContact(Identify):
 
     def check(self) -> None:
         named = [*self.position, *self.force, *self.setpoint, *self.stiffness]
-        if twice := sorted({name for name in named if named.count(name) > 1 and not _told(name)}):
+        if twice := sorted(
+            {name for name in named if named.count(name) > 1 and not _is_number(name)}
+        ):
             raise PalpateError(f"'{twice[0]}' is named twice: expected a channel for each number")
         for option in ("position", "force", "setpoint", "stiffness"):
             if len(names := getattr(self, option)) not in (1, 2):
@@ -99,7 +101,7 @@ class IdentifyContact(Identify):
 
     def reading(self) -> dict[str, Any]:
         named = [*self.position, *self.force, *self.setpoint, *self.stiffness]
-        return {**super().reading(), "columns": [name for name in named if not _told(name)]}
+        return {**super().reading(), "columns": [name for name in named if not _is_number(name)]}
 
     def prepare(self, recording: Recording) -> Recording:
         """The recording with the four channels of two numbers that the model needs."""
@@ -124,7 +126,7 @@ class IdentifyContact(Identify):
         return problems(aligned)
 
 
-def _told(name: str) -> bool:
+def _is_number(name: str) -> bool:
     """Whether it is a number and no channel's name."""
     try:
         float(name)

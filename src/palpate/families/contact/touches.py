@@ -86,18 +86,19 @@ def _moves(setpoint: Channel, period: float) -> Channel:
     return dataclasses.replace(setpoint, name=MOVES, values=moved, unit="m/s")
 
 
-def directions_of(recording: Recording, told: Sequence[float]) -> Float[np.ndarray, " walls"]:
-    """Where the walls face, rad: as `told` in degrees, else as the recording says.
+def directions_of(recording: Recording, degrees: Sequence[float]) -> Float[np.ndarray, " walls"]:
+    """Where the walls face, rad: as given in `degrees`, else as the recording says.
 
     Raises `PalpateError` where neither says it, and for two walls that face alike.
     """
     fact = recording.fact(NORMALS, Quantity)
-    if not told and fact is None:
+    if not degrees and fact is None:
         raise PalpateError(
             "the recording does not say where the walls face: expected --walls DEGREES, for each "
             "wall the direction in which it pushes the tip (0 is x, 90 is y, 180 is against x)"
         )
-    angles = np.radians(told) if told else np.atleast_1d(np.asarray(fact and fact.values, float))
+    recorded = np.asarray(fact and fact.values, float)
+    angles = np.radians(degrees) if degrees else np.atleast_1d(recorded)
     for number, angle in enumerate(angles):
         if np.any(np.abs(_turn(angles[:number] - angle)) < 0.1):
             raise PalpateError(

@@ -30,7 +30,7 @@ ROUNDS = 4  # of a joint and of what has moved with it, each from the other
 SEEN = 0.2  # of evidence, for each point: less is no difference
 CARRIED = 0.15  # rad or m that a part has to go to show what it carries
 STILLER = 0.05  # rad or m
-ENOUGH = 6  # looks that tell whether a part has gone along
+LOOKS = 6  # looks that tell whether a part has gone along
 TOUCHES = 0.03  # m: what is so near a part may carry it
 
 
@@ -239,7 +239,7 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
             for other in (range(len(tree.looks)) if number == new else sorted(shown))
             if abs(places[other] - places[first]) > CARRIED
         ]
-        gone = gone[:: max(1, len(gone) // ENOUGH)]
+        gone = gone[:: max(1, len(gone) // LOOKS)]
         if not gone:
             continue
         carried = part.parent == carrier

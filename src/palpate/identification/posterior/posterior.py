@@ -31,7 +31,7 @@ from palpate.identification.posterior.predictive import Predicted, Score
 from palpate.identification.posterior.settled import Settled, factors_of, joined, settle_each
 from palpate.identification.samplers.draws import Draws
 from palpate.identification.samplers.hamiltonian import no_u_turn
-from palpate.identification.samplers.local_global import CHAINS, compiled_meanwhile, local_global
+from palpate.identification.samplers.local_global import CHAINS, compile_beside, local_global
 from palpate.identification.samplers.metropolis import metropolis
 from palpate.identification.samplers.tempered import populations
 from palpate.identification.verdicts import undecided
@@ -322,7 +322,7 @@ def preparing(
     first, _ = factors_of(target)[0]
     if method != LOCAL_GLOBAL or first.dimension > WIDEST:
         return contextlib.nullcontext()
-    return compiled_meanwhile(first, chains or CHAINS)
+    return compile_beside(first, chains or CHAINS)
 
 
 def check_numbers(chains: int | None, draws: int | None) -> None:

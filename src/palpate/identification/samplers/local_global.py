@@ -109,7 +109,7 @@ def local_global(
 
 
 @contextlib.contextmanager
-def compiled_meanwhile(target: Target, chains: int = CHAINS) -> Iterator[None]:
+def compile_beside(target: Target, chains: int = CHAINS) -> Iterator[None]:
     """Compile what `local_global` runs for a target of these shapes, beside what is done within.
 
     A search for modes waits for a compiler of its own, and leaves a core to another. What is raised

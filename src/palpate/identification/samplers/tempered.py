@@ -221,8 +221,8 @@ def next_change(likelihood: Float[Array, " particles"], left: Float[Array, ""]) 
     def halve(_, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
         middle = 0.5 * (low + high)
-        enough = effective_share(jnp.exp(middle) * likelihood) >= KEPT
-        return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
+        kept = effective_share(jnp.exp(middle) * likelihood) >= KEPT
+        return jnp.where(kept, middle, low), jnp.where(kept, high, middle)
 
     begin = jnp.log(left) - 40.0, jnp.log(left)
     low, _ = jax.lax.fori_loop(0, BISECTIONS, halve, begin)

@@ -12,7 +12,7 @@ from palpate.safety.reflex import Reflex
 
 # The greatest force in the step, N; the share of the way behind it; energy put into the robot in
 # the step, J; the most of it at a time, W; and the level of a tank after it, J.
-TOLD = "force", "progress", "drawn", "flow", "level"
+REPORTED = "force", "progress", "drawn", "flow", "level"
 
 
 def check(environments: VectorEnv) -> tuple[int, int]:
@@ -69,10 +69,10 @@ def begun(environments: VectorEnv, seed: int, step: int) -> np.ndarray:
 def advance(
     environments: VectorEnv, observation: np.ndarray, action: np.ndarray, executed: np.ndarray
 ) -> tuple[Transition, np.ndarray, dict[str, Any]]:
-    """One step of all: the transitions, what is seen then, and what else was told of each.
+    """One step of all: the transitions, what is seen then, and what else they report of each.
 
-    Actions lie in [-1, 1], which is stretched onto the environments' bounds. Told are "ended"
-    (bool), "end" (how, "" where it goes on or nothing says so), and what is `TOLD`, NaN where
+    Actions lie in [-1, 1], which is stretched onto the environments' bounds. Reported are "ended"
+    (bool), "end" (how, "" where it goes on or nothing says so), and what is `REPORTED`, NaN where
     nothing says so, each (environments,); and where a decision can be interrupted "motions", as
     `Motions.pieces`.
 
@@ -87,7 +87,7 @@ def advance(
     following = after.copy()
     for number in np.flatnonzero(ended):
         following[number] = infos["final_obs"][number]
-    cost = _told(infos, "cost", ended, np.zeros(len(ended), np.float32))
+    cost = _reported(infos, "cost", ended, np.zeros(len(ended), np.float32))
     lived = Transition(
         np.array(observation, np.float32),
         np.array(action, np.float32),
@@ -97,33 +97,35 @@ def advance(
         _finite("observation", following),
         np.asarray(terminated, np.float32),
     )
-    end = _told(infos, "end", ended, np.full(len(ended), "", object))
-    told = {name: _told(infos, name, ended, np.full(len(ended), np.nan)) for name in TOLD}
-    told |= {name: infos[name] for name in ("motions",) if name in infos}
-    return lived, _finite("observation", after), {"ended": ended, "end": end, **told}
+    end = _reported(infos, "end", ended, np.full(len(ended), "", object))
+    info = {name: _reported(infos, name, ended, np.full(len(ended), np.nan)) for name in REPORTED}
+    info |= {name: infos[name] for name in ("motions",) if name in infos}
+    return lived, _finite("observation", after), {"ended": ended, "end": end, **info}
 
 
-def motions_of(told: dict[str, Any]) -> tuple[Motion, int]:
+def motions_of(info: dict[str, Any]) -> tuple[Motion, int]:
     """The pieces of a step's decisions, and how many of the rows are pieces.
 
     Raises `PalpateError` for numbers that are not finite.
     """
-    found = {name: _finite(name, one) for name, one in told["motions"].items()}
+    found = {name: _finite(name, one) for name, one in info["motions"].items()}
     count, done = int(found.pop("there").sum()), found["executed"]
     return Motion(action=done, reward=np.zeros_like(found["cost"]), **found), count
 
 
-def _told(infos: dict[str, Any], name: str, ended: np.ndarray, default: np.ndarray) -> np.ndarray:
-    """What is told of each under a name; of an episode that ended, what its last step told.
+def _reported(
+    infos: dict[str, Any], name: str, ended: np.ndarray, default: np.ndarray
+) -> np.ndarray:
+    """What is reported of each under a name; of an episode that ended, by its last step.
 
     Environments of Gymnasium put that into "final_info", others beside the rest.
     """
-    told = default.copy()
+    values = default.copy()
     for source, which in ((infos, True), (infos.get("final_info", {}), ended)):
         if name in source:
-            known = np.broadcast_to(source.get(f"_{name}", True), told.shape) & which
-            told[known] = np.asarray(source[name])[known]
-    return told
+            known = np.broadcast_to(source.get(f"_{name}", True), values.shape) & which
+            values[known] = np.asarray(source[name])[known]
+    return values
 
 
 def _finite(what: str, values: np.ndarray) -> np.ndarray:

@@ -27,14 +27,14 @@ class Episodes:
         """All episodes begin anew; those under way do not count."""
         self._sums[:] = 0.0
 
-    def add(self, lived: Transition, told: dict[str, np.ndarray]) -> None:
+    def add(self, lived: Transition, info: dict[str, np.ndarray]) -> None:
         """A step of all, as `advance` tells it."""
         self._sums += np.stack([lived.reward, lived.cost, np.ones_like(lived.reward)])
         self.totals[1] += np.sum(lived.cost)
-        for number in np.flatnonzero(told["ended"]):
+        for number in np.flatnonzero(info["ended"]):
             self.totals[0] += 1
             self._ended.append(self._sums[:, number].copy())
-            self._ends[str(told["end"][number])] += 1
+            self._ends[str(info["end"][number])] += 1
             self.costs = np.append(self.costs[1:], self._sums[1, number])
             self._sums[:, number] = 0.0
 

@@ -137,15 +137,15 @@ def train_off_policy(
     )
     restored = None if run is None else run.restore(start)
     done, state = restored or (0, start)
+    history = state.totals, state.episode_costs
     learnt, memory = copied((state.agent, (state.buffer, state.motions)))
     if restored is None and offline is not None:
         memory = compiled.keep(memory, offline)
         if settings.pretraining:
             learnt = compiled.pretrain(learnt, memory, jax.random.fold_in(key, 1))
         if settings.pretraining and run is not None:
-            told = state.totals, state.episode_costs
-            run.save(0, TrainingState(learnt, memory[0], *told, memory[1]))
-    episodes = Episodes(count, state.totals, state.episode_costs)
+            run.save(0, TrainingState(learnt, memory[0], *history, memory[1]))
+    episodes = Episodes(count, *history)
     observation, pending = None, None
     rounds = range(done + count, settings.steps + count, count)
     bar = progress(rounds, "training", done=done // count)
@@ -162,9 +162,9 @@ def train_off_policy(
                 reflex.watch_with(*compiled.reflex(learnt))
             if pending is not None:
                 learnt, memory, figures = compiled.learn(learnt, memory, *pending)
-            lived, observation, told = advance(environments, observation, action, executed)
-            episodes.add(lived, told)
-            motions = None if reflex is None else motions_of(told)
+            lived, observation, info = advance(environments, observation, action, executed)
+            episodes.add(lived, info)
+            motions = None if reflex is None else motions_of(info)
             updates = settings.updates(step) - settings.updates(step - count)
             pending = lived, motions, for_updates, updates, np.float32(episodes.mean_cost)
 
@@ -182,8 +182,8 @@ def train_off_policy(
             if save:
                 observation = None
                 if run is not None:
-                    told = episodes.totals, episodes.costs
-                    run.save(step, TrainingState(learnt, memory[0], *told, memory[1]))
+                    history = episodes.totals, episodes.costs
+                    run.save(step, TrainingState(learnt, memory[0], *history, memory[1]))
             if stop:
                 break
     return learnt

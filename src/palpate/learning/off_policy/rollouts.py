@@ -10,7 +10,7 @@ from gymnasium.vector import VectorEnv
 from palpate.errors import PalpateError
 from palpate.learning.off_policy.agent import Agent
 from palpate.learning.off_policy.buffer import Motion, Transition
-from palpate.learning.off_policy.environments import TOLD, advance, begun, check, motions_of
+from palpate.learning.off_policy.environments import REPORTED, advance, begun, check, motions_of
 from palpate.runs.progress import Watch, unwatched
 
 # From observations (environments, features), whether each has just begun, and a generator:
@@ -50,10 +50,10 @@ def collect(
     seen = []
     for _ in watch(range(-(-steps // count))):
         action = np.asarray(script(observation, fresh, random), np.float32)
-        lived, observation, told = advance(environments, observation, action, action)
-        fresh = told["ended"]
-        if "motions" in told:
-            motions, pieces = motions_of(told)
+        lived, observation, info = advance(environments, observation, action, action)
+        fresh = info["ended"]
+        if "motions" in info:
+            motions, pieces = motions_of(info)
             lived = jax.tree.map(lambda leaf, pieces=pieces: leaf[:pieces], motions)
         seen.append(lived)
     most = None if isinstance(seen[0], Motion) else steps
@@ -90,22 +90,22 @@ def evaluate(
         raise PalpateError(f"{episodes} episodes were asked for: expected at least one")
     count = environments.num_envs
     found = {name: np.zeros(episodes) for name in ("return", "cost", "length")}
-    found |= {name: np.full(episodes, np.nan) for name in TOLD}
+    found |= {name: np.full(episodes, np.nan) for name in REPORTED}
     found["end"] = np.full(episodes, "", object)
     playing = np.arange(count)  # the number of the episode that each environment plays
     observation, due = begun(environments, seed, 0), iter(watch(range(episodes)))
     while np.any(playing < episodes):
         action = np.asarray(act(observation), np.float32)
-        lived, observation, told = advance(environments, observation, action, action)
+        lived, observation, info = advance(environments, observation, action, action)
         counts = playing < episodes
         those = playing[counts]
         found["return"][those] += np.asarray(lived.reward)[counts]
         found["cost"][those] += np.asarray(lived.cost)[counts]
         found["length"][those] += 1
         for name, joined in JOINED.items():
-            found[name][those] = joined(found[name][those], told[name][counts])
-        over = counts & told["ended"]
-        found["end"][playing[over]] = told["end"][over]
+            found[name][those] = joined(found[name][those], info[name][counts])
+        over = counts & info["ended"]
+        found["end"][playing[over]] = info["end"][over]
         playing[over] += count
         for _ in range(int(over.sum())):
             next(due, None)

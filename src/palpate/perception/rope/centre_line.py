@@ -148,14 +148,14 @@ def centre_lines(
     Raises `PalpateError` when less than four points of a rope are seen.
     """
     found = line_points(segmentation)
-    _enough(len(found.pixels))
+    _check_count(len(found.pixels))
     start, distance = pinhole.project(gripper)
     order = walk(found, start, length * pinhole.focal[0] / float(distance))
     if segmentation.depth is None:
         pixels = np.concatenate([start[None], found.pixels[order]])
         return _leaning(pixels, pinhole, gripper, length)
     rows, columns = np.nonzero((segmentation.share > 0) & np.isfinite(segmentation.depth))
-    _enough(len(rows))
+    _check_count(len(rows))
     pixels = np.stack([columns, rows], axis=-1)
     points = pinhole.back_project(pixels, segmentation.depth[rows, columns])
     lines = [_through_space(np.concatenate([gripper[None], points]), length)]
@@ -170,7 +170,7 @@ def centre_lines(
     return [line for line, misfit in judged if misfit < misfits[0] + SURELY]
 
 
-def _enough(count: int) -> None:
+def _check_count(count: int) -> None:
     if count < FEWEST:
         raise PalpateError(
             f"a centre line needs at least {FEWEST} points of the rope, {count} are seen"

@@ -92,8 +92,8 @@ def score(twin: Twin, world: ApplianceWorld, earlier: Mapping[int, Labels] | Non
         parent[one] = float(twin.parts[other].parent == wanted)
         if not right[one]:
             continue
-        degrees[one], apart = difference(screw, truth.axis[one], truth.anchor[one])
-        centimetres[one] = apart if own.joint == "revolute" else np.nan
+        degrees[one], distance = difference(screw, truth.axis[one], truth.anchor[one])
+        centimetres[one] = distance if own.joint == "revolute" else np.nan
         inside[one] = _inside(twin, other, screw, truth.axis[one], truth.anchor[one])
     return Score(
         found, number, right, degrees, centimetres, iou, parent, inside,
@@ -105,10 +105,10 @@ def difference(screw: Screw, axis: np.ndarray, anchor: np.ndarray) -> tuple[floa
     """Of a joint and a true axis: degrees between them, and cm between the lines."""
     across = np.cross(screw.axis, axis)
     size = float(np.linalg.norm(across))
-    apart = anchor - screw.point
-    gap = float(np.linalg.norm(np.cross(apart, axis)))
+    offset = anchor - screw.point
+    gap = float(np.linalg.norm(np.cross(offset, axis)))
     if size > 1e-3:
-        gap = abs(float(apart @ across)) / size
+        gap = abs(float(offset @ across)) / size
     angle = math.degrees(math.atan2(size, abs(float(screw.axis @ axis))))
     return angle, 100.0 * gap
 

@@ -33,12 +33,12 @@ NOISE = np.array([1e-3, 1e-3, 2e-3])  # m, m, rad: of a tracker as agents expect
 class PiecePosterior:
     """What handling has told of one piece: its motion, cut to pieces, and the posterior's modes.
 
-    The first climb begins at what is `told` of it, if anything, or at the prior's centre.
+    The first climb begins at what is `believed` of it, if anything, or at the prior's centre.
     """
 
-    def __init__(self, model: Planar, seed: int, told: Planar | None = None):
+    def __init__(self, model: Planar, seed: int, believed: Planar | None = None):
         self.model = model
-        self._told = told
+        self._believed = believed
         self._key = jax.random.key(seed)
         self._kept: list[Segments] = []
         self._modes: Array | None = None
@@ -57,8 +57,8 @@ class PiecePosterior:
             return None
         self._key, draw, choose = jax.random.split(self._key, 3)
         start = jax.random.normal(draw, (STARTS, target.dimension)).at[0].set(0.0)
-        if self._told is not None:
-            start = start.at[0].set(_position(target, self._told))
+        if self._believed is not None:
+            start = start.at[0].set(_position(target, self._believed))
         if self._modes is not None:
             target = target.linearised(self._modes[0])
             # The last modes, and the best with some coordinates drawn anew: where sliding sets in
@@ -80,8 +80,8 @@ class PiecePosterior:
         target, modes = settle(target, key)
         known = self._modes
         if known is None:
-            told = self.model if self._told is None else self._told
-            known = _position(target, told)[None]
+            believed = self.model if self._believed is None else self._believed
+            known = _position(target, believed)[None]
         start = jnp.concatenate([modes.position[: STARTS // 2], known[: STARTS // 2]])
         return self._best(target, climb(target, start).position)
 
@@ -102,8 +102,7 @@ class PiecePosterior:
 
 def _position(target: MotionPosterior, model: Planar) -> Array:
     """Where a model is among the coordinates of a posterior, the scales at their medians."""
-    told = motion_posterior(model, target.segments, target.scales)
-    return initial_position(told)
+    return initial_position(motion_posterior(model, target.segments, target.scales))
 
 
 def telling(parts: list[Segments]) -> Segments:

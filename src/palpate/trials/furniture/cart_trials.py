@@ -164,16 +164,16 @@ def _hidden(task: CartTask, seed: int) -> list[Planar]:
                     "wheel_along": [[drag]],
                     "wheel_across": [[drag]],
                 }
-        told = {path: jnp.asarray(value, piece.mass.dtype) for path, value in values.items()}
-        pieces.append(with_values(piece, told))
+        placed = {path: jnp.asarray(value, piece.mass.dtype) for path, value in values.items()}
+        pieces.append(with_values(piece, placed))
     return pieces
 
 
 def _wiggled(task: CartTask, seed: int) -> list[list[tuple[Aligned, bool]]]:
     """Handling of each piece, that begins at rest, as `Episode.handling` has it."""
-    apart = [(4.0 * index, 0.0, 0.0) for index in range(len(task.kinds))]
+    poses = [(4.0 * index, 0.0, 0.0) for index in range(len(task.kinds))]
     world = FurnitureWorld(
-        [Piece(kind, pose) for kind, pose in zip(task.kinds, apart, strict=True)]
+        [Piece(kind, pose) for kind, pose in zip(task.kinds, poses, strict=True)]
     )
     stretches: list[list[tuple[Aligned, bool]]] = [[] for _ in task.kinds]
     for repetition in range(3):

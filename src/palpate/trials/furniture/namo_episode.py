@@ -82,8 +82,9 @@ class Flag(Opinion):
 
     def tried(self, name: str, share: float) -> None:
         prior = self._probability[name]
-        told = 1 - ERRS if share >= DONE else ERRS  # of a movable object
-        self._probability[name] = prior * told / (prior * told + (1 - prior) * (1 - told))
+        likelihood = 1 - ERRS if share >= DONE else ERRS  # of a movable object
+        joint = prior * likelihood
+        self._probability[name] = joint / (joint + (1 - prior) * (1 - likelihood))
 
 
 class Learner(Opinion):

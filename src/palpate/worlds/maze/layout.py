@@ -133,8 +133,8 @@ class Layout:
             c, s = math.cos(wall.yaw), math.sin(wall.yaw)
             inside = np.abs((position - wall.position) @ np.array([[c, -s], [s, c]]))
             beyond = inside - wall.half_sizes
-            apart = np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
-            nearest = np.minimum(nearest, apart)
+            gap = np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+            nearest = np.minimum(nearest, gap)
         return np.asarray(nearest)
 
     @cached_property

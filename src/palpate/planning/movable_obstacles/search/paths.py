@@ -205,8 +205,8 @@ def clear(space: Space, ways: np.ndarray, allowed: Allowed = _NOTHING) -> np.nda
         excepted = np.isin(obstacle, list(gaps)) if gaps and len(way) else np.zeros(len(way), bool)
         if excepted.any():
             near = shapely.distance(ways[way[excepted]], tree.geometries[obstacle[excepted]])
-            enough = np.array([gaps[index] for index in obstacle[excepted]]) - _SLACK
-            fine = np.flatnonzero(excepted)[near >= enough]
+            least = np.array([gaps[index] for index in obstacle[excepted]]) - _SLACK
+            fine = np.flatnonzero(excepted)[near >= least]
             way = np.delete(way, fine)
         good[way] = False
     return good

@@ -151,7 +151,7 @@ class Planner:
                 ahead = resolved
                 if farthest is None or len(ahead.segments) > len(farthest.segments):
                     farthest = ahead
-            if failed or (changed and not graph.good_enough(moves)):
+            if failed or (changed and not graph.within_tolerance(moves)):
                 continue
             final = driven_to(ahead, goal)
             if final is not None:

@@ -159,7 +159,7 @@ class PolicyGraph:
         costs[others] = np.maximum(costs, self._straight + _OPTIMISM * bound)[others]
         return bool(abs(costs[action] - old[0]) > 1e-6 or probability < old[1])
 
-    def good_enough(self, moves: list[Move]) -> bool:
+    def within_tolerance(self, moves: list[Move]) -> bool:
         """Whether the policy that led to `moves` costs little more than any other could."""
         known = all(self._known[move.action] for move in moves)
         return known and self._cost_of(self._taken) <= _TOLERATED * self.lower_bound

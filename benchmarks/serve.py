@@ -35,7 +35,7 @@ from palpate.deployment.scheduling import ROBOT, real_time
 from palpate.deployment.supervisor import Mode, Supervisor
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
 from palpate.errors import PalpateError
-from palpate.families.rope.robot import RopeRobot, servoed
+from palpate.families.rope.robot import RopeRobot, with_servo
 from palpate.networks import load_policy
 from palpate.numerics import devices
 from palpate.runs import Figure, Result
@@ -58,7 +58,7 @@ def robot(endpoint: str, markers: int, period: float, seconds: float, trials: in
         Disturbance(time, PUSH[1], (PUSH[0] * np.cos(angle), PUSH[0] * np.sin(angle), 0.0), 0.5)
         for angle, time in enumerate(np.arange(EVERY, seconds, EVERY).tolist())
     )
-    still = servoed(RopeConfiguration(markers=markers), period)
+    still = with_servo(RopeConfiguration(markers=markers), period)
     pushed = dataclasses.replace(still, disturbances=pushes)
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=endpoint) as link:
         body = RopeRobot(link, pushed, 0, "straight", period)

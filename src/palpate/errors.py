@@ -30,7 +30,7 @@ class PalpateWarning(UserWarning):
     """What somebody should know and nothing fails for; the command line prints it as a note."""
 
 
-def listed(names: Iterable[str], most: int = 6) -> str:
+def list_names(names: Iterable[str], most: int = 6) -> str:
     """The first of `names`, and how many more there are, for a sentence."""
     every = list(names)
     more = f" and {len(every) - most} more" if len(every) > most else ""

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from palpate.commands import evaluate, train
 from palpate.errors import PalpateError, PalpateWarning
 from palpate.families.gymnasium import methods
-from palpate.families.gymnasium.environments import described, made
+from palpate.families.gymnasium.environments import describe_environment, make_environments
 from palpate.families.gymnasium.options import EvaluateGymnasium, TrainGymnasium
 from palpate.learning.off_policy import Lagrangian, Penalty
 from palpate.networks.guarded import load_actor
@@ -107,7 +107,7 @@ def test_updates_are_enough_for_a_comparison_by_steps():
 )
 def test_what_cannot_be_learnt_in_is_refused_with_a_sentence(name, said):
     with pytest.raises(PalpateError, match=said):
-        made(name, 2)
+        make_environments(name, 2)
 
 
 def test_a_missing_package_is_told_by_its_extra(monkeypatch):
@@ -115,7 +115,7 @@ def test_a_missing_package_is_told_by_its_extra(monkeypatch):
     for name in [each for each in sys.modules if each.startswith("gymnasium.envs.mujoco")]:
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(PalpateError, match=r"imageio.*pip install 'palpate\[gymnasium\]'"):
-        made("palpate/VelocityAnt-v0", 1)
+        make_environments("palpate/VelocityAnt-v0", 1)
 
 
 def test_a_module_of_the_current_folder_is_imported(tmp_path, monkeypatch):
@@ -125,7 +125,7 @@ def test_a_module_of_the_current_folder_is_imported(tmp_path, monkeypatch):
         "import gymnasium\nfrom small_environments import Bandit\n"
         "gymnasium.register('Here-v0', entry_point=Bandit, disable_env_checker=True)\n"
     )
-    assert described("lying_here:Here-v0")["costs"]
+    assert describe_environment("lying_here:Here-v0")["costs"]
 
 
 def test_without_costs_only_who_ignores_them_learns():

@@ -105,12 +105,12 @@ def test_the_error_of_what_nobody_saw_is_said_to_be_unknown(capsys):
     draws = Draws(position, np.zeros((2, 20)), np.ones(2), 0, 40, 1.0, 0.0)
     posterior = Posterior(Settled(target, ()), draws, pieces)
     found = score(target, predicted, pieces)
-    figures = of_draws.drawn_figures(posterior, found, SLED, 1.0, "m, m, rad")
+    figures = of_draws.posterior_figures(posterior, found, SLED, 1.0, "m, m, rad")
     values = {figure.name: figure.value for figure in figures}
     assert values["rmse_m"] == pytest.approx(np.sqrt((14 * 3**2 + 4 * 6**2) / 18))
     assert values["rmse_rad"] is None
     settings = {"structure": "sled", "scored_on": "what was fitted", "doubts": []}
-    rows = of_draws.drawn_rows(posterior)
+    rows = of_draws.posterior_rows(posterior)
     settings["summary"] = of_draws.summary_of_draws(figures, settings, rows)
     tables.show(Result("x", figures, settings, [0], None, 1.0, parameters=rows))
     said = capsys.readouterr().out

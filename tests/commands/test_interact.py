@@ -5,7 +5,7 @@ import json
 from PIL import Image
 
 from palpate.cli import main
-from palpate.models.articulated.assembly import assembled
+from palpate.models.articulated.assembly import assemble
 from palpate.models.articulated.urdf import read_urdf
 from palpate.worlds.descriptions import refusal
 
@@ -23,7 +23,7 @@ def test_a_microwave_is_handled_and_its_twin_is_taken_by_mujoco(tmp_path, capsys
     assert joints["part 1"].friction > 0.05
     for file in ("twin.urdf", "twin.xml"):
         assert refusal(out / file) == ""
-    assert len(assembled(read_urdf(out / "twin.urdf")).links) >= 1
+    assert len(assemble(read_urdf(out / "twin.urdf")).links) >= 1
     assert (out / "twin.png").stat().st_size > 10_000
     with Image.open(out / "rendering.webp") as film:
         assert getattr(film, "n_frames", 1) > 1  # of each look in which something had moved

@@ -14,7 +14,7 @@ import pytest
 
 from deployed import PERIOD, actor_file, impedance_policy, manifest, rope_policy
 from palpate.cli import main
-from palpate.commands.serve import free_endpoint, limits_of, stopped_by, supervisor_of
+from palpate.commands.serve import fault_of, free_endpoint, limits_of, supervisor_of
 from palpate.deployment.decision import ReflexDecision
 from palpate.deployment.deployment import deployment_of, load_network
 from palpate.deployment.loop import Record
@@ -252,4 +252,4 @@ def test_a_rope_that_cannot_be_stops_the_policy_and_the_command_says_so(monkeypa
     ],
 )
 def test_what_kept_a_policy_from_going_on(events, fault):
-    assert stopped_by(Record(events=[(0.0, *event) for event in events])) == fault
+    assert fault_of(Record(events=[(0.0, *event) for event in events])) == fault

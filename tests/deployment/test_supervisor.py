@@ -15,8 +15,8 @@ from palpate.deployment.supervisor import (
     SOFT,
     Limits,
     Mode,
-    shortened,
-    slowed,
+    brake,
+    shorten,
 )
 from palpate.errors import PalpateError
 from palpate.networks import Channel
@@ -358,11 +358,11 @@ def test_whatever_happens_the_limits_hold_and_rest_comes_before_motion(faults, w
 
 def test_a_brake_keeps_its_direction():
     velocity = np.array([0.3, -0.4, 0.0], np.float32)
-    np.testing.assert_allclose(slowed(velocity, 0.1), 0.8 * velocity, rtol=1e-6)
-    assert not slowed(velocity, 0.6).any()
-    assert not slowed(np.zeros(3), 0.1).any()
-    np.testing.assert_allclose(shortened(velocity, 0.25), 0.5 * velocity, rtol=1e-6)
-    assert shortened(velocity, 0.51) is velocity
+    np.testing.assert_allclose(brake(velocity, 0.1), 0.8 * velocity, rtol=1e-6)
+    assert not brake(velocity, 0.6).any()
+    assert not brake(np.zeros(3), 0.1).any()
+    np.testing.assert_allclose(shorten(velocity, 0.25), 0.5 * velocity, rtol=1e-6)
+    assert shorten(velocity, 0.51) is velocity
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])

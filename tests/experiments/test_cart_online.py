@@ -167,10 +167,10 @@ def test_the_pieces_in_which_most_happened_are_compared(monkeypatch):
     zero = jnp.zeros((4, 1, 3))
     pieces = Segments(zero, zero, zero, zero, target, target, jnp.ones(target.shape, bool))
     monkeypatch.setattr(cart_posterior, "MOST", 3)
-    picked = cart_posterior.telling([pieces.take([0, 1]), pieces.take([2, 3])])
+    picked = cart_posterior.most_informative([pieces.take([0, 1]), pieces.take([2, 3])])
     np.testing.assert_allclose(picked.target[:, 0, 0, 0], [0.3, 0.2, 0.1])
     monkeypatch.setattr(cart_posterior, "MOST", 6)
-    picked = cart_posterior.telling([pieces])
+    picked = cart_posterior.most_informative([pieces])
     assert picked.count == 6
     assert np.asarray(picked.seen).all(axis=(1, 2, 3)).tolist() == [True] * 4 + [False] * 2
 

@@ -21,8 +21,10 @@ def test_episodes_of_all_policies_are_pooled_and_the_arms_held_against_the_bars(
         rest = {name: [value] * episodes for name, value in numbers.items()}
         return {"episodes": {"end": ends} | rest}
 
-    monkeypatch.setattr(maze_arm, "trained", lambda experiment, seed: tmp_path / f"maze-{seed}")
-    monkeypatch.setattr(maze_arm, "tried", tried)
+    monkeypatch.setattr(
+        maze_arm, "train_on_tip", lambda experiment, seed: tmp_path / f"maze-{seed}"
+    )
+    monkeypatch.setattr(maze_arm, "evaluate_policy", tried)
     result = maze_arm.reproduce(tmp_path)
     figures = {figure.name: figure for figure in result.figures}
     assert figures["success_rate"].value == pytest.approx(490 / 500)

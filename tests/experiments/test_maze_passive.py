@@ -37,7 +37,7 @@ def test_rows_are_held_against_agnostic_episode_by_episode(tmp_path, monkeypatch
         return options.out
 
     monkeypatch.setattr(maze_passive.train, "run", run)
-    monkeypatch.setattr(maze_passive, "tried", tried)
+    monkeypatch.setattr(maze_passive, "evaluate_policy", tried)
     monkeypatch.setattr(other_robots, "CALLS", 50)
     ropes = {"bare": {"success": 1.0, "time": 2.0}, "filtered": {"success": 0.97, "time": 2.02}}
     monkeypatch.setattr(other_robots, "of_ropes", lambda count: ropes | {"least": 0.3})

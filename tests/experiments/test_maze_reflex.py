@@ -37,7 +37,7 @@ def stood_in(monkeypatch):
         return method, {"command": f"palpate train --method {method}"}
 
     monkeypatch.setattr(maze_reflex.train, "run", run)
-    monkeypatch.setattr(maze_reflex, "played", played)
+    monkeypatch.setattr(maze_reflex, "play_episodes", played)
     monkeypatch.setattr(maze_reflex, "load_actor", load_actor)
     monkeypatch.setattr(maze_reflex, "at_its_best", lambda policy: policy)
     timed = {"p99_ms": 0.1, "median_ms": 0.05}

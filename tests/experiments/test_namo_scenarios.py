@@ -43,7 +43,7 @@ def test_maps_without_a_rival_are_planned_and_their_figures_given(tmp_path):
 def test_a_map_of_namosims_stands_beside_its_figures(tmp_path):
     world = dataclasses.replace(two_rooms({"a": IN_DOOR}), name="obstacle_on_goal")
     write_map(tmp_path / "obstacle_on_goal.json", world)
-    trial = study.tried(tmp_path / "obstacle_on_goal.json", tmp_path / "out", 2, 0)
+    trial = study.plan_map(tmp_path / "obstacle_on_goal.json", tmp_path / "out", 2, 0)
     assert trial.reached
     rows = {figure.name: figure for figure in study.figures([trial])}
     known = study.NAMOSIM["obstacle_on_goal"]
@@ -60,7 +60,7 @@ def test_goals_are_visited_one_after_the_other_on_the_map_as_it_is_left(tmp_path
     goals = ((7.0, 1.5, 0.0), (1.0, 0.5, 0.0), (6.0, 2.5, 0.0), (4.1, 0.3, 0.0))
     world = dataclasses.replace(two_rooms({"a": IN_DOOR}), goals=goals)
     write_map(tmp_path / "tour.json", world)
-    trial = study.tried(tmp_path / "tour.json", tmp_path / "out", 1, 0)
+    trial = study.plan_map(tmp_path / "tour.json", tmp_path / "out", 1, 0)
     assert (trial.goals, len(trial.plans)) == (4, 3)  # the last one is in a wall
     assert trial.transfers == 1  # the door stays open
     assert trial.reached == 0.75
@@ -73,14 +73,14 @@ def test_goals_are_visited_one_after_the_other_on_the_map_as_it_is_left(tmp_path
 def test_a_plan_that_fails_the_exact_check_is_not_reached(tmp_path, monkeypatch):
     write_map(tmp_path / "a.json", two_rooms({"a": IN_DOOR}))
     monkeypatch.setattr(study, "faults_of", lambda plan, world: ["the robot flies"])
-    trial = study.tried(tmp_path / "a.json", tmp_path / "out", 1, 0)
+    trial = study.plan_map(tmp_path / "a.json", tmp_path / "out", 1, 0)
     assert not trial.reached
     assert "the robot flies" in trial.line()
 
 
 def test_a_file_that_is_no_map_is_told_and_not_reached(tmp_path):
     (tmp_path / "bad.svg").write_text("<svg/>")
-    trial = study.tried(tmp_path / "bad.svg", tmp_path / "out", 1, 0)
+    trial = study.plan_map(tmp_path / "bad.svg", tmp_path / "out", 1, 0)
     assert not trial.reached
     assert "viewBox" in trial.line()
 
@@ -117,7 +117,7 @@ def test_maps_of_one_name_and_names_that_are_no_folders_are_kept_apart(tmp_path)
 def test_a_map_of_namosims_that_is_not_reached_leaves_the_bars_standing(tmp_path):
     world = dataclasses.replace(two_rooms({}, doors=()), name="obstacle_on_goal")
     write_map(tmp_path / "obstacle_on_goal.json", world)
-    trial = study.tried(tmp_path / "obstacle_on_goal.json", tmp_path / "out", 1, 0)
+    trial = study.plan_map(tmp_path / "obstacle_on_goal.json", tmp_path / "out", 1, 0)
     rows = {figure.name: figure for figure in study.figures([trial])}
     assert rows["speedup_min"].met is False
     assert rows["distance_ratio_max"].met is False

@@ -6,13 +6,13 @@ import pytest
 
 from palpate.experiments.furniture import one_shot, one_shot_pieces, one_shot_regression
 from palpate.experiments.furniture.one_shot_figure import shares_figure
-from palpate.experiments.furniture.one_shot_pieces import PERIOD, error_share, judged, pushes_of
+from palpate.experiments.furniture.one_shot_pieces import PERIOD, error_share, judge, pushes_of
 from palpate.experiments.furniture.one_shot_regression import (
     OURS,
     RIVALS,
     first_samples,
-    recorded,
     transitions,
+    truncate,
 )
 from palpate.experiments.furniture.one_shot_sampling import OURS as SAMPLER
 from palpate.families.furniture.recording import POSE, WRENCH, one_body, starting_furniture
@@ -46,7 +46,7 @@ def predicted_with(asked, off, spread, draws=200):
 def test_only_what_was_pushed_is_judged(pushes):
     model = starting_furniture(pushes, PERIOD)
     asked = pushes_of(pushes, model)
-    found = judged(model, predicted_with(asked, 0.1, 0.05), asked)
+    found = judge(model, predicted_with(asked, 0.1, 0.05), asked)
     np.testing.assert_allclose(found.error_m, 0.1, rtol=1e-5)
     assert found.error_m.shape == found.displacement_m.shape == (2,)
     moved = np.asarray(asked.target[:, -1] - asked.pose)[[0, 1], [0, 1], :2]
@@ -54,7 +54,7 @@ def test_only_what_was_pushed_is_judged(pushes):
     assert found.displacement_m.min() > 0.1
     # two standard deviations off in x of three channels: there the interval misses
     assert found.inside == pytest.approx(2 / 3, abs=0.01)
-    assert judged(model, predicted_with(asked, 0.0, 0.05), asked).inside == 1.0
+    assert judge(model, predicted_with(asked, 0.0, 0.05), asked).inside == 1.0
     assert found.drift_m == pytest.approx(np.linalg.norm(moved, axis=1).max(), abs=0.12)
 
 
@@ -63,7 +63,7 @@ def test_shares_are_pooled_over_pushes_and_not_averaged():
         {"error_m": [0.1], "displacement_m": [1.0]},
         {"error_m": [0.1], "displacement_m": [0.1]},
     ]
-    assert one_shot.pooled(stages) == pytest.approx(0.02 / 1.01)
+    assert one_shot.pool_errors(stages) == pytest.approx(0.02 / 1.01)
     assert error_share(np.array([0.3, 0.4]), np.array([0.0, 5.0])) == pytest.approx(0.01)
 
 
@@ -165,7 +165,7 @@ def test_the_posterior_is_given_the_frames_that_regressions_are_given(monkeypatc
     monkeypatch.setattr(one_shot_regression, "cut", noting)
     monkeypatch.setattr(one_shot_regression, "compare", stop)
     seen = first_samples(aligned, 4)
-    told = recorded(first, seen)
+    told = truncate(first, seen)
     np.testing.assert_array_equal(told.align(PERIOD, POSE, WRENCH).observation, seen.observation)
     with pytest.raises(StopIteration):
         one_shot_regression._ours(told, seen, first, 10, 0)

@@ -26,10 +26,10 @@ def strong(monkeypatch):
 
 def test_the_doors_of_mujoco_move_as_the_example_says(strong):
     """To the noise, from rest, over four seconds, through friction and past pi."""
-    truth = own_model.drawn(SEED)
+    truth = own_model.draw_door(SEED)
     door = load_class(f"{own_model.EXAMPLE}:Door", Model)(**truth)
     furthest = 0.0
-    for trial in own_model.pushed(truth, SEED).trials:
+    for trial in own_model.push_door(truth, SEED).trials:
         angle = trial["angle"].values
         start = door.initial_state(jnp.asarray(angle[:1], jnp.float32))
         torque = jnp.asarray(trial["torque"].values[:-1], jnp.float32)
@@ -41,8 +41,8 @@ def test_the_doors_of_mujoco_move_as_the_example_says(strong):
 
 
 def test_finite_differences_find_a_door_that_moves_far(strong):
-    truth = own_model.drawn(SEED)
-    found = own_model.finite_differences(own_model.pushed(truth, SEED))
+    truth = own_model.draw_door(SEED)
+    found = own_model.finite_differences(own_model.push_door(truth, SEED))
     for name, true in truth.items():
         assert found[name] == pytest.approx(true, rel=0.2), name
 
@@ -50,8 +50,8 @@ def test_finite_differences_find_a_door_that_moves_far(strong):
 def test_mujoco_sysid_finds_a_door(strong):
     pytest.importorskip("mujoco.sysid")
     mujoco_sysid()
-    truth = own_model.drawn(SEED)
-    recording = own_model.pushed(truth, SEED)
+    truth = own_model.draw_door(SEED)
+    recording = own_model.push_door(truth, SEED)
     few = dataclasses.replace(recording, trials=recording.trials[:2])
     found = fit_door(few, lambda door: own_model.scene(door, 10), own_model.RANGES)
     for name, true in truth.items():
@@ -66,7 +66,7 @@ def test_the_worst_method_and_all_intervals_count(tmp_path, monkeypatch):
         rows = [
             {"name": name, "value": off * true, "lower": 0.9 * true,
              "upper": true * (0.95 if (name, off) == ("inertia", 1.2) else 1.3)}
-            for name, true in own_model.drawn(options.seed).items()
+            for name, true in own_model.draw_door(options.seed).items()
         ]  # fmt: skip
         result = Result("x", [Figure("wall_time_s", 3.0, "s")], {}, [0], None, 3.0, parameters=rows)
         write_json(options.out / "result.json", result.to_dict())
@@ -74,7 +74,7 @@ def test_the_worst_method_and_all_intervals_count(tmp_path, monkeypatch):
 
     monkeypatch.setattr(own_model.identify, "run", run)
     monkeypatch.setattr(own_model, "mujoco_sysid", lambda: None)
-    monkeypatch.setattr(own_model, "fit_door", lambda *_: own_model.drawn(SEED))
+    monkeypatch.setattr(own_model, "fit_door", lambda *_: own_model.draw_door(SEED))
     result = own_model.reproduce(tmp_path, quick=True, seed=3)
     figures = {figure.name: figure for figure in result.figures}
     assert figures["model_lines"].met

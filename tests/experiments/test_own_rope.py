@@ -9,7 +9,7 @@ import pytest
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment
 from palpate.experiments.rope import own_rope, spoilt
-from palpate.experiments.rope.numpy_rope import NumpyRope, drawn, recorded
+from palpate.experiments.rope.numpy_rope import NumpyRope, draw_rope, record_rope
 from palpate.tasks.rope.stabilization import FIRST_ROOT
 from palpate.worlds.rope.configuration import RopeConfiguration, in_step
 from palpate.worlds.rope.rope import RopeWorld
@@ -82,8 +82,8 @@ def test_the_gripper_keeps_its_limits():
 
 @pytest.fixture(scope="module")
 def recording():
-    own = drawn(7, 9, 50.0)
-    return own, recorded(own, 7, 1, 4.0)
+    own = draw_rope(7, 9, 50.0)
+    return own, record_rope(own, 7, 1, 4.0)
 
 
 def test_a_recording_is_noisy_and_has_gaps(recording):
@@ -105,8 +105,8 @@ def test_each_mistake_is_flagged_by_its_cause(recording, name, tmp_path, capsys)
 
 
 def test_what_is_missed_and_what_is_flagged_falsely_is_counted(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(spoilt, "drawn", lambda seed, markers, rate: rope(bodies=8, markers=9))
-    monkeypatch.setattr(spoilt, "recorded", lambda own, seed, *_: recorded(own, seed, 1, 1.0))
+    monkeypatch.setattr(spoilt, "draw_rope", lambda seed, markers, rate: rope(bodies=8, markers=9))
+    monkeypatch.setattr(spoilt, "record_rope", lambda own, seed, *_: record_rope(own, seed, 1, 1.0))
     said = iter([[], ["rate: it is"], ["rate: it is"], ["unit"]])
     monkeypatch.setattr(spoilt, "problems", lambda *_: next(said))
     found = spoilt.check_recordings(Experiment("own-rope", tmp_path, True, 0), 2)

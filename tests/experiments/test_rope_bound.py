@@ -72,7 +72,7 @@ def test_a_replay_without_knots_is_the_controller_again(small, tmp_path, monkeyp
     monkeypatch.setattr(rope_bound, "search", search)
     trials = lasting([StabilizationTrial(BASE, start, 1) for start in ("straight", "shaken")])
     with Run.open(tmp_path, {}) as run:
-        done = rope_bound.bounded(small, untrained(), trials, 80, 0, run)
+        done = rope_bound.find_bound(small, untrained(), trials, 80, 0, run)
     replayed = done["replayed_energy"][:, WARM]
     length = replayed.shape[-1]
     np.testing.assert_allclose(replayed[:, 0], done["energy"][:, :length], rtol=1e-3, atol=1e-5)

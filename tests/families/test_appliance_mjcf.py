@@ -9,7 +9,7 @@ from palpate.errors import PalpateError, PalpateWarning
 from palpate.experiments.appliance.random_trees import random_rotation
 from palpate.families.appliance.mjcf import links_of, read_mjcf_links
 from palpate.models.articulated import ArticulatedState, tree_of
-from palpate.models.articulated.assembly import assembled
+from palpate.models.articulated.assembly import assemble
 from palpate.models.articulated.description import (
     DescribedJoint,
     DescribedLink,
@@ -18,7 +18,7 @@ from palpate.models.articulated.description import (
     Inertial,
     Place,
 )
-from palpate.models.articulated.faults import mended
+from palpate.models.articulated.faults import mend
 from palpate.models.articulated.mjcf import write_mjcf
 from palpate.worlds.descriptions import refusal
 
@@ -102,19 +102,19 @@ def described(folder) -> Description:
 
 def test_what_is_written_is_what_is_read(float64, tmp_path):
     description = described(tmp_path)
-    assert mended(description)[1] == []
+    assert mend(description)[1] == []
     path = tmp_path / "thing.xml"
     write_mjcf(path, description)
     assert refusal(path) == ""
     read, names = read_mjcf_links(path)
     assert names == ["hinge", "slide"]
-    for own, theirs in zip(assembled(description).links, read, strict=True):
+    for own, theirs in zip(assemble(description).links, read, strict=True):
         assert (own.joint, own.parent) == (theirs.joint, theirs.parent)
         assert own.damping == pytest.approx(theirs.damping)
         assert own.friction == pytest.approx(theirs.friction)
         assert (own.lower, own.upper) == pytest.approx((theirs.lower, theirs.upper))
     model = mujoco.MjModel.from_xml_path(str(path))
-    compare(model, assembled(description).links, 0)
+    compare(model, assemble(description).links, 0)
     np.testing.assert_allclose(model.jnt_actfrcrange, [[-10, 10], [-20, 20]])
     assert model.numeric("velocity slide").data == [1.0]
 

@@ -19,7 +19,7 @@ from palpate.families.furniture.recording import (
 )
 from palpate.families.furniture.wheels import wheel_rows
 from palpate.models.planar import furniture
-from palpate.models.planar.wheels import turned_wheel
+from palpate.models.planar.wheels import wheel_at_angle
 from palpate.parameters import with_values
 from palpate.recordings import Channel, Labels, Polygons, Recording, Role, Trial, join
 from palpate.recordings.files import read_recording, write_recording
@@ -130,7 +130,7 @@ def standing(angles, rolling, sideways, bodies=1):
     """Draws of squares with a wheel each, at angles (draws, bodies) in rad; forces in N."""
     wheels = (np.asarray(values)[..., None] for values in (angles, rolling, sideways))
     model = furniture([np.array(SQUARE)] * bodies, wheels=1)
-    return with_values(model, turned_wheel(*wheels))
+    return with_values(model, wheel_at_angle(*wheels))
 
 
 def test_wheels_are_told_by_where_they_roll():

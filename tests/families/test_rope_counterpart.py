@@ -14,16 +14,16 @@ from palpate.errors import PalpateError
 from palpate.families.rope.control_options import EvaluateRopeStabilization, TrainRopeStabilization
 from palpate.families.rope.counterpart import (
     SEEN_MARKERS,
-    adapted,
     counterpart,
-    described,
+    describe_rope,
     rope_for,
+    with_constants,
     with_markers,
 )
 from palpate.families.rope.deployment import RopeDeployment
 from palpate.families.rope.options import ALONG, IdentifyRope
 from palpate.families.rope.recording import constants, record_rope
-from palpate.families.rope.robot import servoed
+from palpate.families.rope.robot import with_servo
 from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.parameters import describe
@@ -125,8 +125,8 @@ def test_which_rope_a_policy_is_tried_in():
     rope, whose = rope_for(policy, manifest(own_rope(), foreign))
     assert whose == "that of the model it was trained on"
     assert rope == counterpart(own_rope(), 2e-3)
-    assert described(rope).startswith("0.73")
-    assert described(rope).endswith("12 markers at 60 Hz")
+    assert describe_rope(rope).startswith("0.73")
+    assert describe_rope(rope).endswith("12 markers at 60 Hz")
     other = own_rope(length=0.5)
     assert rope_for(policy, manifest(own_rope(), foreign), other) == (
         counterpart(other, 2e-3),
@@ -221,22 +221,22 @@ def test_markers_between_markers():
 
 @pytest.mark.parametrize("rate", [20, 60, 100, 144, 240])
 def test_a_servo_is_asked_a_whole_number_of_times_in_a_period(rate):
-    rope = servoed(counterpart(own_rope(control_period=1 / rate, substeps=30), 0.0), 1 / rate)
+    rope = with_servo(counterpart(own_rope(control_period=1 / rate, substeps=30), 0.0), 1 / rate)
     asked = 1 / rate / rope.control_period
     assert asked == pytest.approx(round(asked))
     assert 1.5e-3 < rope.control_period < 3e-3
-    assert servoed(RopeConfiguration(), 0.01) == RopeConfiguration(control_period=0.002)
+    assert with_servo(RopeConfiguration(), 0.01) == RopeConfiguration(control_period=0.002)
 
 
 def test_single_constants_are_changed_and_the_time_step_follows():
     base = counterpart(own_rope(), 1e-3)
-    heavy = adapted(base, {"mass": 0.2})
+    heavy = with_constants(base, {"mass": 0.2})
     assert heavy.mass == 0.2
     assert dataclasses.replace(heavy, mass=base.mass, time_step=base.time_step) == base
-    stiff = adapted(base, {"bending_stiffness": 0.01})
+    stiff = with_constants(base, {"bending_stiffness": 0.01})
     assert stiff.time_step < base.time_step
-    assert adapted(base, {}) is base
-    assert adapted(RopeConfiguration(), {"length": 0.9}) == RopeConfiguration(length=0.9)
+    assert with_constants(base, {}) is base
+    assert with_constants(RopeConfiguration(), {"length": 0.9}) == RopeConfiguration(length=0.9)
 
 
 def test_a_policy_decides_on_every_second_frame_of_a_fast_camera(tmp_path, capsys):

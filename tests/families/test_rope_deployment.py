@@ -10,7 +10,7 @@ from palpate.families.rope.counterpart import SEEN_MARKERS
 from palpate.families.rope.deployment import RopeDecision
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.rope.learned import LearnedController
-from palpate.trials.trial import stacked
+from palpate.trials.trial import stack_observations
 from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
 from small_rope import SMALL
 
@@ -29,7 +29,7 @@ def test_a_rope_world_gets_the_commands_of_the_trials(nodes):
     for _ in range(100):
         ours.see({"gripper": seen.gripper_position, "markers": seen.markers})
         command = ours.decide(command)
-        carry, (expected,) = theirs(carry, stacked([seen]), None, None)
+        carry, (expected,) = theirs(carry, stack_observations([seen]), None, None)
         np.testing.assert_allclose(command, expected, atol=1e-5)
         seen = world.step(command)
     assert np.linalg.norm(command) > 0.1

@@ -14,7 +14,7 @@ from palpate.identification.data.segments import cut
 from palpate.identification.posterior.comparison import posterior_of
 from palpate.identification.posterior.laplace import Modes
 from palpate.identification.posterior.likelihood import known_scales, motion_posterior
-from palpate.identification.posterior.posterior import SAMPLERS, Sampler, preparing, sample
+from palpate.identification.posterior.posterior import SAMPLERS, Sampler, prepare_sampler, sample
 from palpate.identification.posterior.settled import Part, Settled, settle_each
 
 pytestmark = pytest.mark.optimised
@@ -108,7 +108,7 @@ def test_another_recording_of_the_same_shape_compiles_nothing(first):
 def test_a_sampler_that_was_compiled_during_the_search_is_not_compiled_again():
     scales = known_scales(MODEL, NOISE)  # another shape than all others here
     target = motion_posterior(MODEL, cut(pushes(TRUE, 3), MODEL, 1.0, at_rest=True), scales)
-    with compiled() as names, preparing(target, 6):
+    with compiled() as names, prepare_sampler(target, 6):
         settled = settle_each(target, jax.random.key(0))
     assert "_walked" in names
     with compiled() as names:

@@ -10,7 +10,7 @@ import pytest
 from depth_scenes import depth_of
 from palpate.identification.interactive import splitting
 from palpate.identification.interactive.handling import Handling, Push
-from palpate.identification.interactive.labels import prior, scores, smoothed
+from palpate.identification.interactive.labels import prior, scores, smooth_labels
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import refine
 from palpate.identification.interactive.screws import NOWHERE, Screw
@@ -365,7 +365,7 @@ def test_a_door_that_slides_in_its_plane_is_of_one_part_and_the_wall_behind_it_s
     slide = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3)).pose(0.15)
     motions = [[NOWHERE], [slide]]
     given = scores(looks[0], looks[1:], motions)
-    found = smoothed(looks[0], given + prior(looks[0], given, motions)).argmax(axis=0)
+    found = smooth_labels(looks[0], given + prior(looks[0], given, motions)).argmax(axis=0)
     door = looks[0].points[:, 0] < 0.03
     assert found[door].mean() > 0.98
     assert found[~door].mean() < 0.02
@@ -397,7 +397,7 @@ def test_a_floor_that_goes_on_from_an_open_door_is_not_of_it() -> None:
     door = Screw("revolute", np.array([0.0, -1.0, 0.0]), np.array([-0.02, 0.0, 0.28]))
     motions = [[NOWHERE], [door.pose(-0.5 * math.pi)]]
     given = scores(opened, [closed], motions)
-    found = smoothed(opened, given + prior(opened, given, motions)).argmax(axis=0)
+    found = smooth_labels(opened, given + prior(opened, given, motions)).argmax(axis=0)
     flat = opened.normals[:, 2] > 0.9
     x, y, z = opened.points.T
     low = flat & (z < 0.4) & (np.abs(y) < 0.25)

@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.handling import Handling, Push
-from palpate.identification.interactive.labels import evidence, smoothed
+from palpate.identification.interactive.labels import evidence, smooth_labels
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES, FORCES, WORTHS, Repeat, _tries
 from palpate.learning.movable_guess import MovableGuess, load_guess
-from palpate.models.articulated.assembly import assembled
+from palpate.models.articulated.assembly import assemble
 from palpate.models.articulated.urdf import read_urdf, write_urdf
 from palpate.perception.clouds import Cloud, cloud_of
 from palpate.trials.appliance.hand import handle
@@ -186,7 +186,7 @@ def test_neighbours_on_a_surface_are_likely_of_one_part(handled):
     cloud = handled[2].before
     given = np.zeros((2, len(cloud.points)))
     given[1, ::5] = 2.0
-    chance = smoothed(cloud, given)
+    chance = smooth_labels(cloud, given)
     assert np.allclose(chance.sum(axis=0), 1.0)
     assert chance[1].mean() > 0.6
 
@@ -281,7 +281,7 @@ def test_a_twin_becomes_a_file_that_can_be_read_again(handled, tmp_path):
     twin = _copy(twin)
     twin.observe(handling)
     write_urdf(tmp_path / "twin.urdf", describe(twin, "microwave"))
-    links = assembled(read_urdf(tmp_path / "twin.urdf")).links
+    links = assemble(read_urdf(tmp_path / "twin.urdf")).links
     assert [link.joint for link in links] == ["revolute"]
     assert np.allclose(links[0].origin, twin.parts[0].screw.point, atol=1e-6)
     assert links[0].upper - links[0].lower > 0.4

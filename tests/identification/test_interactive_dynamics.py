@@ -21,7 +21,7 @@ from palpate.identification.interactive.resistance import JointMotion, regress
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated import ArticulatedState
-from palpate.models.articulated.assembly import assembled
+from palpate.models.articulated.assembly import assemble
 from palpate.parameters import parameters_of
 from palpate.perception.clouds import cloud_of
 from palpate.trials.appliance.interaction import interact
@@ -148,7 +148,7 @@ def test_a_force_of_a_period_is_half_a_period_late(known):
     _, twin, found = known
     action = next(one for one in map(partial(_Action, twin), range(len(twin.held)))
                   if one.part == 0 and one.handling.moved)  # fmt: skip
-    acts = action.motion(assembled(describe(twin, "door")).links, found.parts).effort
+    acts = action.motion(assemble(describe(twin, "door")).links, found.parts).effort
     trial = action.trial(slice(0, len(acts)), found.parts)
     forces = trial[FORCE].values[:, 0, 1:4]
     along = action.screw.velocity(action.handling.points[1 : len(acts) - 1])
@@ -174,7 +174,7 @@ def test_the_twin_moves_as_the_appliance_does(known):
 
 def test_the_file_has_what_was_felt(known):
     _, twin, found = known
-    link = assembled(found.describe_with(describe(twin, "door"))).links[0]
+    link = assemble(found.describe_with(describe(twin, "door"))).links[0]
     (own,) = found.resistance
     assert (link.damping, link.friction) == pytest.approx((own.damping, own.friction))
     still = ArticulatedState(jnp.zeros(1), jnp.zeros(1))

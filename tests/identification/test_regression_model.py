@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.identification.regression.model import KINDS, Features, regressed
+from palpate.identification.regression.model import KINDS, Features, fit_regression
 from palpate.models.model import rollout
 from toys import Cart, CartState
 
@@ -49,7 +49,7 @@ def transitions(count, model=CART, seed=0, spread=1.0):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_linear_system_is_predicted_open_loop(kind):
-    model = regressed(CART, RAW, kind, *transitions(80))
+    model = fit_regression(CART, RAW, kind, *transitions(80))
     actions = jnp.sin(jnp.arange(40))[:, None]
     start = CartState(jnp.array([0.2]), jnp.array([-0.5]))
     found, truth = rollout(model, start, actions), rollout(CART, start, actions)
@@ -66,7 +66,7 @@ def test_a_linear_system_is_predicted_open_loop(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_features_may_use_that_the_place_says_nothing(kind):
     """Data of one place are then as good everywhere, to the last digit."""
-    model = regressed(CART, MOVING, kind, *transitions(60, spread=0.01))
+    model = fit_regression(CART, MOVING, kind, *transitions(60, spread=0.01))
     actions = jnp.ones((20, 1))
     here, there = (
         rollout(model, CartState(jnp.array([place]), jnp.zeros(1)), actions).position - place
@@ -99,7 +99,9 @@ def test_conditions_tell_a_wall_and_none_does_not():
     start = CartState(jnp.array([WALL]), jnp.zeros(1))
     pushing = jnp.full((20, 1), 3.0)
     beyond = {
-        kind: float(rollout(regressed(walled, MOVING, kind, *data), start, pushing).position[-1, 0])
+        kind: float(
+            rollout(fit_regression(walled, MOVING, kind, *data), start, pushing).position[-1, 0]
+        )
         for kind in ("lwr", "oo-lwr")
     }
     assert beyond["oo-lwr"] == pytest.approx(WALL, abs=1e-3)
@@ -108,7 +110,7 @@ def test_conditions_tell_a_wall_and_none_does_not():
 
 def test_what_no_regression_is_is_said():
     with pytest.raises(PalpateError, match="unknown regression 'lstm'; there are: lwr, oo-lwr, gp"):
-        regressed(CART, RAW, "lstm", *transitions(5))
+        fit_regression(CART, RAW, "lstm", *transitions(5))
     bare = Features(raw_inputs, change, apply)
     with pytest.raises(PalpateError, match="needs features with a condition"):
-        regressed(CART, bare, "oo-lwr", *transitions(5))
+        fit_regression(CART, bare, "oo-lwr", *transitions(5))

@@ -5,7 +5,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from palpate.errors import PalpateError
-from palpate.experiments.appliance.movable_surfaces import log_loss, logistic, ranked
+from palpate.experiments.appliance.movable_surfaces import area_under_curve, log_loss, logistic
 from palpate.learning.movable_guess import FURTHEST, fit_guess, load_guess
 from palpate.perception.surface_features import FEATURES
 
@@ -28,9 +28,9 @@ def guess(ring):
 def test_it_learns_what_no_line_tells(ring, guess):
     features, moves = ring
     straight = logistic(features[:2000], moves[:2000])
-    assert ranked(straight(features[2000:]), moves[2000:]) < 0.6
+    assert area_under_curve(straight(features[2000:]), moves[2000:]) < 0.6
     chance = guess(features[2000:])
-    assert ranked(chance, moves[2000:]) > 0.85
+    assert area_under_curve(chance, moves[2000:]) > 0.85
     assert ((chance > 0.0) & (chance < 1.0)).all()
     assert log_loss(chance, moves[2000:]) < log_loss(straight(features[2000:]), moves[2000:])
 
@@ -78,6 +78,6 @@ def test_the_one_that_comes_with_palpate_prefers_what_stands_free():
 
 def test_ranks_are_those_of_pairs():
     chance, real = np.array([0.1, 0.4, 0.4, 0.8]), np.array([0.0, 1.0, 0.0, 1.0])
-    assert ranked(chance, real) == pytest.approx((1.0 + 0.5 + 1.0 + 1.0) / 4.0)
-    assert ranked(chance, np.ones(4)) is None
+    assert area_under_curve(chance, real) == pytest.approx((1.0 + 0.5 + 1.0 + 1.0) / 4.0)
+    assert area_under_curve(chance, np.ones(4)) is None
     assert log_loss(np.array([0.5]), np.array([1.0])) == pytest.approx(np.log(2.0))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from palpate.errors import PalpateError
 from palpate.models.model import rollout
 from palpate.models.planar import Planar, PlanarState, furniture
-from palpate.models.planar.shapes import centred, rectangle
+from palpate.models.planar.shapes import centre_outline, rectangle
 from palpate.parameters import FreeParameters, parameters_of, sample_prior, with_values
 
 run = jax.jit(rollout)
@@ -280,7 +280,7 @@ def test_poses_differ_by_the_short_way_round():
 
 
 def test_an_l_is_cut_into_convex_parts_of_the_same_area():
-    corners, place = centred([[0, 0], [2, 0], [2, 1], [1, 1], [1, 3], [0, 3]])
+    corners, place = centre_outline([[0, 0], [2, 0], [2, 1], [1, 1], [1, 3], [0, 3]])
     np.testing.assert_allclose(place, [0.75, 1.25])
     model = furniture([corners])
     parts = np.asarray(model.outline)[0]
@@ -303,7 +303,7 @@ def test_the_radius_of_gyration_is_that_of_the_closed_form():
         ([[0, 0], [1, 0], [2, 0]], "no area"),
         ([[0, 0], [1, 0]], "at least 3 corners"),
         ([[0, 0], [1, 0], [np.nan, 1]], "not finite"),
-        ([[0, 0], [1, 0], [1, 1], [0, 1]], "`centred` moves it there"),
+        ([[0, 0], [1, 0], [1, 1], [0, 1]], "`centre_outline` moves it there"),
     ],
 )
 def test_outlines_that_are_none_are_refused_with_a_sentence(outline, said):

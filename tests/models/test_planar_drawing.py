@@ -8,7 +8,7 @@ import numpy as np
 from palpate.models.planar import furniture
 from palpate.models.planar.drawing import PIVOT, WHEEL
 from palpate.models.planar.shapes import rectangle
-from palpate.models.planar.wheels import turned_wheel
+from palpate.models.planar.wheels import wheel_at_angle
 from palpate.report.motion import in_space
 
 POSE = jnp.array([[2.0, 1.0, np.pi / 2]])
@@ -31,7 +31,7 @@ def test_outlines_are_closed_and_turned():
 
 
 def test_a_wheel_is_a_stroke_along_which_it_rolls():
-    model = table([1.0, -1.0], **turned_wheel(np.pi / 6, 4.0, 16.0))
+    model = table([1.0, -1.0], **wheel_at_angle(np.pi / 6, 4.0, 16.0))
     stroke, across = np.asarray(model.drawing(POSE)[WHEEL]).reshape(2, 3, 3)[:, :2]
     np.testing.assert_allclose(stroke.mean(axis=0), [2.5, 2.0, 0.0], atol=1e-5)
     np.testing.assert_allclose(across.mean(axis=0), [2.5, 2.0, 0.0], atol=1e-5)

@@ -14,7 +14,7 @@ from palpate.models.planar import Planar, PlanarState, furniture
 from palpate.models.planar.friction import STICTION, Tensor, exponential
 from palpate.models.planar.shapes import rectangle
 from palpate.models.planar.system import GRAVITY
-from palpate.models.planar.wheels import turned_wheel, wheel_axes
+from palpate.models.planar.wheels import wheel_at_angle, wheel_axes
 
 pytestmark = pytest.mark.optimised
 
@@ -221,7 +221,7 @@ def test_a_fixed_wheel_goes_along_itself_only(float64):
 def test_a_wheel_that_hardly_slips_rolls_straight_in_single_precision(across):
     """A matrix of condition up to 1e11: no NaN, and up to 1e7 the force along is what it is."""
     for direction in np.linspace(0.0, np.pi, 9):
-        model = body(1, wheel_position=[0.3, 0.2], **turned_wheel(direction, 1.0, across))
+        model = body(1, wheel_position=[0.3, 0.2], **wheel_at_angle(direction, 1.0, across))
         way = np.array([np.cos(direction), np.sin(direction)])
         start = at(velocity=(*(0.5 * way), 0.0))
         poses, velocities = pushed(model, start, 1.0, (*(3.0 * way), 0.0))
@@ -232,8 +232,8 @@ def test_a_wheel_that_hardly_slips_rolls_straight_in_single_precision(across):
 
 def test_a_wheel_has_the_symmetries_of_its_labels(float64):
     """A quarter turn swaps along and across, a half turn changes nothing: one set of parameters."""
-    one = turned_wheel(0.3, 2.0, 9.0)
-    for other in (turned_wheel(0.3 + np.pi / 2, 9.0, 2.0), turned_wheel(0.3 - np.pi, 2.0, 9.0)):
+    one = wheel_at_angle(0.3, 2.0, 9.0)
+    for other in (wheel_at_angle(0.3 + np.pi / 2, 9.0, 2.0), wheel_at_angle(0.3 - np.pi, 2.0, 9.0)):
         for name, value in one.items():
             np.testing.assert_allclose(other[name], value, rtol=1e-12)
 
@@ -241,8 +241,8 @@ def test_a_wheel_has_the_symmetries_of_its_labels(float64):
 @pytest.mark.parametrize("direction", [-1.5, -0.4, 0.0, 0.3, 1.5])
 def test_where_a_wheel_rolls_and_how_hard_is_found_from_its_parameters(float64, direction):
     for parameters in (
-        turned_wheel(direction, 2.0, 300.0),
-        turned_wheel(direction + np.pi / 2, 300.0, 2.0),
+        wheel_at_angle(direction, 2.0, 300.0),
+        wheel_at_angle(direction + np.pi / 2, 300.0, 2.0),
     ):
         np.testing.assert_allclose(
             wheel_axes(**parameters), (direction, 2.0, 300.0), rtol=1e-9, atol=1e-15
@@ -253,7 +253,7 @@ def test_where_a_wheel_rolls_and_how_hard_is_found_from_its_parameters(float64, 
 @pytest.mark.parametrize("direction", [0.3, -0.4, 2.5])
 def test_a_turned_wheel_under_a_body_is_a_square_one_under_a_turned_body(float64, law, direction):
     """On one wheel under its centre and nothing else, only the wheel's axes matter."""
-    turned = body(1, law=law, **turned_wheel(direction, 2.0, 9.0))
+    turned = body(1, law=law, **wheel_at_angle(direction, 2.0, 9.0))
     square = body(1, law=law, wheel_along=2.0, wheel_across=9.0)
     expected, _ = pushed(square, at(0.0, 0.0, direction), 1.0, (8.0, 5.0, 0.0))
     poses, _ = pushed(turned, at(), 1.0, (8.0, 5.0, 0.0))

@@ -14,7 +14,7 @@ from palpate.models.planar import Planar, PlanarState, furniture
 from palpate.models.planar.friction import STICTION
 from palpate.models.planar.shapes import rectangle
 from palpate.models.planar.system import GRAVITY
-from palpate.models.planar.wheels import turned_wheel
+from palpate.models.planar.wheels import wheel_at_angle
 
 HALF = np.array([0.9, 0.425])
 
@@ -32,7 +32,7 @@ def _body(random: np.random.Generator) -> tuple[Planar, dict[str, np.ndarray | f
         floor_damping=1e-6,
         floor_spread=0.8,
         wheel_position=place,
-        **turned_wheel(direction, along, across),
+        **wheel_at_angle(direction, along, across),
     )
     gyration = float(np.sqrt(np.sum(HALF**2) / 3.0))
     signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])

@@ -10,8 +10,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from palpate.errors import PalpateError
-from palpate.models.contact import Tip, TipState, facing
-from palpate.models.contact.integration import grip, slowed
+from palpate.models.contact import Tip, TipState, tip_with_walls
+from palpate.models.contact.integration import grip, velocity_after_friction
 from palpate.models.contract import check_model
 from palpate.models.files import load_model, save_model
 from palpate.models.model import rollout
@@ -26,7 +26,7 @@ FREE = {"damping_ratio": 0.0, "damping": 0.0, "friction": 0.0}
 def walled(directions, **values) -> Tip:
     """Without friction and delay of the arm, mass of a tool and of walls, unless some is given."""
     nothing = {"arm_friction": 0.0, "tool_mass": 0.0, "wall_mass": 0.0, "control_delay": 0.0}
-    return facing(directions, **nothing | values)
+    return tip_with_walls(directions, **nothing | values)
 
 
 def moving(tip, position, velocity) -> TipState:
@@ -38,7 +38,7 @@ def held(setpoint, stiffness, steps: int):
 
 
 def test_it_keeps_the_contract_of_a_model():
-    check_model(facing([0.0, 1.0, LEFT]))
+    check_model(tip_with_walls([0.0, 1.0, LEFT]))
 
 
 def test_without_contact_the_impedance_swings_as_its_closed_form():
@@ -152,10 +152,12 @@ def test_dry_friction_of_the_arm_slows_a_free_tip_straight_to_a_stop():
 def test_friction_never_turns_round_and_takes_at_most_its_own():
     sliding = jnp.linspace(-1.0, 1.0, 2001)
     for most in (0.0, 1e-3, 0.3, 30.0):
-        after = slowed(sliding, jnp.full_like(sliding, most), 1e-4)
+        after = velocity_after_friction(sliding, jnp.full_like(sliding, most), 1e-4)
         assert np.all(after * sliding >= 0.0)
         np.testing.assert_allclose(after + most * grip(after, 1e-4), sliding, atol=1e-12)
-        slope = jax.vmap(jax.grad(slowed), (0, None, None))(sliding, jnp.asarray(most), 1e-4)
+        slope = jax.vmap(jax.grad(velocity_after_friction), (0, None, None))(
+            sliding, jnp.asarray(most), 1e-4
+        )
         assert np.all(np.isfinite(slope))
 
 
@@ -331,9 +333,9 @@ def test_the_sensor_shows_its_bias_and_a_start_knows_it():
 
 def test_walls_and_parameters_of_different_numbers_are_refused():
     with pytest.raises(PalpateError, match="'friction' has the shape"):
-        dataclasses.replace(facing([0.0, 1.0]), friction=jnp.ones(3))
+        dataclasses.replace(tip_with_walls([0.0, 1.0]), friction=jnp.ones(3))
     with pytest.raises(PalpateError, match="at least one wall"):
-        facing([])
+        tip_with_walls([])
 
 
 def test_it_is_saved_and_loaded(tmp_path):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from palpate.models.contact import facing
+from palpate.models.contact import tip_with_walls
 from palpate.models.model import rollout
 
 LAG = 2e-3  # s
@@ -26,7 +26,7 @@ SCENE = """<mujoco><option timestep="1e-4" gravity="0 0 0" cone="elliptic" impra
 
 def test_pressing_and_sliding_along_a_plate_on_a_spring_is_as_in_mujoco():
     """Set-point and stiffness change, and the plate is met at speed, rubbed along, and left."""
-    tip = facing([math.pi], position=-0.04, mass=1.2, damping_ratio=0.7, stiffness=1500.0,
+    tip = tip_with_walls([math.pi], position=-0.04, mass=1.2, damping_ratio=0.7, stiffness=1500.0,
                  damping=6.0, friction=0.35, wall_mass=0.05, arm_friction=0.0,
                  tool_mass=TOOL, sensor_lag=LAG, control_delay=0.0)  # fmt: skip
     time = tip.control_period * np.arange(400)

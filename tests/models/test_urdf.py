@@ -15,7 +15,7 @@ from palpate.commands.options import Check
 from palpate.errors import DoubtfulResultError, PalpateError
 from palpate.experiments.appliance.random_trees import random_rotation
 from palpate.models.articulated import ArticulatedState, tree_of
-from palpate.models.articulated.assembly import assembled, read_articulated
+from palpate.models.articulated.assembly import assemble, read_articulated
 from palpate.models.articulated.description import (
     DescribedJoint,
     DescribedLink,
@@ -23,7 +23,7 @@ from palpate.models.articulated.description import (
     Inertial,
     Place,
 )
-from palpate.models.articulated.faults import legal_inertia, mended, usable
+from palpate.models.articulated.faults import legal_inertia, mend, usable
 from palpate.models.articulated.urdf import read_urdf, rotation_of, turn_of, write_urdf
 from palpate.worlds.descriptions import refusal
 
@@ -49,7 +49,7 @@ def file(tmp_path):
 
 def faults_of(path):
     notes = []
-    _, faults = mended(read_urdf(path, lambda *note: notes.append(note)))
+    _, faults = mend(read_urdf(path, lambda *note: notes.append(note)))
     return notes, faults
 
 
@@ -102,7 +102,7 @@ def test_the_model_of_a_file_moves_as_pinocchio_reads_it(float64, tmp_path, seed
     rng = np.random.default_rng(seed)
     description = random_description(rng, tmp_path)
     write_urdf(tmp_path / "random.urdf", description)
-    links, names, frames = assembled(read_urdf(tmp_path / "random.urdf"))
+    links, names, frames = assemble(read_urdf(tmp_path / "random.urdf"))
     if not links:
         return
     theirs = pin.buildModelFromUrdf(str(tmp_path / "random.urdf"))
@@ -255,8 +255,8 @@ def test_mending_twice_is_mending_once(tmp_path_factory, seed):
         )
         for link in description.links
     )  # fmt: skip
-    once, _ = mended(dataclasses.replace(description, joints=spoilt, links=links))
-    twice, faults = mended(once)
+    once, _ = mend(dataclasses.replace(description, joints=spoilt, links=links))
+    twice, faults = mend(once)
     assert faults == []
     assert [joint.kind for joint in twice.joints] == [joint.kind for joint in once.joints]
 

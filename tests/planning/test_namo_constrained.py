@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from namo_rooms import two_rooms
-from palpate.numerics.polygons import placed, polygons
+from palpate.numerics.polygons import place_points, polygons
 from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.motion.constrained import ConstrainedManipulation, Drawn
@@ -59,7 +59,7 @@ def planned(world: Map, *draws: Constraint) -> Plan:
 def anchors_of(plan: Plan, constraint: Constraint) -> np.ndarray:
     """Where the fixed point is throughout, (steps, 2)."""
     poses = [s.object_poses for s in plan.segments if s.object_poses is not None]
-    return placed(np.array([constraint.anchor]), np.vstack(poses))[:, 0]
+    return place_points(np.array([constraint.anchor]), np.vstack(poses))[:, 0]
 
 
 @pytest.mark.parametrize("wheels", [(0.0, -0.45), (0.0, 0.0)])
@@ -71,7 +71,7 @@ def test_a_piece_on_wheels_is_held_by_the_face_that_can_be_reached(wheels):
     assert abs(math.cos(first.grasp.normal - ALONG_WALL)) < 0.1
     for before, after in zip(first.object_poses[:-1], first.object_poses[1:], strict=True):
         middle = 0.5 * (before[2] + after[2]) + ALONG_WALL
-        step = np.diff(placed(np.array([wheels]), np.array([before, after]))[:, 0], axis=0)[0]
+        step = np.diff(place_points(np.array([wheels]), np.array([before, after]))[:, 0], axis=0)[0]
         across = step @ np.array([-math.sin(middle), math.cos(middle)])
         assert abs(across) < 1e-6  # no wheel slips
 
@@ -103,7 +103,9 @@ def test_a_gap_counts_that_is_little_wider_than_the_margin():
     assert plan.moved == ["piece"]
     world = doorway()
     poses = np.vstack([s.object_poses for s in plan.segments if s.object_poses is not None])
-    gaps = shapely.distance(polygons(placed(world.movables["piece"].outline, poses)), world.walls)
+    gaps = shapely.distance(
+        polygons(place_points(world.movables["piece"].outline, poses)), world.walls
+    )
     assert 0.02 <= gaps.min() < math.hypot(0.02, 0.025)
 
 

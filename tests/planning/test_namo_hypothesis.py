@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from namo_grids import OWN
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import checked_polygon
+from palpate.numerics.polygons import check_polygon
 from palpate.planning.movable_obstacles.maps.description import read_described
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot, map_of
 from palpate.planning.movable_obstacles.maps.svg_paths import path_outlines
@@ -109,7 +109,7 @@ def test_any_map_ends_in_a_checked_plan_or_a_sentence(drawn):
 def test_any_corners_make_a_simple_polygon_or_a_sentence(corners):
     said = None
     try:
-        polygon = checked_polygon(corners, "it")
+        polygon = check_polygon(corners, "it")
     except PalpateError as error:
         polygon, said = None, str(error)
     assert said.startswith("it ") if polygon is None else polygon.is_valid and polygon.area >= 1e-6

@@ -13,7 +13,7 @@ from shapely.geometry import Polygon
 from namo_grids import CORNERS, OWN, room, ros_map
 from namo_rooms import IN_DOOR, two_rooms, write_map
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import checked_polygon, checked_pose, shown
+from palpate.numerics.polygons import check_polygon, check_pose, quote
 from palpate.planning.movable_obstacles.maps.files import maps_in, read_map
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot
 
@@ -59,8 +59,8 @@ def test_aliases_do_not_expand(tmp_path):
 
 def test_what_a_sentence_shows_is_short():
     for value in ("x" * 999, [1] * 999, {str(k): k for k in range(999)}, 10**400, 10**9999):
-        assert len(shown(value)) < 100
-    assert shown("box") == "'box'"
+        assert len(quote(value)) < 100
+    assert quote("box") == "'box'"
 
 
 def test_a_map_is_written_and_read_back(tmp_path):
@@ -155,15 +155,15 @@ def test_a_movable_larger_than_the_map_is_refused(tmp_path):
 
 def test_an_outline_is_closed_only_by_the_same_corner():
     far = np.array([[0, 0], [1, 0], [1, 1], [0, 0.5]]) + 9e4
-    assert len(checked_polygon(far, "it").exterior.coords) == 5
+    assert len(check_polygon(far, "it").exterior.coords) == 5
     near = [[0, 0], [1, 0], [1, 1], [1e-10, 0]]
-    assert len(checked_polygon(near, "it").exterior.coords) == 4
+    assert len(check_polygon(near, "it").exterior.coords) == 4
 
 
 @pytest.mark.parametrize("pose", [[10**400, 1], "here", [1], None, {"x": 1}, "x" * 9999])
 def test_what_is_no_pose_is_refused(pose):
     with pytest.raises(PalpateError, match=r"it is .*: expected x and y") as caught:
-        checked_pose(pose, "it")
+        check_pose(pose, "it")
     assert len(str(caught.value)) < 200
 
 

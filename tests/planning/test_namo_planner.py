@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from namo_rooms import IN_DOOR, two_rooms
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import placed, polygons
+from palpate.numerics.polygons import place_points, polygons
 from palpate.planning.movable_obstacles.maps.files import read_map
 from palpate.planning.movable_obstacles.maps.map import Movable
 from palpate.planning.movable_obstacles.maps.occupancy import Space
@@ -83,13 +83,13 @@ def exhaustive(world, name: str, depth: int) -> float:
         for primitive in PRIMITIVES[world.robot.drive]:
             if last is not None and bool(last.turn) == bool(primitive.turn):
                 continue
-            reach = np.linalg.norm(placed(movable.outline, pose) - robot[:2], axis=1).max()
+            reach = np.linalg.norm(place_points(movable.outline, pose) - robot[:2], axis=1).max()
             unit = step / reach if primitive.turn else step
             count = math.ceil((math.pi if primitive.turn else 3.0) / unit)
             lengths = unit * np.arange(1, count + 1)
             motion = model.motion(movable, pose, robot, primitive, lengths, 0)
             possible = free(
-                polygons(placed(movable.outline, motion.object_poses)), motion.robot_poses
+                polygons(place_points(movable.outline, motion.object_poses)), motion.robot_poses
             )
             price = TURNING * np.linalg.norm(pose[:2] - robot[:2]) if primitive.turn else CARRYING
             for index in range(0, possible, 3):
@@ -193,7 +193,7 @@ def test_an_object_on_the_goal_is_moved_off_it():
     assert plan.moved == ["a"]
     final = plan.segments[-2].object_poses[-1]
     body = polygons(
-        placed(two_rooms({"a": (6.7, 1.2, 7.3, 1.8)}).movables["a"].outline, final[None])
+        place_points(two_rooms({"a": (6.7, 1.2, 7.3, 1.8)}).movables["a"].outline, final[None])
     )
     assert body[0].distance(shapely.Point(7.0, 1.5)) >= 0.25 - 1e-6
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.planning.movable_obstacles.maps.map import Movable
 from palpate.planning.movable_obstacles.motion.constrained import (
     ConstrainedManipulation,
@@ -63,8 +63,8 @@ def test_a_free_piece_is_carried_rigidly(primitive):
 def test_a_pivot_keeps_its_point_whatever_point_was_meant(anchor):
     constraint = Constraint("pivot", anchor)
     motion = moved(constraint, Turn("turn", turn=1.0, anchor=(anchor[0] + 0.1, anchor[1])))
-    points = placed(np.array([anchor]), motion.object_poses)[:, 0]
-    np.testing.assert_allclose(points - placed(np.array([anchor]), POSE)[0], 0, atol=1e-9)
+    points = place_points(np.array([anchor]), motion.object_poses)[:, 0]
+    np.testing.assert_allclose(points - place_points(np.array([anchor]), POSE)[0], 0, atol=1e-9)
     assert np.ptp(motion.object_poses[:, 2]) == pytest.approx(np.ptp(LENGTHS))
     # The base keeps its place by the object.
     held = [np.linalg.norm(robot[:2] - pose[:2]) for robot, pose in zip(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from namo_rooms import IN_DOOR, two_rooms
-from palpate.numerics.polygons import length_of, placed, polygons
+from palpate.numerics.polygons import length_of, place_points, polygons
 from palpate.planning.movable_obstacles.maps.occupancy import Footprint, Space, inside
 from palpate.planning.movable_obstacles.maps.regions import regions_of
 from palpate.planning.movable_obstacles.motion.collisions import Clearance
@@ -19,7 +19,7 @@ from palpate.planning.movable_obstacles.motion.manipulation import (
     TURN_LEFT,
     Motion,
     RigidCarry,
-    carried,
+    carry,
     outline_grasps,
 )
 from palpate.planning.movable_obstacles.search.abstract import Actions, iterate
@@ -216,7 +216,7 @@ def test_an_object_hits_what_is_nearer_than_the_margin_and_its_robot_what_is_nea
         for angles in random.uniform(-4.0, 4.0, (2, 400))
     )
     others = shapely.union(world.walls, world.movables["b"].polygon)
-    bodies = polygons(placed(world.movables["a"].outline, objects))
+    bodies = polygons(place_points(world.movables["a"].outline, objects))
     inside_of = shapely.box(*world.bounds)
     room = inside_of.buffer(-world.robot.radius, join_style="mitre")
     points = shapely.points(robots[:, :2])
@@ -353,9 +353,9 @@ def test_grasps_lie_on_the_outline_and_face_it():
         assert shape.exterior.distance(shapely.Point(grasp.point)) < 1e-9
         pose = (0.3, -0.2, 0.8)
         robot = grasp.robot_pose(pose, 0.25)
-        (where,) = placed(np.array([grasp.point]), np.array(pose))
+        (where,) = place_points(np.array([grasp.point]), np.array(pose))
         assert np.linalg.norm(robot[:2] - where) == pytest.approx(0.25)
-        body = polygons(placed(outline, np.array([pose])))[0]
+        body = polygons(place_points(outline, np.array([pose])))[0]
         assert body.distance(shapely.Point(robot[:2])) == pytest.approx(0.25)
         ahead = robot[:2] + 0.3 * np.array([math.cos(robot[2]), math.sin(robot[2])])
         assert body.contains(shapely.Point(ahead))
@@ -382,5 +382,5 @@ def test_a_carried_object_keeps_its_place_in_the_robots_hands():
         assert turned == pytest.approx(np.repeat(turned[:, :1], 4, axis=1))
         moved = np.linalg.norm(np.diff(motion.robot_poses[:, :2], axis=0), axis=1)
         assert moved == pytest.approx(np.diff(lengths) * (0 if primitive.turn else 1))
-    assert carried(pose, robot, robot[None])[0] == pytest.approx(pose)
+    assert carry(pose, robot, robot[None])[0] == pytest.approx(pose)
     assert (FORWARD.forward, TURN_LEFT.turn) == (1.0, 1.0)

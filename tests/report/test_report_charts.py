@@ -12,7 +12,7 @@ from palpate.report.evidence import Parameter
 from palpate.report.parameter_chart import parameters
 from palpate.report.parameter_words import number
 from palpate.report.player import scene
-from palpate.report.style import STYLES, numbered
+from palpate.report.style import STYLES, style_indices
 
 TIME = np.linspace(0.0, 2.0, 201)
 
@@ -174,15 +174,15 @@ def test_a_long_motion_is_thinned():
 def test_looks_differ_without_colour_and_references_are_broad():
     assert len({(style.dash, style.width) for style in STYLES}) == len(STYLES)
     assert len({style.symbol for style in STYLES}) == len(STYLES)
-    looks = numbered(["predicted", "observed", "a", "predicted", "b"])
+    looks = style_indices(["predicted", "observed", "a", "predicted", "b"])
     assert looks == {"observed": 0, "predicted": 1, "a": 2, "b": 3}
-    assert numbered("abcdefg")["g"] == 2
-    assert numbered(["identified", "start model", "a"]) == {
+    assert style_indices("abcdefg")["g"] == 2
+    assert style_indices(["identified", "start model", "a"]) == {
         "identified": 1,
         "start model": 2,
         "a": 3,
     }
-    assert numbered(["true", "controlled", "held still", "swing damper"]) == {
+    assert style_indices(["true", "controlled", "held still", "swing damper"]) == {
         **{"true": 0, "controlled": 1, "held still": 2, "swing damper": 3}
     }
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palpate.identification.regression.model import regressed
+from palpate.identification.regression.model import fit_regression
 from palpate.models.planar import PlanarState, furniture
 from palpate.models.planar.shapes import rectangle
 from palpate.trials.furniture.planar_features import body_features, raw_features
@@ -59,7 +59,7 @@ def test_a_regression_of_body_features_predicts_another_place():
     asked = moved(*draws(50, 1, seed=5), 4.0, 4.0, 2.0)
     error = {}
     for name, features in (("raw", raw_features()), ("body", body_features())):
-        fitted = regressed(model, features, "lwr", *data, model.step(*data))
+        fitted = fit_regression(model, features, "lwr", *data, model.step(*data))
         off = fitted.step(*asked).pose - model.step(*asked).pose
         error[name] = float(jnp.abs(off).mean())
     assert error["body"] < 0.02

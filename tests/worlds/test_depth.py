@@ -8,7 +8,7 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.numerics.pinhole import DepthImage, Pinhole
-from palpate.worlds.depth import DepthSensor, depth_image, measured
+from palpate.worlds.depth import DepthSensor, depth_image, measure
 
 AHEAD = Pinhole.looking_at((0.0, 0.0, 1.0), (0.0, -2.0, 1.0), 80, 60, math.radians(60))
 WALL = """<mujoco><worldbody>
@@ -38,7 +38,7 @@ def test_noise_grows_with_depth_as_the_formula_says():
     for depth in (1.0, 3.0):
         whole = np.full((200, 200), depth)
         random = np.random.default_rng(0)
-        seen = measured(whole, np.ones_like(whole), DepthSensor(), random)
+        seen = measure(whole, np.ones_like(whole), DepthSensor(), random)
         expected = 1.2e-3 + 1.9e-3 * (depth - 0.4) ** 2
         assert np.nanstd(seen) == pytest.approx(expected, rel=0.02)
     assert model.ngeom == 2
@@ -59,7 +59,7 @@ def test_what_is_seen_at_a_grazing_angle_or_too_far_away_is_missing():
     depth = np.array([[1.0, 1.0, 7.0]])
     cosine = np.array([[1.0, math.cos(1.5), 1.0]])
     sensor = DepthSensor(noise=0.0, flying=0.0, lost=0.0, edge=100.0)
-    seen = measured(depth, cosine, sensor, np.random.default_rng(0))
+    seen = measure(depth, cosine, sensor, np.random.default_rng(0))
     assert np.isfinite(seen).tolist() == [[True, False, False]]
 
 

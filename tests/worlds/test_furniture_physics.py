@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.worlds.furniture.furniture import FurnitureWorld, Piece
 from palpate.worlds.furniture.pieces import KINDS
 from trolley import EXACT, LENGTH, MASS, OUTLINE, PLACES, WIDTH, sledge, trolley
@@ -14,7 +14,7 @@ from trolley import EXACT, LENGTH, MASS, OUTLINE, PLACES, WIDTH, sledge, trolley
 
 def point_at(point: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Where a point (2,) of a body at that pose is."""
-    return placed(point[None], pose)[0]
+    return place_points(point[None], pose)[0]
 
 
 def pushed(world: FurnitureWorld, wrench, steps: int = 100, seed: int = 3) -> np.ndarray:

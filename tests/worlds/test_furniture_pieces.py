@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.worlds.furniture.pieces import KINDS, centroid
 
 
 def test_placing_turns_and_moves():
     outline = np.array([(1.0, 0.0), (0.0, 2.0)])
-    moved = placed(outline, np.array([3.0, 4.0, np.pi / 2]))
+    moved = place_points(outline, np.array([3.0, 4.0, np.pi / 2]))
     assert moved == pytest.approx(np.array([(3, 5), (1, 4)]))
 
 

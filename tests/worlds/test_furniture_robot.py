@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import placed
-from palpate.planning.movable_obstacles.motion.body_controller import BodyController, moved_with
+from palpate.numerics.polygons import place_points
+from palpate.planning.movable_obstacles.motion.body_controller import BodyController, velocity_at
 from palpate.worlds.furniture.furniture import FurnitureWorld, Piece, Robot, RobotAction
 from palpate.worlds.furniture.robot import RobotObservation
 from palpate.worlds.furniture.touch import felt_wrenches
@@ -30,7 +30,9 @@ def drive(world, base=STILL, joints=STILL, grip=None, steps=50):
 def relative(truth, body=0):
     """The gripper in the frame of a body."""
     pose = truth.poses[body]
-    back = placed(truth.robot.gripper_pose[None, :2] - pose[:2], np.array([0, 0, -pose[2]]))[0]
+    back = place_points(truth.robot.gripper_pose[None, :2] - pose[:2], np.array([0, 0, -pose[2]]))[
+        0
+    ]
     return np.array([*back, truth.robot.gripper_pose[2] - pose[2]])
 
 
@@ -243,7 +245,7 @@ def test_the_body_controller_moves_a_held_table_where_it_should_go():
     controller = BodyController(links=robot.links, nominal=robot.nominal)
     start, wanted, commanded = world.truth().poses[0], np.array([-0.15, 0.1, 0.1]), np.zeros(3)
     for _ in range(200):
-        gripper = moved_with(wanted, observation.poses[0], observation.robot.gripper_pose[:2])
+        gripper = velocity_at(wanted, observation.poses[0], observation.robot.gripper_pose[:2])
         commanded, joints = controller.split(
             observation.robot.base_pose, commanded, observation.robot.joint_angles, gripper, 0.02
         )

@@ -9,11 +9,11 @@ from palpate.worlds.maze.layout import (
     TIP_RADIUS,
     TRAINING,
     UNSEEN,
-    drawn_layout,
-    named_layout,
+    draw_layout,
+    find_layout,
 )
 
-EVERY = [named_layout(name) for name in (*TRAINING, *UNSEEN)]
+EVERY = [find_layout(name) for name in (*TRAINING, *UNSEEN)]
 
 
 @pytest.mark.parametrize("layout", EVERY, ids=lambda layout: layout.name)
@@ -45,7 +45,7 @@ def test_the_channel_lets_the_tip_through_and_the_block_fills_it():
 
 
 def test_distance_is_the_way_around_walls():
-    home = named_layout("home")
+    home = find_layout("home")
     goal = np.array(home.goal)
     near = goal + np.array([(0.02, 0.03), (-0.04, 0.0), (0.0, -0.1)])
     np.testing.assert_allclose(
@@ -92,6 +92,6 @@ def test_scattered_starts_are_free_and_all_along_the_way(layout):
 
 def test_mazes_differ_and_keep_their_names():
     assert len({layout.walls for layout in EVERY}) == len(EVERY)
-    assert drawn_layout(3) == drawn_layout(3)
-    assert drawn_layout(3).walls != drawn_layout(4).walls
+    assert draw_layout(3) == draw_layout(3)
+    assert draw_layout(3).walls != draw_layout(4).walls
     assert len(UNSEEN) >= 10

@@ -8,7 +8,7 @@ import pytest
 
 from maze_worlds import held
 from palpate.errors import PalpateError
-from palpate.worlds.maze.layout import BLOCK_HALF_SIZES, TIP_RADIUS, named_layout
+from palpate.worlds.maze.layout import BLOCK_HALF_SIZES, TIP_RADIUS, find_layout
 from palpate.worlds.maze.maze import (
     DISPLACEMENT_LIMIT,
     FORCE_LIMIT,
@@ -32,7 +32,7 @@ from palpate.worlds.maze.tip import (
 )
 from palpate.worlds.world import DivergedError
 
-HOME = named_layout("home")
+HOME = find_layout("home")
 BLOCK_FACE = HOME.obstacle.position[0] - BLOCK_HALF_SIZES[0]
 AT_BLOCK = (BLOCK_FACE - TIP_RADIUS - 1e-4, HOME.obstacle.position[1])
 OPEN = (-0.12, -0.15)  # 5 cm from every wall, between the thin wall and the thick one

@@ -7,7 +7,7 @@ from palpate.commands.options import Check
 from palpate.errors import DoubtfulResultError, PalpateError
 from palpate.families.appliance.mjcf import read_mjcf_links
 from palpate.models.articulated.description import MOVING, Description
-from palpate.models.articulated.faults import Fault, mended
+from palpate.models.articulated.faults import Fault, mend
 from palpate.models.articulated.meshes import with_copied_meshes
 from palpate.models.articulated.mjcf import write_mjcf
 from palpate.models.articulated.urdf import read_urdf, read_xml, write_urdf
@@ -38,7 +38,7 @@ def run(options: Check) -> Path | None:
         faults.append(Fault(where, what, FAILING, "taken as missing"))
 
     description = read_urdf(options.file, note)
-    whole, found = mended(description)
+    whole, found = mend(description)
     faults += found
     print(f"{options.file}: {contents(description)}")
     for fault in faults:

@@ -7,7 +7,7 @@ import jax
 
 from palpate.commands import folders
 from palpate.commands.in_world.evaluate import evaluate_in_world
-from palpate.commands.train import named_task
+from palpate.commands.train import find_task
 from palpate.errors import PalpateError
 from palpate.families.options import Evaluate, Found
 from palpate.families.world_options import EvaluateInWorld
@@ -19,7 +19,7 @@ from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.runs.storage import write_text
 from palpate.tasks.task import Task
-from palpate.trials.in_model import tried_in_model
+from palpate.trials.in_model import evaluate_in_model
 
 
 def run(options: Evaluate | EvaluateInWorld) -> Path:
@@ -40,7 +40,7 @@ def evaluate_trials_of(options: Evaluate) -> Path:
         raise PalpateError(
             f"{file} was trained for '{manifest.get('task')}', not for {options.task}"
         )
-    task = named_task(options.task)
+    task = find_task(options.task)
     model, inputs = None, {"policy": file, **options.inputs()}
     if options.model is not None:
         described = folders.product_of(options.model, folders.MODEL, "identify")
@@ -54,7 +54,7 @@ def evaluate_trials_of(options: Evaluate) -> Path:
             found = options.evaluate(policy, manifest, run, base)
             figures, lines = [*found.figures], [about, *found.lines]
             if model is not None:
-                inside, _ = tried_in_model(task, model, policy, options.seed)
+                inside, _ = evaluate_in_model(task, model, policy, options.seed)
                 figures += inside
                 lines += lines_of(inside)
             write_text(run.path / folders.TABLE, "\n".join(filter(None, lines)) + "\n")

@@ -168,7 +168,7 @@ def _write_fit(
     )
     wall_time = run.elapsed + earlier
     report = fit.FitReport.of(start, found.model, data, correction)
-    figures, parameters = report.figures(wall_time), fit.fitted_rows(found)
+    figures, parameters = report.figures(wall_time), fit.fit_rows(found)
     doubts = _doubts(options, data, report.scored.within(TRUSTED))
     summary = fit.summary_of_fit(report, figures, parameters, doubts)
     settings = report.settings() | {folders.DOUBTS: doubts, folders.SUMMARY: summary}
@@ -235,7 +235,7 @@ def _write_draws(
     pieces = cut_pieces(data.validation_aligned, model, *_cut(options))
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
     evidence = draws.expected_errors(predicted, pieces, model)
-    evidence |= draws.drawn_motion(posterior, predicted, pieces)
+    evidence |= draws.posterior_motion(posterior, predicted, pieces)
     write_evidence(run.path, evidence)
     everything = np.ones(model.observation_shape[-1], bool)
     doubts = _doubts(options, data, score.pooled(everything))
@@ -250,9 +250,9 @@ def _write_draws(
         "observation_unit": tables.units_of(data.unit, model)[0],
         "predicted": tables.predicted_names(data, model),
     }
-    figures = draws.drawn_figures(posterior, score, model, run.elapsed, data.unit)
+    figures = draws.posterior_figures(posterior, score, model, run.elapsed, data.unit)
     meanings = options.meanings(posterior.models(), posterior.prior)
-    parameters = [*draws.drawn_rows(posterior), *meanings]
+    parameters = [*draws.posterior_rows(posterior), *meanings]
     rows = {"parameters": parameters, "warnings": [*doubts, *found.warnings]}
     settings[folders.SUMMARY] = draws.summary_of_draws(figures, settings, parameters)
     folders.finish(run, figures, settings, tables.split(data), **rows)

@@ -83,7 +83,7 @@ def run(options: Serve) -> Path:
         folders.finish(run, figures, {"real_time_scheduling": prompt})
         print("\n".join(lines_of(figures)))
         path = folders.hand_over(options, run, "A policy in real time")
-        if fault := stopped_by(record):
+        if fault := fault_of(record):
             raise StoppedError(f"the policy was stopped and did not go on: {fault}")
         if status or (options.simulate and not asked and not record.decisions.count):
             raise StoppedError(
@@ -93,7 +93,7 @@ def run(options: Serve) -> Path:
         return path
 
 
-def stopped_by(record: Record) -> str:
+def fault_of(record: Record) -> str:
     """The fault for which the policy stood still in the end; "" where it ran or saw nobody.
 
     A robot that fell silent has ended its work, and is no fault.

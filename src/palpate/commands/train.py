@@ -25,7 +25,7 @@ from palpate.runs.figure_names import lines_of, value_in_words
 from palpate.runs.result import machine, read_result
 from palpate.runs.run import RESULT
 from palpate.tasks.task import Task
-from palpate.trials.in_model import EPISODES, tried_in_model
+from palpate.trials.in_model import EPISODES, evaluate_in_model
 
 POOR = 0.5  # share of successes below which a policy is warned of
 
@@ -57,10 +57,10 @@ def train_through_model(options: Train) -> Path:
         if not run.finished:
             command = folders.command(options, f"train {options.place or options.task}")
             more = {"recordings": about.get("recordings", {})}
-            policy = trained(
+            policy = train_policy(
                 task, model, training, options.seed, run, command=command, manifest=more
             )
-            figures, evidence = tried_in_model(task, model, policy, options.seed)
+            figures, evidence = evaluate_in_model(task, model, policy, options.seed)
             write_evidence(run.path, evidence)
             figures += options.in_world(*load_policy(run.path / folders.POLICY))
             split = {"scored": f"{EPISODES} new start states in the model it was trained on"}
@@ -77,7 +77,7 @@ def train_through_model(options: Train) -> Path:
         return run.path
 
 
-def trained(
+def train_policy(
     task: Task,
     model: Model,
     training: Training,
@@ -105,7 +105,7 @@ def trained(
     return policy
 
 
-def named_task(name: str) -> Task:
+def find_task(name: str) -> Task:
     """The task of that name, as it is by default."""
     return find("tasks", name)()  # a task has defaults for all its fields
 

@@ -231,8 +231,8 @@ class Supervisor:
         action = np.empty_like(self.action)
         for part, limit, change in self._limits.vectors:
             own, rest = self.action[part], self._limits.rest[part]
-            moved = own + shortened(wanted[part] - own, change * share)
-            action[part] = rest + shortened(moved - rest, limit)
+            moved = own + shorten(wanted[part] - own, change * share)
+            action[part] = rest + shorten(moved - rest, limit)
         self.action = action
 
     def _brake(self, periods: float) -> None:
@@ -240,7 +240,7 @@ class Supervisor:
         action = np.empty_like(self.action)
         for part, _, change in self._limits.vectors:
             rest = self._limits.rest[part]
-            action[part] = rest + slowed(self.action[part] - rest, change * periods)
+            action[part] = rest + brake(self.action[part] - rest, change * periods)
         self.action = action
         if (action == self._limits.rest).all():
             self.mode = Mode.STOPPED
@@ -252,13 +252,13 @@ def length(vector: np.ndarray) -> float:
     return float(np.sqrt(vector @ vector))
 
 
-def shortened(vector: np.ndarray, most: float) -> np.ndarray:
+def shorten(vector: np.ndarray, most: float) -> np.ndarray:
     """The vector itself up to the length `most`, else the one of that length beside it."""
     norm = length(vector)
     return vector if norm <= most else vector * np.float32(most / norm)
 
 
-def slowed(vector: np.ndarray, change: float) -> np.ndarray:
+def brake(vector: np.ndarray, change: float) -> np.ndarray:
     """The vector shorter by `change`, or zero: one step of a brake."""
     norm = length(vector)  # zero too where the squares of denormal numbers vanish
     return vector * np.float32(max(0.0, 1 - change / norm)) if norm else np.zeros_like(vector)

@@ -92,13 +92,13 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     rivals: dict[str, list[float]] = {"finite differences": [], "mujoco.sysid": []}
     mujoco_sysid()  # raises at once where it is missing
     for door in range(first, first + count):
-        truth = drawn(door)
-        recording = pushed(truth, door)
+        truth = draw_door(door)
+        recording = push_door(truth, door)
         file = out / f"door-{door}" / "R.npz"
         file.parent.mkdir(parents=True, exist_ok=True)
         write_recording(file, recording)
         for method, outcomes in found.items():
-            outcomes.append(Outcome.of(truth, identified(file, method, door)))
+            outcomes.append(Outcome.of(truth, identify_door(file, method, door)))
             experiment.seconds += outcomes[-1].seconds
         guesses = (
             finite_differences(recording),
@@ -120,7 +120,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )  # fmt: skip
 
 
-def drawn(seed: int) -> Door:
+def draw_door(seed: int) -> Door:
     """The hidden parameters of a door."""
     random = np.random.default_rng(seed)
     return {name: float(np.exp(random.uniform(*np.log(bounds)))) for name, bounds in RANGES.items()}
@@ -136,7 +136,7 @@ def scene(door: Mapping[str, float], steps: int) -> str:
         <sensor><user name="angle" dim="1"/></sensor></mujoco>"""
 
 
-def pushed(door: Door, seed: int) -> Recording:
+def push_door(door: Door, seed: int) -> Recording:
     """Pushes of a MuJoCo door from rest, each for a while and to one side; it then swings on."""
     model = mujoco.MjModel.from_xml_string(scene(door, STEPS))
     random, trials = np.random.default_rng((seed, 1)), []
@@ -154,14 +154,14 @@ def pushed(door: Door, seed: int) -> Recording:
             mujoco.mj_step(model, data, STEPS)
         seen = np.array(angles) + NOISE * random.normal(size=len(angles))
         channels = (
-            Channel("angle", Role.OBSERVATION, times, wrapped(seen)[:, None], "rad"),
+            Channel("angle", Role.OBSERVATION, times, wrap_angle(seen)[:, None], "rad"),
             Channel("torque", Role.COMMAND, times, torque[:, None], "N m"),
         )
         trials.append(Trial(f"push {number}", {channel.name: channel for channel in channels}))
     return Recording(tuple(trials), {"source": f"a MuJoCo door, seed {seed}"})
 
 
-def identified(file: Path, method: str, seed: int) -> Result:
+def identify_door(file: Path, method: str, seed: int) -> Result:
     """What the command finds of a recording, in a run beside it."""
     options: Any = identify_options(f"{EXAMPLE}:Door")
     asked = options(
@@ -190,7 +190,7 @@ def finite_differences(recording: Recording) -> Door:
     return dict(zip(RANGES, map(float, solution), strict=True))
 
 
-def wrapped(angle: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
+def wrap_angle(angle: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
     """The same directions between -pi and pi, rad."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 

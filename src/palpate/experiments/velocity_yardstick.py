@@ -45,13 +45,15 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     first = experiment.uses(FIRST, count)
     listed = []
     for robot in ROBOTS:
-        listed += figures_of(robot, [found(experiment, robot, first + n) for n in range(count)])
+        listed += figures_of(
+            robot, [train_and_evaluate(experiment, robot, first + n) for n in range(count)]
+        )
     episodes = QUICK_EPISODES if quick else EPISODES
     settings = {"environments": ROBOTS, "cost_limit": COST_LIMIT, "episodes": episodes}
     return experiment.result(listed, settings, f"episodes of seeds from {TRIED} on, used once")
 
 
-def found(experiment: Experiment, robot: str, seed: int) -> Values:
+def train_and_evaluate(experiment: Experiment, robot: str, seed: int) -> Values:
     """What a training cost, and what its policy's episodes gave."""
     steps, episodes = (QUICK_STEPS, QUICK_EPISODES) if experiment.quick else (STEPS, EPISODES)
     policy, values = experiment.out / f"{robot}-{seed}", {}

@@ -83,15 +83,15 @@ def identify(
             )
         settings = dataclasses.replace(settings or Settings(), method=FITS[method], seed=seed)
         (start,) = hypotheses.values()
-        return fitted(start, aligned, settings, run)
+        return fit(start, aligned, settings, run)
     targets = {
         name: posterior_of(one, aligned, one_object, piece) for name, one in hypotheses.items()
     }
     watch = functools.partial(progress, description="a posterior")
-    return drawn(compare(targets, draws, chains, seed, method, watch))
+    return draw(compare(targets, draws, chains, seed, method, watch))
 
 
-def fitted(start: Model, aligned: Aligned, settings: Settings, run: Run | None) -> Identified:
+def fit(start: Model, aligned: Aligned, settings: Settings, run: Run | None) -> Identified:
     """A fit and its intervals; see `descent.identify`."""
     model = descent.identify(start, aligned, settings, run)
     coordinates = FreeParameters(model)
@@ -99,7 +99,7 @@ def fitted(start: Model, aligned: Aligned, settings: Settings, run: Run | None) 
     return Identified(**vars(found), model=model)
 
 
-def drawn(comparison: Comparison) -> Identified:
+def draw(comparison: Comparison) -> Identified:
     """The draws of the most probable hypothesis with their intervals."""
     posterior = comparison.posterior
     lower, upper = (

@@ -33,7 +33,7 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
     """
     network = model.network if isinstance(model, Residual) else None
     physics = model.physics if isinstance(model, Residual) else model
-    name = registered(physics)
+    name = kind_name(physics)
     if name is None:
         raise PalpateError(
             f"a model of type {type(physics).__name__} cannot be saved: expected a class at the "
@@ -100,13 +100,13 @@ def load_model(path: str | Path, kind: type[Model] | None = None) -> tuple[Model
             expected = f"the axes ({', '.join(axes[name])})" if axes[name] else "one number"
             raise PalpateError(f"'{name}' in {path} must be {expected}, got shape {value.shape}")
     settings = {name: value for name, value in structure.items() if name not in arrays}
-    model = built(path, kind, arrays, settings)
+    model = build(path, kind, arrays, settings)
     if _VERSIONS[version]:
         model = _corrected(path, model, content.get("correction"))
     return model, about
 
 
-def registered(model: Model) -> str | None:
+def kind_name(model: Model) -> str | None:
     """The name of the model's kind in files, None for one that has none."""
     return name_of(type(model), places("models")) or (file_of(model) or (None,))[0]
 
@@ -168,7 +168,7 @@ def structure_of(kind: type[Model]) -> dict[str, Any]:
     }
 
 
-def built(
+def build(
     path: str | Path,
     kind: type[Model],
     arrays: Mapping[str, np.ndarray],

@@ -76,7 +76,7 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def compiled_sooner(function: Callable[..., Any]) -> Callable[..., Any]:
+def compile_sooner(function: Callable[..., Any]) -> Callable[..., Any]:
     """`eqx.filter_jit` for what is compiled anew for every recording and runs for a minute.
 
     A posterior compiles in two thirds of the time and runs as fast, a single rope half as fast.
@@ -84,11 +84,11 @@ def compiled_sooner(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function, {"xla_cpu_use_fusion_emitters": False})
 
 
-def compiled_at_once(function: Callable[..., Any]) -> Callable[..., Any]:
+def compile_at_once(function: Callable[..., Any]) -> Callable[..., Any]:
     """`eqx.filter_jit` for what is compiled anew for every recording and runs for seconds.
 
     With LLVM's second level of four derivatives compile in three quarters of the time of
-    `compiled_sooner` and run up to a tenth slower; densities alone run at half the speed.
+    `compile_sooner` and run up to a tenth slower; densities alone run at half the speed.
     """
     options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
     return _compiled(function, options)
@@ -208,7 +208,7 @@ def everywhere(tree: Any) -> Any:
     return jax.device_put(tree, placed)
 
 
-def compiled_alone(function: Callable[..., Any]) -> Callable[..., Any]:
+def compile_alone(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function of arrays by itself, so that what it returns is stored.
 
     XLA's CPU compiler otherwise computes an intermediate again for each of its uses: three times

@@ -24,7 +24,7 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
 
 
-def shown(value: object) -> str:
+def quote(value: object) -> str:
     """What a file gave, for a sentence: as `repr`, but never longer than that sentence."""
     try:
         return _SHORT.repr(value)
@@ -32,14 +32,14 @@ def shown(value: object) -> str:
         return f"a huge {type(value).__name__}"
 
 
-def listed(names: Iterable[str], most: int = 8) -> str:
+def list_names(names: Iterable[str], most: int = 8) -> str:
     """Names for a sentence, the first few of them."""
     every = list(names)
     more = f" and {len(every) - most} more" if len(every) > most else ""
-    return (", ".join(shown(name).strip("'") for name in every[:most]) or "none") + more
+    return (", ".join(quote(name).strip("'") for name in every[:most]) or "none") + more
 
 
-def checked_polygon(points: object, what: str) -> Polygon:
+def check_polygon(points: object, what: str) -> Polygon:
     """A polygon from corner points (points, 2) in metres; `what` is what errors call it.
 
     Raises `PalpateError` for fewer than three corners, NaN, corners farther than 100 km away, an
@@ -75,7 +75,7 @@ def checked_polygon(points: object, what: str) -> Polygon:
     return shapely.geometry.polygon.orient(polygon)
 
 
-def checked_pose(pose: object, what: str) -> tuple[float, float, float]:
+def check_pose(pose: object, what: str) -> tuple[float, float, float]:
     """x, y, theta as floats; theta may be left out and is then 0.
 
     Raises `PalpateError` for anything but two or three finite numbers within 100 km.
@@ -86,7 +86,7 @@ def checked_pose(pose: object, what: str) -> tuple[float, float, float]:
         values = []
     if len(values) not in (2, 3) or not all(abs(value) < LARGEST for value in values):
         raise PalpateError(
-            f"{what} is {shown(pose)}: expected x and y in m and, if given, theta in rad"
+            f"{what} is {quote(pose)}: expected x and y in m and, if given, theta in rad"
         )
     x, y, *theta = values
     return x, y, theta[0] if theta else 0.0
@@ -97,13 +97,13 @@ def corners_of(polygon: Polygon) -> np.ndarray:
     return np.asarray(polygon.exterior.coords)[:-1]
 
 
-def centred(polygon: Polygon) -> tuple[np.ndarray, tuple[float, float]]:
+def centre_polygon(polygon: Polygon) -> tuple[np.ndarray, tuple[float, float]]:
     """The outline about its centroid, and where that centroid is."""
     x, y = polygon.centroid.coords[0]
     return corners_of(polygon) - (x, y), (float(x), float(y))
 
 
-def placed(outline: np.ndarray, pose: np.ndarray | Sequence[float]) -> np.ndarray:
+def place_points(outline: np.ndarray, pose: np.ndarray | Sequence[float]) -> np.ndarray:
     """Body points (points, 2) in the world, for a pose (3,) or a batch (*batch, 3)."""
     pose = np.asarray(pose, float)
     cos, sin = np.cos(pose[..., 2:]), np.sin(pose[..., 2:])
@@ -114,7 +114,7 @@ def placed(outline: np.ndarray, pose: np.ndarray | Sequence[float]) -> np.ndarra
     return points
 
 
-def turned(vector: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
+def rotate(vector: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
     """(x, y) turned by an angle in rad."""
     (x, y), cos, sin = vector, math.cos(angle), math.sin(angle)
     return np.array([cos * x - sin * y, sin * x + cos * y])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 from palpate.family import check_name
 from palpate.recordings.channel import Channel, Role
 from palpate.recordings.csv import SECONDS, TIME, Lines
@@ -102,8 +102,8 @@ def _channels(path: Path, lines: Lines, names: Sequence[str], rate: float | None
         raise PalpateError(f"two columns are called '{twice[0]}': expected different names")
     if not clocks and rate is None:
         raise PalpateError(
-            f"no column is called time, t or timestamp, but {listed(header)}: expected one, or the "
-            "rate (--rate HZ)"
+            f"no column is called time, t or timestamp, but {list_names(header)}: expected one, or "
+            "the rate (--rate HZ)"
         )
     clock = next(iter(clocks), None)
     rows, time = [], []

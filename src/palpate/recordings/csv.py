@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 from palpate.recordings.tables import MarkerTable
 
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
@@ -111,14 +111,14 @@ def _plain(names: list[str], lines: Lines) -> MarkerTable:
     if not triples:
         raise PalpateError(
             "no marker columns: expected three for each marker, such as m0_x, m0_y and m0_z, "
-            f"but the header has {listed(names)}"
+            f"but the header has {list_names(names)}"
         )
     markers = in_natural_order(list(triples))
     clock, second = clocks[0] if clocks else (None, 1.0)
     time, positions = _table(lines, len(names), clock, [triples[name] for name in markers])
     used = {clock, *chain.from_iterable(triples.values())}
     unused = [name for column, name in enumerate(names) if column not in used and name]
-    notes = (f"columns that are no markers were left out: {listed(unused)}",) if unused else ()
+    notes = (f"columns that are no markers were left out: {list_names(unused)}",) if unused else ()
     return MarkerTable(
         "CSV", None if clock is None else time * second, positions, markers, notes=notes
     )
@@ -152,7 +152,7 @@ def _motive(first: list[str], lines: Lines) -> MarkerTable:
         ],
     )
     if not triples:
-        there = listed(sorted({kind for kind in kinds[2:] if kind and kind.lower() != "type"}))
+        there = list_names(sorted({kind for kind in kinds[2:] if kind and kind.lower() != "type"}))
         raise PalpateError(f"no columns of type Marker (there are: {there}): export the markers")
     labelled = {k: v for k, v in triples.items() if not k.lower().startswith("unlabeled")}
     notes = ()
@@ -183,7 +183,7 @@ def _vicon(first: list[str], lines: Lines) -> MarkerTable:
         raise PalpateError(f"line {lines.number - 1} has no columns X, Y, Z")
     unit = {_unit(units[column], lines.number) for column in chain(*triples.values())}
     if len(unit) > 1:
-        raise PalpateError(f"line {lines.number} mixes the units {listed(sorted(unit))}")
+        raise PalpateError(f"line {lines.number} mixes the units {list_names(sorted(unit))}")
     markers = in_natural_order(list(triples))
     frame, positions = _table(lines, width, 0, [triples[name] for name in markers], block=True)
     return MarkerTable("Vicon CSV", frame / rate, positions, markers, unit.pop())
@@ -234,7 +234,9 @@ def _named(names: list[str], columns: list[int]) -> dict[str, list[int]]:
 
 def _unit(name: str, line: int) -> str:
     if name.lower() not in _UNITS:
-        raise PalpateError(f"line {line}: unknown unit '{name}'; known are {listed(list(_UNITS))}")
+        raise PalpateError(
+            f"line {line}: unknown unit '{name}'; known are {list_names(list(_UNITS))}"
+        )
     return _UNITS[name.lower()]
 
 

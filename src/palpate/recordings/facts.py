@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import checked_polygon, shown
+from palpate.numerics.polygons import check_polygon, quote
 from palpate.runs.storage import DamagedFileError, parse_json, plain
 
 
@@ -37,7 +37,7 @@ class Labels(Fact):
         )
         if not texts or len(set(self.labels)) < len(self.labels):
             raise PalpateError(
-                f"labels are {shown(self.labels)}: expected texts, none empty, a name for each"
+                f"labels are {quote(self.labels)}: expected texts, none empty, a name for each"
             )
 
 
@@ -53,9 +53,9 @@ class Quantity(Fact):
         try:
             values = np.array(self.values, np.float64)
         except (TypeError, ValueError) as error:
-            raise PalpateError(f"a quantity is {shown(self.values)}: expected numbers") from error
+            raise PalpateError(f"a quantity is {quote(self.values)}: expected numbers") from error
         if not np.isfinite(values).all():
-            raise PalpateError(f"a quantity is {shown(self.values)}: expected finite numbers")
+            raise PalpateError(f"a quantity is {quote(self.values)}: expected finite numbers")
         object.__setattr__(self, "values", values)
 
 
@@ -72,7 +72,7 @@ class Polygons(Fact):
         if names and len(names) != len(self.polygons):
             raise PalpateError(f"{len(self.polygons)} polygons have {len(names)} names")
         for number, polygon in enumerate(self.polygons):
-            checked_polygon(polygon, f"polygon '{names[number]}'" if names else f"polygon {number}")
+            check_polygon(polygon, f"polygon '{names[number]}'" if names else f"polygon {number}")
         corners = tuple(np.array(polygon, np.float64) for polygon in self.polygons)
         object.__setattr__(self, "polygons", corners)
 
@@ -115,7 +115,7 @@ class Driven(Fact):
 
     def __post_init__(self) -> None:
         if not all(type(index) is int and index >= 0 for index in self.indices):
-            raise PalpateError(f"driven are {shown(self.indices)}: expected integers from 0 on")
+            raise PalpateError(f"driven are {quote(self.indices)}: expected integers from 0 on")
 
 
 KINDS: dict[str, type[Fact]] = {
@@ -134,7 +134,7 @@ def fact_from_json(name: str, content: Any) -> Fact:
     kind = fields.pop("kind", None)
     if not isinstance(kind, str) or kind not in KINDS:
         raise DamagedFileError(
-            f"fact '{name}' is of the kind {shown(kind)}; known are: {', '.join(KINDS)}"
+            f"fact '{name}' is of the kind {quote(kind)}; known are: {', '.join(KINDS)}"
         )
     return _made(name, KINDS[kind], **fields)
 

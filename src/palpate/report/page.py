@@ -33,7 +33,7 @@ from palpate.report.evidence import (
 from palpate.report.parameter_chart import parameters
 from palpate.report.parameter_words import elements, interval, number
 from palpate.report.player import scene
-from palpate.report.style import STYLES, numbered
+from palpate.report.style import STYLES, style_indices
 from palpate.runs.figure_names import name_in_words, number_in_words, value_in_words
 from palpate.runs.storage import write_text
 
@@ -82,7 +82,7 @@ def _sections(found: Sequence[Evidence]) -> tuple[str, list[Section]]:
             if curves
         ]
         labelled = (*(motion.chains for motion in evidence.motions), *(c.values for c in curves))
-        looks.append(numbered(chain.from_iterable(labelled)))
+        looks.append(style_indices(chain.from_iterable(labelled)))
 
     def contents(part: Part) -> list[str]:
         """Of each run that has evidence for it, under its name where there are several."""

@@ -49,7 +49,7 @@ _ROLES = {
 FANS = ("draws",)  # of which there are many lines
 
 
-def numbered(labels: Iterable[str]) -> dict[str, int]:
+def style_indices(labels: Iterable[str]) -> dict[str, int]:
     """The index into `STYLES` of each label: that of its role, else one that is left, never 0.
 
     Those are taken in order of first appearance, and anew where there are more. One mapping for

@@ -131,6 +131,6 @@ def progress(steps: Iterable[Any] | int, description: str, done: int = 0) -> Pro
 Watch = Callable[[Sequence[Any]], Iterable[Any]]
 
 
-def unwatched(rounds: Sequence[Any]) -> Sequence[Any]:
+def without_progress(rounds: Sequence[Any]) -> Sequence[Any]:
     """The rounds as they are: nobody is shown how far it is."""
     return rounds

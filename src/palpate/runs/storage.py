@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 
 # Our one entry in the safetensors header, because the library writes several in random order and
 # the same arrays should give the same bytes: {"manifest": ..., "keys": ..., "crc32": ...}.
@@ -206,7 +206,7 @@ def load_arrays(path: str | Path, like: Any) -> tuple[Any, dict[str, Any]]:
     lacking, surplus = wanted - arrays.keys(), arrays.keys() - wanted
     if lacking or surplus:
         problems = [
-            f"{what} {listed(map(repr, sorted(names)), 4)}"
+            f"{what} {list_names(map(repr, sorted(names)), 4)}"
             for what, names in (("lacks", lacking), ("has besides", surplus))
             if names
         ]

@@ -53,7 +53,9 @@ def _root(matrix: Matrix) -> Matrix:
     return (modes * xp.sqrt(xp.maximum(values, 0))[..., None, :]) @ modes.swapaxes(-1, -2)
 
 
-def turned(along: Float[Any, "*batch"], across: Float[Any, "*batch"], direction: Vector) -> Matrix:
+def rotate_stiffness(
+    along: Float[Any, "*batch"], across: Float[Any, "*batch"], direction: Vector
+) -> Matrix:
     """The stiffness that is `along` N/m in a direction and `across` N/m square to it.
 
     K = across I + (along - across) u u^T. A direction without length is that of the first axis.
@@ -66,7 +68,7 @@ def turned(along: Float[Any, "*batch"], across: Float[Any, "*batch"], direction:
     return across[..., None, None] * axes + (along - across)[..., None, None] * onto
 
 
-def approached(
+def approach(
     previous: Float[Any, "*shape"], wanted: Float[Any, "*shape"], most: float, axes: int
 ) -> Float[Any, "*shape"]:
     """`wanted`, or as near to it as a step of size `most` leads from `previous`.
@@ -174,7 +176,7 @@ class ImpedanceLaw:
             along, across = self._low + self._span * (action[:, 2:4].T + 1) / 2
         else:
             along = across = np.full(len(action), self._constant)
-        self._sound, self._wanted = sound, (position + step, turned(along, across, step))
+        self._sound, self._wanted = sound, (position + step, rotate_stiffness(along, across, step))
         if fresh.all():
             springs = np.broadcast_to(self._softest, (len(step), 2, 2))
             self._now = position, springs
@@ -216,8 +218,8 @@ class ImpedanceLaw:
         wanted, (farthest, stiffest) = self._wanted, self._most
         target, springs = self._now
         self._now = (
-            wanted[0] if farthest == math.inf else approached(target, wanted[0], farthest, 1),
-            wanted[1] if stiffest == math.inf else approached(springs, wanted[1], stiffest, 2),
+            wanted[0] if farthest == math.inf else approach(target, wanted[0], farthest, 1),
+            wanted[1] if stiffest == math.inf else approach(springs, wanted[1], stiffest, 2),
         )
         self._moving = any((a != b).any() for a, b in zip(self._now, wanted, strict=True))
         sound = self._sound[:, None, None]

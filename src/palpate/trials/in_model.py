@@ -15,7 +15,7 @@ EPISODES = 256  # from start states that were not trained on, for the figures
 SHOWN = 3  # of them: the first ones, not chosen by how they went
 
 
-def tried_in_model(
+def evaluate_in_model(
     task: Task, model: Model, policy: Controller, seed: int
 ) -> tuple[list[Figure], dict[str, np.ndarray]]:
     """Means over episodes in the model, from start states of another seed than the training's.

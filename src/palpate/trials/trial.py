@@ -150,7 +150,7 @@ def run_trials(
     with ThreadPoolExecutor(devices.cores()) as threads:
         for step in range(steps + 1):
             if step:
-                carry, actions = controller(carry, stacked(loop.latest), goals, None)
+                carry, actions = controller(carry, stack_observations(loop.latest), goals, None)
                 advance = functools.partial(loop.advance, step, actions)
                 list(threads.map(advance, shares))  # MuJoCo lets the other threads run meanwhile
             if watch is not None:
@@ -200,7 +200,7 @@ class _Loop(Generic[RecordType]):
             array[self._drawn[index], step] = getattr(observation, observed)
 
 
-def stacked(observations: Sequence[Any]) -> Any:
+def stack_observations(observations: Sequence[Any]) -> Any:
     """The observations of several worlds as one, whose arrays lead with the worlds.
 
     The `time` is that of the newest.
@@ -211,7 +211,7 @@ def stacked(observations: Sequence[Any]) -> Any:
     if not dataclasses.is_dataclass(first):
         return None if first is None else np.stack(observations)
     columns = {
-        field.name: stacked([getattr(one, field.name) for one in observations])
+        field.name: stack_observations([getattr(one, field.name) for one in observations])
         for field in dataclasses.fields(first)
     }
     return dataclasses.replace(first, **columns)  # type: ignore[type-var]

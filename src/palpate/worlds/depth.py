@@ -47,12 +47,12 @@ def depth_image(
     length = np.linalg.norm(rays, axis=1)
     cosine = np.abs(np.sum(normals * rays, axis=1)) / length
     shape = pinhole.height, pinhole.width
-    seen = measured(depth.reshape(shape), cosine.reshape(shape), sensor, random)
+    seen = measure(depth.reshape(shape), cosine.reshape(shape), sensor, random)
     bodies = np.where(geoms >= 0, model.geom_bodyid[geoms], -1).reshape(shape)
     return DepthImage(float(data.time), pinhole, seen), bodies
 
 
-def measured(
+def measure(
     depth: Float[np.ndarray, "height width"],
     cosine: Float[np.ndarray, "height width"],
     sensor: DepthSensor,

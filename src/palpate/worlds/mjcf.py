@@ -40,7 +40,7 @@ def read_mjcf(path: str | Path, plugin: str = "") -> mujoco.MjSpec:
         raise _unusable(path, error) from error
 
 
-def compiled(path: str | Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
+def compile_model(path: str | Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
     """The model of a scene that was read from `path`; raises `PalpateError` where it is none."""
     try:
         return spec.compile()

@@ -10,7 +10,7 @@ from palpate.planning.movable_obstacles.motion.body_controller import (
     BodyController,
     arm_jacobian,
     gripper_pose,
-    moved_with,
+    velocity_at,
 )
 
 LINKS = (0.4, 0.3, 0.2)
@@ -45,7 +45,7 @@ def test_the_jacobian_is_the_derivative():
 
 
 def test_a_point_moves_with_its_body():
-    velocity = moved_with(
+    velocity = velocity_at(
         np.array([0.1, 0.2, 0.5]), np.array([1.0, 1.0, 2.0]), np.array([1.0, 3.0])
     )
     assert velocity == pytest.approx([0.1 - 0.5 * 2, 0.2, 0.5])
@@ -94,7 +94,7 @@ def test_the_split_is_exact_when_the_base_is_free_to_follow():
         rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
         lever = rotation @ gripper_pose(angles, controller.links)
         got = (
-            moved_with(velocity, np.zeros(3), lever)
+            velocity_at(velocity, np.zeros(3), lever)
             + rotation @ arm_jacobian(angles, controller.links) @ joints
         )
         assert got == pytest.approx(wanted, abs=1e-9)

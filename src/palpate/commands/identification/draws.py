@@ -8,7 +8,7 @@ import numpy as np
 
 from palpate.commands import folders
 from palpate.commands.identification.tables import (
-    doubted,
+    describe_doubts,
     informed_parameters,
     or_none,
     typical_and_worst,
@@ -29,7 +29,7 @@ LEVEL, SHORT = 0.9, 0.1  # of the intervals, and how far their coverage may fall
 FAN, LINES = "draws", 40  # of the page's fan
 
 
-def drawn_rows(posterior: Posterior) -> list[dict[str, Any]]:
+def posterior_rows(posterior: Posterior) -> list[dict[str, Any]]:
     """The parameters for `result.json`: medians, 90 % intervals and what the data left open."""
     declared = posterior.target.coordinates.declarations
     return [
@@ -49,7 +49,7 @@ def drawn_rows(posterior: Posterior) -> list[dict[str, Any]]:
     ]
 
 
-def drawn_figures(
+def posterior_figures(
     posterior: Posterior, score: Score, model: Model, wall_time: float, unit: str
 ) -> list[Figure]:
     """Errors of each unit that is observed, coverage, and how far the chains may be trusted."""
@@ -86,7 +86,7 @@ def expected_errors(predicted: Predicted, pieces: Segments, model: Model) -> dic
     }
 
 
-def drawn_motion(
+def posterior_motion(
     posterior: Posterior, predicted: Predicted, pieces: Segments
 ) -> dict[str, np.ndarray]:
     """Evidence of the pieces whose error is the median and the worst: a fan beside the observed."""
@@ -123,4 +123,4 @@ def summary_of_draws(
     held += f". {informed_parameters(rows)}"
     if rhat is not None and rhat >= MIXED:
         held += f" Draw more: the chains do not agree yet (R-hat {rhat:.3g})."
-    return [found, doubted(settings[folders.DOUBTS]) or held]
+    return [found, describe_doubts(settings[folders.DOUBTS]) or held]

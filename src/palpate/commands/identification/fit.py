@@ -8,7 +8,7 @@ import numpy as np
 
 from palpate.commands.identification.data import Data
 from palpate.commands.identification.tables import (
-    doubted,
+    describe_doubts,
     informed_parameters,
     or_none,
     predicted_names,
@@ -178,7 +178,7 @@ def _root_mean_square(error: np.ndarray) -> np.ndarray:
     return np.sqrt(np.nansum(error**2, axis=-1) / or_nan(count))
 
 
-def fitted_rows(found: Identified) -> list[dict[str, Any]]:
+def fit_rows(found: Identified) -> list[dict[str, Any]]:
     """The parameters for `result.json`: what `describe` says, with intervals and verdicts."""
     return [
         row
@@ -254,4 +254,4 @@ def summary_of_fit(
     trust = informed_parameters(rows)
     if not held_out:
         trust += " No trial was held out, so the error on other motions is unknown."
-    return [found, doubted(doubts) or trust]
+    return [found, describe_doubts(doubts) or trust]

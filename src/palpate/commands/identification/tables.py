@@ -89,7 +89,7 @@ def _cells(row: dict[str, Any]) -> tuple[str, str, str, str]:
     return known.name, f"{elements(known)} {known.unit}".rstrip(), within, note
 
 
-def doubted(doubts: Sequence[str]) -> str:
+def describe_doubts(doubts: Sequence[str]) -> str:
     return f"It is not to be trusted: {doubts[0]}." if doubts else ""
 
 

@@ -20,7 +20,7 @@ def at_its_best(policy: ActorPolicy) -> Acting:
     return lambda observation: np.asarray(act(observation))
 
 
-def played(
+def play_episodes(
     make: Callable[[int], VectorEnv], act: Acting, episodes: int, seed: int
 ) -> dict[str, np.ndarray]:
     """What so many episodes gave, as `palpate.learning.off_policy.evaluate` does."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.in_world.episodes import at_its_best, played
+from palpate.commands.in_world.episodes import at_its_best, play_episodes
 from palpate.errors import PalpateError
 from palpate.families.world_options import EvaluateInWorld
 from palpate.networks.guarded import load_actor
@@ -44,7 +44,7 @@ def evaluate_in_world(options: EvaluateInWorld) -> Path:
                 suffix = "" if name == "policy" else f".{name.replace(' ', '_')}"
                 watching = policy if name == "policy" else None
                 make = functools.partial(options.make, manifest=manifest, policy=watching)
-                found = played(make, act, episodes, options.seed)
+                found = play_episodes(make, act, episodes, options.seed)
                 rows[name] = options.figures(found, suffix)
             rows["policy"] += options.probed(policy, manifest)
             options.show(run, policy, manifest)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders
-from palpate.commands.in_world.episodes import at_its_best, played
+from palpate.commands.in_world.episodes import at_its_best, play_episodes
 from palpate.families.world_options import TrainInWorld
 from palpate.learning.off_policy import train_off_policy
 from palpate.networks import save_controller
@@ -28,9 +28,9 @@ def train_in_world(options: TrainInWorld) -> Path:
     decided = {"training": dataclasses.asdict(options.training()), "constants": options.constants()}
     with folders.begin(options, words, options.inputs(), folders.POLICY, **decided) as run:
         if not run.finished:
-            policy, figures = trained_in_world(options, run)
+            policy, figures = train_policy_in_world(options, run)
             make = functools.partial(options.make, policy=policy)
-            tried = played(make, at_its_best(policy), options.tried, options.seed + 1)
+            tried = play_episodes(make, at_its_best(policy), options.tried, options.seed + 1)
             figures += options.figures(tried, ".tried")
             options.show(run, policy)
             settings: dict[str, Any] = {folders.SUMMARY: [f"{line}." for line in lines_of(figures)]}
@@ -43,7 +43,7 @@ def train_in_world(options: TrainInWorld) -> Path:
         return run.path
 
 
-def trained_in_world(options: TrainInWorld, run: Run) -> tuple[ActorPolicy, list[Figure]]:
+def train_policy_in_world(options: TrainInWorld, run: Run) -> tuple[ActorPolicy, list[Figure]]:
     """The policy that is trained in `run`, which keeps it; and what the training cost."""
     path = run.path / folders.POLICY
     offline = options.collected()

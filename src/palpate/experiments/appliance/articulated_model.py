@@ -102,7 +102,7 @@ def figures(trees: dict[str, Any], drifts: list[float]) -> list[Figure]:
 def errors(case: Case) -> dict[str, Any]:
     """Relative errors of the accelerations, and of each kind of derivative."""
     links = len(case.links)
-    model, state, action = padded(case)
+    model, state, action = pad(case)
     ours = np.asarray(acceleration(model, state, action))[:links]
     found: dict[str, Any] = {
         name: float(np.abs(ours - theirs).max() / np.abs(theirs).max())
@@ -130,7 +130,7 @@ def errors(case: Case) -> dict[str, Any]:
     return found
 
 
-def padded(case: Case) -> tuple[Articulated, ArticulatedState, Float[Array, "links 7"]]:
+def pad(case: Case) -> tuple[Articulated, ArticulatedState, Float[Array, "links 7"]]:
     """The tree filled up to the largest, so that one compilation serves all."""
     model = tree_of(case.links, size=MOST, control_period=CONTROL_PERIOD, substeps=SUBSTEPS)
     action = np.concatenate([case.torque[:, None], case.push, case.point], axis=1)

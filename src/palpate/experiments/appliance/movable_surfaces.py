@@ -130,15 +130,15 @@ def figures(
         own = {"": guess, **{f"{name}.": each for name, each in rivals.items()}}
         for name, each in own.items():
             listed += [
-                Figure(f"{prefix}{name}area_under_curve", ranked(each[chosen], real[chosen]), "",
-                       better="higher"),
+                Figure(f"{prefix}{name}area_under_curve",
+                       area_under_curve(each[chosen], real[chosen]), "", better="higher"),
                 Figure(f"{prefix}{name}log_loss", log_loss(each[chosen], real[chosen]), "nats"),
             ]  # fmt: skip
         listed.append(Figure(f"{prefix}surfaces", float(chosen.sum()), "", better="higher"))
     return listed
 
 
-def ranked(chance: Probabilities, real: np.ndarray) -> float | None:
+def area_under_curve(chance: Probabilities, real: np.ndarray) -> float | None:
     """The probability that a surface that moves has a greater number than one that does not."""
     positive = real > 0.5
     count, others = int(positive.sum()), int((~positive).sum())

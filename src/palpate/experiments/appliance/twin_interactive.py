@@ -170,7 +170,7 @@ def figures(found: Mapping[tuple[str, int, str], Mapping[str, Any]]) -> list[Fig
     ]
     for rival in RIVALS:
         if others := {one[:2]: each for one, each in found.items() if one[2] == rival}:
-            listed += compared(own, others, rival)
+            listed += push_ratio(own, others, rival)
     listed += of_motions([each for each in own.values() if "motions" in each])
     for name, each in by_category.items():
         prefix = name.replace("-", "_")
@@ -195,13 +195,13 @@ def of_motions(found: Sequence[Mapping[str, Any]]) -> list[Figure]:
         Figure("parameter_coverage_90", of("inside", np.mean), "", better="higher"),
         Figure("motions", float(len(moves)), "", better="higher"),
         Figure("residual_worse_count", float(sum(map(worse_corrected, found))), "", 0.0),
-        Figure("residual_kept_count", float(sum(kept(each) for each in found)), ""),
+        Figure("residual_kept_count", float(sum(is_corrected(each) for each in found)), ""),
         Figure("cloud_to_urdf_s_p95", float(np.quantile(seconds, 0.95)) if seconds else None, "s",
                10.0),
     ]  # fmt: skip
 
 
-def kept(each: Mapping[str, Any]) -> bool:
+def is_corrected(each: Mapping[str, Any]) -> bool:
     """Whether an appliance's twin was corrected."""
     return any(one["corrected"] is not None for one in each["motions"])
 
@@ -209,13 +209,13 @@ def kept(each: Mapping[str, Any]) -> bool:
 def worse_corrected(each: Mapping[str, Any]) -> bool:
     """Whether an appliance's twin moves worse with its correction than without, over its parts."""
     pairs = [(one["corrected"], one["error"]) for one in each["motions"]]
-    if not kept(each):
+    if not is_corrected(each):
         return False
     corrected, alone = np.mean(np.array(pairs, float), axis=0)
     return bool(corrected > alone)
 
 
-def compared(
+def push_ratio(
     own: Mapping[tuple[str, int], Mapping[str, Any]],
     others: Mapping[tuple[str, int], Mapping[str, Any]],
     rival: str,

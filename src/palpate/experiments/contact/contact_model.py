@@ -21,7 +21,7 @@ from palpate.commands.identification.data import read
 from palpate.experiments.experiment import Experiment
 from palpate.families.contact.touch_options import IdentifyContact, RecordContact
 from palpate.families.options import Method
-from palpate.models.contact import facing
+from palpate.models.contact import tip_with_walls
 from palpate.recordings import Recording
 from palpate.recordings.files import read_recording
 from palpate.runs import Figure, Result
@@ -44,7 +44,7 @@ JUDGED = {  # what is found: how its error is called, in which unit, and its bar
 FOUND = tuple(JUDGED)
 TOUCHED, SLIDING = 5.0, 0.02  # N, far above a tool's inertia, and m/s: what a textbook counts
 STEEP = 0.8  # tangential over normal force, from which on it is another plate that rubs
-PRIOR = facing(NOMINAL)  # its values are the priors' medians
+PRIOR = tip_with_walls(NOMINAL)  # its values are the priors' medians
 
 Walls = dict[str, Float[np.ndarray, "walls"]]  # by what is found; SI units
 
@@ -79,7 +79,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             asked = IdentifyContact(recordings=(file,), method=method, seed=plates, **where)
             result = read_result(identify.run(asked) / RESULT)
             experiment.seconds += result.wall_time_s
-            found[name].append(judged(result, hidden, centre_of(asked)))
+            found[name].append(judge(result, hidden, centre_of(asked)))
         for name, guess in RIVALS.items():
             off = errors(guess(recording), truth_of(hidden, np.zeros(2)))
             rivals[name].append(Outcome(off, {}))
@@ -115,7 +115,7 @@ def centre_of(options: IdentifyContact) -> Float[np.ndarray, "2"]:
     return np.asarray(model.centre)
 
 
-def judged(result: Result, hidden: Plates, centre: Float[np.ndarray, "2"]) -> Outcome:
+def judge(result: Result, hidden: Plates, centre: Float[np.ndarray, "2"]) -> Outcome:
     """What `palpate identify contact` wrote, against what is hidden."""
     rows = {row["name"]: row for row in result.parameters}
     truth = truth_of(hidden, centre)

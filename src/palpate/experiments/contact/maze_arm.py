@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders, train
-from palpate.commands.in_world.episodes import at_its_best, played
+from palpate.commands.in_world.episodes import at_its_best, play_episodes
 from palpate.experiments.contact.maze_safe import FIRST
 from palpate.experiments.experiment import Experiment
 from palpate.families.contact.episodes import figures
@@ -49,18 +49,18 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     first, whole = experiment.uses(FIRST, count), QUICK_EPISODES if quick else EPISODES
     found: dict[str, list[Episodes]] = {who: [] for who in whole}
     for number in range(count):
-        folder = trained(experiment, first + number)
+        folder = train_on_tip(experiment, first + number)
         for who, episodes in whole.items():
             share = len(range(number, episodes, count))
             about = {"policy": folder.name, "episodes": share}
-            work = functools.partial(tried, folder, who, share, TRIED + first + number)
+            work = functools.partial(evaluate_policy, folder, who, share, TRIED + first + number)
             found[who].append(experiment.found(f"{folder.name}-{who}", about, work)["episodes"])
     settings = {"episodes": whole, "command": f"palpate train maze --method {METHOD}"}
     split = "new episodes in the maze that the policies were trained in, on the tip alone"
-    return experiment.result(held_against(found), settings, split)
+    return experiment.result(compare(found), settings, split)
 
 
-def trained(experiment: Experiment, seed: int) -> Path:
+def train_on_tip(experiment: Experiment, seed: int) -> Path:
     """The folder of the training on the tip."""
     folder = experiment.out / f"maze-{METHOD}-{seed}"
     small: dict[str, Any] = {}
@@ -71,17 +71,17 @@ def trained(experiment: Experiment, seed: int) -> Path:
     return folder
 
 
-def tried(folder: Path, who: str, episodes: int, seed: int) -> dict[str, Episodes]:
+def evaluate_policy(folder: Path, who: str, episodes: int, seed: int) -> dict[str, Episodes]:
     """So many episodes of the policy on the arm or the tip, or of an arm that holds "still"."""
     policy, manifest = load_actor(folder / folders.POLICY)
     options = EvaluateMaze(policy=folder, world="tip" if who == "tip" else "arm")
     make = functools.partial(options.make, manifest=manifest, policy=policy)
     act = (lambda seen: np.zeros((len(seen), 4))) if who == "still" else at_its_best(policy)
-    ended = played(make, act, episodes, seed)
+    ended = play_episodes(make, act, episodes, seed)
     return {"episodes": {name: values.tolist() for name, values in ended.items()}}
 
 
-def held_against(found: dict[str, list[Episodes]]) -> list[Figure]:
+def compare(found: dict[str, list[Episodes]]) -> list[Figure]:
     """Figures of all policies' episodes together: the arm's with their bars, then the others'."""
     pooled = {
         who: figures({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})

@@ -122,13 +122,13 @@ def of_training(experiment: Experiment, name: str, seed: int) -> dict[str, Any]:
         for row, (training, which, world) in ROWS.items():
             if training == name:
                 count = size.on_arm if world == "arm" else size.episodes
-                rows[row] = tried(policy, which, world, count, TRIED + experiment.seed)
+                rows[row] = evaluate_policy(policy, which, world, count, TRIED + experiment.seed)
         return {"rows": rows}
 
     return experiment.found(f"{name}-{seed}-found", about, work)
 
 
-def tried(folder: Path, which: str, world: str, episodes: int, seed: int) -> Episodes:
+def evaluate_policy(folder: Path, which: str, world: str, episodes: int, seed: int) -> Episodes:
     """How episodes of a policy ended, and their energies, J."""
     policy, manifest = load_actor(folder / folders.POLICY)
     options = EvaluateMaze(policy=folder, filter=which, world=world)  # type: ignore[arg-type]

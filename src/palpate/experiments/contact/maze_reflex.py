@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from palpate.commands import folders, train
-from palpate.commands.in_world.episodes import at_its_best, played
+from palpate.commands.in_world.episodes import at_its_best, play_episodes
 from palpate.experiments.contact.maze_safe import FIRST
 from palpate.experiments.experiment import Experiment, mean_of, ratio, share_of
 from palpate.families.contact.maze_options import EvaluateMaze, TrainMaze
@@ -100,7 +100,7 @@ def of_training(experiment: Experiment, task: str, method: str, seed: int) -> Fo
         def tried(**asked: Any) -> dict[str, int]:
             trial = TASKS[task][1](policy=folder, seed=TRIED + seed, **asked)
             make = functools.partial(trial.make, manifest=manifest, policy=policy)
-            ended = played(make, at_its_best(policy), episodes, trial.seed)
+            ended = play_episodes(make, at_its_best(policy), episodes, trial.seed)
             ends = {end: int(np.sum(ended["end"] == end)) for end in ("goal", "violation")}
             return ends | {"of": episodes}
 

@@ -105,7 +105,7 @@ def of_training(experiment: Experiment, name: str, seed: int) -> dict[str, Any]:
         if name in (OWN, PLAIN):
             places["noisy"] = {"noise": NOISY}
         found: dict[str, Any] = {
-            where: tried(folder, where, size.episodes, TRIED + experiment.seed, **asked)
+            where: evaluate_policy(folder, where, size.episodes, TRIED + experiment.seed, **asked)
             for where, asked in places.items()
         }
         return found | {
@@ -117,7 +117,7 @@ def of_training(experiment: Experiment, name: str, seed: int) -> dict[str, Any]:
     return experiment.found(f"{name}-{seed}-found", about, work)
 
 
-def tried(policy: Path, where: str, episodes: int, seed: int, **asked: Any) -> Values:
+def evaluate_policy(policy: Path, where: str, episodes: int, seed: int, **asked: Any) -> Values:
     """What `evaluate` finds of a policy."""
     folder = policy.with_name(f"{policy.name}-{where}")
     options = EvaluateMaze(policy=policy, episodes=episodes, seed=seed, out=folder, **asked)

@@ -82,7 +82,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         **constants(),
     }
     with experiment.stage("simulations", configuration) as stage:
-        found, names = calibrated(size, seed, stage.run)
+        found, names = calibrate(size, seed, stage.run)
     ranks = found["rank"]
     values = [p_values(each, DRAWS, size.bins) for each in ranks]
     labels = ("right sigma", f"sigma {WRONG:g} times too large")
@@ -133,7 +133,7 @@ def body() -> Planar:
     return declare(furniture([rectangle(1.2, 0.7)]), **PRIORS)
 
 
-def pushed(seed: int, sigma_factor: float) -> Problem:
+def push_body(seed: int, sigma_factor: float) -> Problem:
     """Four pushes of the body from rest at the origin, the same for all simulations."""
     rng = np.random.default_rng(seed)
     held = rng.normal(size=(PUSHES, 2, 1, 3)) * (FORCE, FORCE, TORQUE)
@@ -141,13 +141,13 @@ def pushed(seed: int, sigma_factor: float) -> Problem:
     return problem(body(), jnp.zeros((PUSHES, 1, 3)), action, NOISE, sigma_factor)
 
 
-def calibrated(size: Size, seed: int, run: Run) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def calibrate(size: Size, seed: int, run: Run) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """Ranks, effective sizes and R-hat, each (2, simulations, parameters), and the names.
 
     First with the right sigma, then with the wrong one. Batches are checkpoints: a run that was cut
     off repeats one at most.
     """
-    problems = [pushed(seed, factor) for factor in (1.0, WRONG)]
+    problems = [push_body(seed, factor) for factor in (1.0, WRONG)]
     names = problems[0].target.names
     if size.simulations % BATCH:
         raise PalpateError(f"{size.simulations} simulations are no multiple of {BATCH}")

@@ -20,7 +20,7 @@ from shapely.geometry import Polygon, box
 from palpate.experiments.experiment import Experiment
 from palpate.families.furniture.plan_picture import plan_picture
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot, map_of
-from palpate.planning.movable_obstacles.search.plan import Plan, timed
+from palpate.planning.movable_obstacles.search.plan import Plan, planning_clock
 from palpate.planning.movable_obstacles.search.planner import Planner
 from palpate.planning.movable_obstacles.search.policy import NoWayError
 from palpate.planning.movable_obstacles.search.verification import faults_of
@@ -90,11 +90,11 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
 def plan_timed(objects: int, map_seed: int, seed: int = 0) -> Timed:
     """Generate a map, plan it once from nothing, and check the plan."""
     world = generated_map(objects, map_seed)
-    begin = timed()
+    begin = planning_clock()
     try:
         plan = Planner(seed=seed).plan(world)
     except NoWayError as error:
-        return Timed(objects, map_seed, None, timed() - begin, str(error))
+        return Timed(objects, map_seed, None, planning_clock() - begin, str(error))
     faults = faults_of(plan, world)
     return Timed(objects, map_seed, plan, plan.planning_s, faults[0] if faults else None)
 

@@ -110,7 +110,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0, maps: Path | Non
     with experiment.counted():
         for path in files:
             taken = {trial.name for trial in trials}
-            trials.append(tried(path, out, repeats, seed, taken))
+            trials.append(plan_map(path, out, repeats, seed, taken))
             print(trials[-1].line(), flush=True)
     return experiment.result(
         figures(trials),
@@ -127,7 +127,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0, maps: Path | Non
     )
 
 
-def tried(
+def plan_map(
     path: Path, out: Path, repeats: int, seed: int, taken: Collection[str] = frozenset()
 ) -> Trial:
     """Plan one map, check the plans, and write plan, picture and animation of each below `out`.

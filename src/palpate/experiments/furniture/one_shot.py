@@ -27,7 +27,7 @@ from palpate.experiments.furniture.one_shot_pieces import (
     error_share,
     fit,
     fit_jointly,
-    judged,
+    judge,
     pushes_of,
     recordings,
     scene,
@@ -191,7 +191,7 @@ def _judged(posterior: Posterior, pushes: Recording) -> dict[str, Any]:
     model = posterior.target.coordinates.reference
     asked = pushes_of(pushes, model)
     return {
-        **vars(judged(model, posterior.predict(asked), asked)),
+        **vars(judge(model, posterior.predict(asked), asked)),
         "rhat": posterior.rhat_of_predictions,
         "ess": posterior.size_of_predictions,
         "sampling_s": posterior.draws.seconds,
@@ -225,14 +225,14 @@ def _figures(
     first: int,
 ) -> list[Figure]:
     movable = {kind: of for kind, of in pieces.items() if kind != BOLTED}
-    each = {kind: pooled(of) for kind, of in movable.items()}
+    each = {kind: pool_errors(of) for kind, of in movable.items()}
     every = [stage for of in movable.values() for stage in of]
     inside = [stage["inside"] for stage in every]
     paces = {name: Pace(**pace) for name, pace in raced["paces"].items()}
     wins, cells = victories(compared)
     figures = [
-        Figure("error_share", pooled(every), "", bar=0.05, seed_document="one-shot learning",
-               spread=two_standard_errors([pooled([stage]) for stage in every])),
+        Figure("error_share", pool_errors(every), "", bar=0.05, seed_document="one-shot learning",
+               spread=two_standard_errors([pool_errors([stage]) for stage in every])),
         Figure("error_share_worst_kind", max(each.values()), "", bar=0.2),
         Figure("bolted_drift_cm", 100.0 * max(stage["drift_m"] for stage in pieces[BOLTED]), "cm",
                bar=1.0),
@@ -261,20 +261,22 @@ def _figures(
         for kind, of in pieces.items()
     ]
     figures += [
-        Figure(f"error_share_of_sysid.{kind}", pooled([stage]) if stage["error_m"] else None, "")
+        Figure(
+            f"error_share_of_sysid.{kind}", pool_errors([stage]) if stage["error_m"] else None, ""
+        )
         for kind, stage in sysid.items()
     ]
     ours, theirs = of_the_same_pieces(pieces, sysid, first)
     figures += [
-        Figure("error_share_of_sysid", pooled(theirs) if theirs else None, ""),
-        Figure("error_share_of_the_same_pieces", pooled(ours) if ours else None, ""),
+        Figure("error_share_of_sysid", pool_errors(theirs) if theirs else None, ""),
+        Figure("error_share_of_the_same_pieces", pool_errors(ours) if ours else None, ""),
     ]
     figures.append(Figure("rhat_worst_piece", max(s["rhat"] for s in every), ""))
     figures.append(Figure("ess_worst_piece", min(s["ess"] for s in every), "", better="higher"))
     return figures
 
 
-def pooled(stages: list[dict[str, Any]]) -> float:
+def pool_errors(stages: list[dict[str, Any]]) -> float:
     """Error share over all pushes of these pieces."""
     error = np.concatenate([stage["error_m"] for stage in stages])
     return error_share(error, np.concatenate([stage["displacement_m"] for stage in stages]))

@@ -84,7 +84,7 @@ def fit_jointly(handled: Recording, draws: int, seed: int) -> Posterior:
     return sample(target, draws=draws, seed=seed)
 
 
-def judged(model: Model, predicted: Predicted, pieces: Segments) -> Pushes:
+def judge(model: Model, predicted: Predicted, pieces: Segments) -> Pushes:
     """Hold predictions of pushes against what was seen, of those bodies that were pushed."""
     pushed = np.any(np.asarray(pieces.action) != 0.0, axis=(1, 3))  # (pieces, bodies)
     target, start = np.asarray(pieces.target), np.asarray(pieces.pose)

@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palpate.experiments.furniture.one_shot_pieces import PERIOD, error_share, judged, pushes_of
+from palpate.experiments.furniture.one_shot_pieces import PERIOD, error_share, judge, pushes_of
 from palpate.families.furniture.recording import POSE, WRENCH, names_of, starting_furniture
 from palpate.families.furniture.structures import structures
 from palpate.identification.data.segments import Segments, cut, noise_scale
 from palpate.identification.posterior.comparison import compare
 from palpate.identification.posterior.likelihood import inferred_scales, motion_posterior
-from palpate.identification.regression.model import RegressedModel, regressed
+from palpate.identification.regression.model import RegressedModel, fit_regression
 from palpate.models.model import rollout
 from palpate.models.planar import Planar, PlanarState
 from palpate.recordings import Aligned, Polygons, Recording
@@ -43,7 +43,7 @@ def shares(
     found: dict[str, dict[int, float | None]] = {name: {} for name in (OURS, *RIVALS)}
     for size in SIZES:
         seen = first_samples(aligned, size + 1)
-        found[OURS][size] = _ours(recorded(handled, seen), seen, pushes, draws, seed)
+        found[OURS][size] = _ours(truncate(handled, seen), seen, pushes, draws, seed)
         for rival in RIVALS:
             share = _theirs(handled, aligned, pushes, rival, size)
             found[rival][size] = share if np.isfinite(share) else None
@@ -65,7 +65,7 @@ def first_samples(aligned: Aligned, size: int) -> Aligned:
     )
 
 
-def recorded(recording: Recording, seen: Aligned) -> Recording:
+def truncate(recording: Recording, seen: Aligned) -> Recording:
     """A recording of no more than these frames of its first trial."""
     trial = recording.trials[0]
     channels = {}
@@ -87,7 +87,7 @@ def _ours(handled: Recording, seen: Aligned, pushes: Recording, draws: int, seed
     targets = {name: motion_posterior(of, pieces, scales) for name, of in models.items()}
     posterior = compare(targets, draws, CHAINS, seed).posterior
     asked = pushes_of(pushes, model)
-    result = judged(model, posterior.predict(asked), asked)
+    result = judge(model, posterior.predict(asked), asked)
     return error_share(result.error_m, result.displacement_m)
 
 
@@ -102,7 +102,7 @@ def _theirs(handled: Recording, aligned: Aligned, pushes: Recording, kind: str, 
     asked = pushes_of(pushes, fine)
     choices = [body_features([outline])] + ([] if kind == "oo-lwr" else [raw_features()])
     return min(
-        _share(regressed(prototype, features, kind, before, wrench, after), asked)
+        _share(fit_regression(prototype, features, kind, before, wrench, after), asked)
         for features in choices
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Float
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.worlds.furniture.furniture import SETTLING, STEPS_PER_PERIOD
 from palpate.worlds.furniture.pieces import (
     LOAD_REACH,
@@ -115,7 +115,7 @@ def caster_angles(
     the tractrix: within a few trails it forgets where it began. Here it begins at `STARTS` angles;
     their mean is returned, with the length of their mean unit vector, 1 where all agree.
     """
-    pivots = np.array([placed(np.array([place]), pose)[0] for pose in way])
+    pivots = np.array([place_points(np.array([place]), pose)[0] for pose in way])
     moved = np.diff(pivots, axis=0)
     path, heading = np.linalg.norm(moved, axis=1), np.arctan2(moved[:, 1], moved[:, 0])
     angles = np.empty((len(way), STARTS))  # in the world

@@ -86,7 +86,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     trials = lasting([StabilizationTrial(nominal.BASE, start, first) for start in START_POSES])
     rollouts = ROLLOUTS // 20 if quick else ROLLOUTS
     with experiment.stage("search", {"policy": about, "rollouts": rollouts}) as stage:
-        done = bounded(model, policy, trials, rollouts, seed, stage.run)
+        done = find_bound(model, policy, trials, rollouts, seed, stage.run)
         if not stage.finished:
             write_evidence(stage.path, _evidence(done))
     outcome = Outcome.of(done)
@@ -111,7 +111,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
 
 
-def bounded(
+def find_bound(
     model: Rope,
     policy: CommandPolicy,
     trials: list[StabilizationTrial],
@@ -254,7 +254,7 @@ class Outcome:
 
     @classmethod
     def of(cls, done: dict[str, np.ndarray]) -> "Outcome":
-        """What came of a search that is done: see `bounded`."""
+        """What came of a search that is done: see `find_bound`."""
         period, shape = nominal.BASE.control_period, done["replayed_energy"].shape
         energy, speed = (
             done[name].reshape(-1, shape[-1]) for name in ("replayed_energy", "replayed_speed")

@@ -115,7 +115,7 @@ def nominal_trials(ropes: int, seed: int) -> list[StabilizationTrial]:
     return [dataclasses.replace(trial, steps=_steps()) for trial in trials]
 
 
-def whirled(ropes: int, seed: int) -> list[WhirledTrial]:
+def whirl_ropes(ropes: int, seed: int) -> list[WhirledTrial]:
     """Sampled ropes, each whirled in a circle of its own rate, speed, sense and phase."""
     random = np.random.default_rng((seed, 2))
     configurations = sample_configurations(nominal.BASE, ropes, seed)
@@ -171,7 +171,7 @@ class TakeOver(FeedbackController):
         return (step + 1, inner), command
 
 
-def watched(policy: CommandPolicy, trials: Sequence[StabilizationTrial]) -> Observed:
+def watch(policy: CommandPolicy, trials: Sequence[StabilizationTrial]) -> Observed:
     """What a robot sees of a policy from the instant on at which it takes over.
 
     Without the trials whose simulation ended early; velocities as the policy estimates them.
@@ -217,8 +217,8 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         task,
         model,
         policy,
-        lambda policy, seed: watched(policy, nominal_trials(work.nominal, NOMINAL_SEEDS + seed)),
-        lambda policy, seed: watched(policy, whirled(work.watched, WATCHED_SEEDS + seed)),
+        lambda policy, seed: watch(policy, nominal_trials(work.nominal, NOMINAL_SEEDS + seed)),
+        lambda policy, seed: watch(policy, whirl_ropes(work.watched, WATCHED_SEEDS + seed)),
         training,
         out,
         seed=seed,
@@ -242,7 +242,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         "swing_damper": dataclasses.asdict(TUNED),
     }
     used = {"about": about, **settings}
-    shifted, usual = whirled(work.evaluated, first), nominal_trials(work.nominal, first)
+    shifted, usual = whirl_ropes(work.evaluated, first), nominal_trials(work.nominal, first)
     tried = {
         suffix(name): TakeOver(controller)
         for name, controller in (controllers | baselines(nominal.BASE)).items()

@@ -112,7 +112,7 @@ def reproduce(
     )
 
 
-def undamped(rope: Rope) -> Rope:
+def remove_damping(rope: Rope) -> Rope:
     """The baseline of Lv et al. 2017: every damping term zero, and staying so."""
     still = with_values(rope, {name: jnp.zeros_like(getattr(rope, name)) for name in DAMPING})
     return declare(still, **{name: {"fixed": True} for name in DAMPING})
@@ -141,7 +141,7 @@ def _compare(
 ) -> dict[str, PredictionError]:
     """Errors on unseen trials of the fit, the undamped fit, and the model before fitting."""
     errors = {"before fitting": prediction_error(rope, unseen)}
-    for label, start in (("damped", rope), ("undamped", undamped(rope))):
+    for label, start in (("damped", rope), ("undamped", remove_damping(rope))):
         configuration = {"data": name, "model": label, **source, **dataclasses.asdict(settings)}
         with experiment.stage(f"{name}/{label}", configuration) as stage:
             model = identify(start, fitted, settings, stage.run)
@@ -205,7 +205,7 @@ def captures(mocap: Path) -> list[Path]:
     return [mocap / name for name in CAPTURES]
 
 
-def seen_capture(path: Path, mend: bool = False) -> Aligned:
+def read_capture(path: Path, mend: bool = False) -> Aligned:
     """A recording of a real rope; with `mend` without markers that jump, as for fitting."""
     recording = read_recording(path, rate=RATE)
     recording = with_driven(repair_markers(recording) if mend else recording, GRIPPED)
@@ -217,7 +217,7 @@ def seen_capture(path: Path, mend: bool = False) -> Aligned:
 def _real(experiment: Experiment, mocap: Path, settings: Settings) -> list[Figure]:
     """L1 on a real rope gripped at both ends, in centimetres."""
     paths = captures(mocap)
-    fitted, unseen = seen_capture(paths[0], mend=True), seen_capture(paths[1])
+    fitted, unseen = read_capture(paths[0], mend=True), read_capture(paths[1])
     driven = np.array(GRIPPED) % fitted.observation.shape[2]
     rope = starting_rope(fitted, driven.tolist())
     source = {"files": [fingerprint(path) for path in paths]}

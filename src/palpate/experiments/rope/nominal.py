@@ -13,7 +13,7 @@ from typing import Any
 
 from palpate.commands.folders import POLICY
 from palpate.commands.train import constants as task_constants
-from palpate.commands.train import trained
+from palpate.commands.train import train_policy
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment
 from palpate.families.rope.recording import GRIPPER, MARKERS, constants, record_rope, starting_rope
@@ -119,7 +119,7 @@ def trained_policy(
     with experiment.stage(folder, configuration) as stage:
         if not stage.finished:
             command = experiment.command
-            trained(task, model, training, experiment.seed, stage.run, command=command)
+            train_policy(task, model, training, experiment.seed, stage.run, command=command)
         return load_policy(stage.path / POLICY)
 
 

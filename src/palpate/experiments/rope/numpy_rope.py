@@ -167,7 +167,7 @@ class NumpyRope(World):
         )
 
 
-def drawn(seed: int, markers: int, rate: float) -> RopeConfiguration:
+def draw_rope(seed: int, markers: int, rate: float) -> RopeConfiguration:
     """A rope as `NumpyRope` takes it, drawn by the seed."""
     random = np.random.default_rng(seed)
     length = float(random.uniform(*LENGTH))
@@ -183,7 +183,7 @@ def drawn(seed: int, markers: int, rate: float) -> RopeConfiguration:
     )  # fmt: skip
 
 
-def recorded(rope: RopeConfiguration, seed: int, trials: int, duration: float) -> Recording:
+def record_rope(rope: RopeConfiguration, seed: int, trials: int, duration: float) -> Recording:
     """Markers alone, of a rope whose held end is shaken by hand; some are lost for a while."""
     world, random, kept = NumpyRope(rope), np.random.default_rng((seed, 1)), []
     for number in range(trials):

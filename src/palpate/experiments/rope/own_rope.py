@@ -18,7 +18,7 @@ from palpate.commands.folders import POLICY
 from palpate.commands.options import Export, Serve
 from palpate.errors import StoppedError
 from palpate.experiments.experiment import Experiment, share_of
-from palpate.experiments.rope.numpy_rope import NumpyRope, drawn, ranges, recorded
+from palpate.experiments.rope.numpy_rope import NumpyRope, draw_rope, ranges, record_rope
 from palpate.experiments.rope.spoilt import check_recordings
 from palpate.families.rope.control_options import EvaluateRopeStabilization, TrainRopeStabilization
 from palpate.families.rope.options import IdentifyRope
@@ -112,11 +112,11 @@ def through_every_command(
     experiment: Experiment, out: Path, seed: int, markers: int, rate: float, size: Size
 ) -> Outcome:
     """Record a rope and give it to one command after the other, in folders below `out`."""
-    rope = drawn(seed, markers, rate)
+    rope = draw_rope(seed, markers, rate)
     file, onnx = out / "R.npz", out / "policy.onnx"
     if not file.exists():
         out.mkdir(parents=True, exist_ok=True)
-        write_recording(file, recorded(rope, seed, TRIALS, LASTING))
+        write_recording(file, record_rope(rope, seed, TRIALS, LASTING))
     model = identify.run(
         IdentifyRope(
             recordings=(file,), mass=rope.mass, uniform=True, seed=seed, out=out / "identified"

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from palpate.commands import identify
 from palpate.experiments.experiment import Experiment, share_of
-from palpate.experiments.rope.simulated import simulated
+from palpate.experiments.rope.simulated import simulate
 from palpate.families.options import Method
 from palpate.families.rope.options import IdentifyRope
 from palpate.models.rope import Rope
@@ -68,10 +68,10 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         truth = sample_prior(nominal(), jax.random.key(rope))
         fitted, unseen = (out / f"rope-{rope}" / f"{name}.npz" for name in ("fitted", "unseen"))
         fitted.parent.mkdir(parents=True, exist_ok=True)
-        write_recording(fitted, shaken(truth, rope, size.trials))
-        write_recording(unseen, shaken(truth, rope + 10**6, UNSEEN))
+        write_recording(fitted, shake(truth, rope, size.trials))
+        write_recording(unseen, shake(truth, rope + 10**6, UNSEEN))
         for method, found in outcomes.items():
-            result = identified(method, fitted, unseen, rope)
+            result = identify_rope(method, fitted, unseen, rope)
             experiment.seconds += result.wall_time_s
             found.append((result, inside(result, truth)))
     return experiment.result(
@@ -111,17 +111,17 @@ def hanging(rope: Rope) -> Float[np.ndarray, "nodes 3"]:
     return position
 
 
-def shaken(rope: Rope, seed: int, trials: int) -> Any:
+def shake(rope: Rope, seed: int, trials: int) -> Any:
     """A recording of trials in which the gripper is still, moves at random, and is still again."""
     still = np.zeros((round(STILL / PERIOD), 3))
     actions = []
     for trial_seed in np.random.SeedSequence(seed).generate_state(trials).tolist():
         motion = excitation(trial_seed, MOVING, PERIOD, SPEED_LIMIT, ACCELERATION_LIMIT)
         actions.append(PERIOD * np.cumsum(np.concatenate([still, motion]), axis=0))
-    return simulated(rope, hanging(rope), np.stack(actions), NOISE, seed)
+    return simulate(rope, hanging(rope), np.stack(actions), NOISE, seed)
 
 
-def identified(method: Method, fitted: Path, unseen: Path, seed: int) -> Result:
+def identify_rope(method: Method, fitted: Path, unseen: Path, seed: int) -> Result:
     """What the command finds of a recording, in a run beside it."""
     options = IdentifyRope(
         recordings=(fitted,),

@@ -16,8 +16,8 @@ import numpy as np
 from palpate.commands import identify
 from palpate.commands.identification.fit import CORRECTION
 from palpate.experiments.experiment import Experiment
-from palpate.experiments.rope.model import GRIPPED, RATE, captures, seen_capture
-from palpate.experiments.rope.simulated import simulated
+from palpate.experiments.rope.model import GRIPPED, RATE, captures, read_capture
+from palpate.experiments.rope.simulated import simulate
 from palpate.families.rope.options import NOISE, IdentifyRope
 from palpate.identification.data.prediction import prediction_error
 from palpate.models.files import load_model
@@ -55,7 +55,7 @@ def reproduce(
         IdentifyRope, residual=True, iterations=QUICK if quick else (), seed=seed
     )
     recording = out / "simulated.npz"
-    write_recording(recording, recorded(experiment.uses(0, TRIALS)))
+    write_recording(recording, record_rope(experiment.uses(0, TRIALS)))
     simulated_rope = options(recordings=(recording,), mass=MASS, out=out / "simulated")
     results = {"simulated": _identified(experiment, simulated_rope)}
     figures: list[Figure] = []
@@ -85,7 +85,7 @@ def constants() -> dict[str, float]:
     return size | STIFFNESS | {"noise": NOISE, "trials": TRIALS, "duration": DURATION}
 
 
-def recorded(seed: int) -> Recording:
+def record_rope(seed: int) -> Recording:
     """Trials of a rope that is the model itself: nothing is left over.
 
     The gripper moves at random and then holds still, from hanging.
@@ -98,7 +98,7 @@ def recorded(seed: int) -> Recording:
     ]
     hanging = np.zeros((rope.nodes, 3))
     hanging[:, 2] = -np.linspace(0.0, LENGTH, NODES)
-    return simulated(rope, hanging, np.stack(commands), NOISE, seed)
+    return simulate(rope, hanging, np.stack(commands), NOISE, seed)
 
 
 def _identified(experiment: Experiment, options: IdentifyRope) -> Result:
@@ -113,7 +113,7 @@ def _real_figures(found: Result, folder: Path, unseen: Path) -> list[Figure]:
     figures = [Figure("l1_ratio_to_physics", value, "", bar=0.90, rival=DEFORM)]
     model, _ = load_model(folder / "model.json")
     if isinstance(model, Residual):
-        aligned = seen_capture(unseen)
+        aligned = read_capture(unseen)
         ours, alone = (prediction_error(of, aligned).by_trial for of in (model, model.physics))
         figures += gain_figures(ours, alone)
     return figures + _figures("real", found)

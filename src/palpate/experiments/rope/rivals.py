@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from palpate.experiments.experiment import Experiment, decision_figures, suffix
 from palpate.experiments.rope import nominal
-from palpate.experiments.rope.model import undamped
+from palpate.experiments.rope.model import remove_damping
 from palpate.experiments.rope.nominal import Size
 from palpate.families.rope.recording import constants
 from palpate.learning import Training
@@ -88,7 +88,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         experiment,
         "identify-undamped",
         size,
-        dataclasses.replace(undamped(model), drive="position").constrain(),
+        dataclasses.replace(remove_damping(model), drive="position").constrain(),
         nominal.recorded_markers(out),
     )
     rival, rival_about = nominal.trained_policy(

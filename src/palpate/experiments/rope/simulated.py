@@ -11,7 +11,7 @@ from palpate.models.rope import Rope
 from palpate.recordings import Channel, Recording, Role, Trial
 
 
-def simulated(
+def simulate(
     rope: Rope,
     start: Float[np.ndarray, "nodes 3"],
     actions: Float[np.ndarray, "trials steps 3"],

@@ -10,7 +10,7 @@ import numpy as np
 from palpate.commands.identification.data import read
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, share_of
-from palpate.experiments.rope.numpy_rope import drawn, recorded
+from palpate.experiments.rope.numpy_rope import draw_rope, record_rope
 from palpate.families.rope.options import IdentifyRope
 from palpate.recordings import Channel, Recording, Role, Trial
 from palpate.recordings.files import write_recording
@@ -87,8 +87,8 @@ def _checked(folder: Path, first: int, count: int) -> dict[str, Any]:
         seed, name = first + index, names[index % len(names)]
         random = np.random.default_rng((seed, 2))
         markers = int(random.integers(MARKERS[0], MARKERS[1] + 1))
-        rope = drawn(seed, markers, float(np.exp(random.uniform(*np.log(RATES)))))
-        recording = recorded(rope, seed, TRIALS, LASTING)
+        rope = draw_rope(seed, markers, float(np.exp(random.uniform(*np.log(RATES)))))
+        recording = record_rope(rope, seed, TRIALS, LASTING)
         kind = KINDS.get(name, Spoilt("no channel"))
         bad = furniture() if name == WRONG_FILE else spoil(recording, kind, random)
         good_file, bad_file = folder / f"{seed}.npz", folder / f"{seed}-spoilt.npz"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 from palpate.families.appliance.recording import FORCE, HAND, trial_of
 from palpate.perception.point_files import MOST, images_of, points_of
 from palpate.recordings import Channel, Recording, Role, Trial
@@ -107,12 +107,12 @@ def _first_pass(path: Path, bag: Bag) -> _Log:
         if not there:
             raise PalpateError(
                 f"{path} has no messages of the type {kind}: expected clouds of points, a wrench "
-                f"and tf; it has {listed(sorted(kinds))}"
+                f"and tf; it has {list_names(sorted(kinds))}"
             )
     if len(topics) > 1:
         raise PalpateError(
-            f"{path} has the wrenches {listed(sorted(topics))}: expected one, of the hand; cut the "
-            "others out with `ros2 bag convert`"
+            f"{path} has the wrenches {list_names(sorted(topics))}: expected one, of the hand; "
+            "cut the others out with `ros2 bag convert`"
         )
     for topic, own in seen_in.items():
         if frames.root(own) != frames.root(frame) or own.strip("/") == frames.root(own):

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 
 from palpate.errors import PalpateError, PalpateWarning
-from palpate.models.articulated.faults import mended
+from palpate.models.articulated.faults import mend
 from palpate.models.articulated.meshes import with_copied_meshes
 from palpate.models.articulated.mjcf import write_mjcf
 from palpate.models.articulated.urdf import read_urdf, read_xml
@@ -31,7 +31,7 @@ def read_scene(file: str | Path, body: str | None = None) -> Scene:
     if kind == "mujoco":
         return foreign_scene(_parsed(file), file, body)
     doubts: list[str] = []
-    description, faults = mended(read_urdf(file, lambda where, what: doubts.append(where)))
+    description, faults = mend(read_urdf(file, lambda where, what: doubts.append(where)))
     for fault in faults:
         if not fault.mend:
             raise PalpateError(f"{file}: {fault}")

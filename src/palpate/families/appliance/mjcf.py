@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from palpate.errors import PalpateError, PalpateWarning, listed
+from palpate.errors import PalpateError, PalpateWarning, list_names
 from palpate.models.articulated.assembly import together
 from palpate.models.articulated.description import Inertial, Place
 from palpate.models.articulated.links import FREE, Link, free_links
@@ -42,7 +42,7 @@ def links_of(model: mujoco.MjModel) -> tuple[list[Link], list[str]]:
     """
     lacks = [what for name, what in NOT_MODELLED.items() if getattr(model, name, 0)]
     if lacks:
-        said = f"the file has {listed(lacks)}, which a tree of links is without"
+        said = f"the file has {list_names(lacks)}, which a tree of links is without"
         warnings.warn(said, PalpateWarning, stacklevel=2)
     links: list[Link] = []
     names: list[str] = []

@@ -49,7 +49,7 @@ class Episode:
     threshold: float = 1.0  # of the risk, above which the guard acts
 
 
-def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Episode:
+def run_episode(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Episode:
     """The episode that the seed begins, of an environment with one world."""
     observation, _ = environment.reset(seed=seed)
     inside: Any = environment.lockstep
@@ -83,7 +83,7 @@ def watched(policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> Epi
 
 def show_path(folder: Path, policy: ActorPolicy, environment: GymnasiumWorlds, seed: int) -> None:
     """Draw the first episode of the seed, which was not chosen, into the run's folder."""
-    episode = watched(policy, environment, seed)
+    episode = run_episode(policy, environment, seed)
     environment.close()
     path_picture(folder / PICTURE, episode)
     film(folder / FILM, episode)

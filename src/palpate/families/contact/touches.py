@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from palpate.errors import PalpateError
-from palpate.models.contact import Tip, facing
+from palpate.models.contact import Tip, tip_with_walls
 from palpate.recordings import Aligned, Channel, Quantity, Recording, Role, Trial
 from palpate.worlds.contact.touching import NORMALS
 
@@ -131,7 +131,7 @@ def starting_tip(aligned: Aligned, directions: Float[np.ndarray, " walls"]) -> T
         # Not of the other walls, whose friction is as great as what a wall of its own pushes.
         alone, normal = own | ~felt, [math.cos(angle), math.sin(angle)]
         found.append(_onset(places[alone] @ normal, forces[alone] @ normal))
-    return facing(
+    return tip_with_walls(
         directions.tolist(),
         position=found,
         centre=places.mean(axis=0),

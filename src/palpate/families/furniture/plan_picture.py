@@ -21,7 +21,7 @@ from matplotlib.path import Path as Outline
 from PIL import Image
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 from palpate.planning.movable_obstacles.maps.regions import regions_of
@@ -67,9 +67,9 @@ def plan_picture(
         order = {name: k + 1 for k, name in enumerate(plan.moved)} if plan else {}
         for name, movable in world.movables.items():
             moved = name in order
-            _draw_object(axes, placed(movable.outline, movable.pose), moved=moved)
+            _draw_object(axes, place_points(movable.outline, movable.pose), moved=moved)
             if moved:
-                _draw_object(axes, placed(movable.outline, final[name].pose), left=True)
+                _draw_object(axes, place_points(movable.outline, final[name].pose), left=True)
             label = str(order[name]) if moved else ""
             if movability and name in movability:
                 label += f"{' ' if label else ''}{movability[name]:.0%}"
@@ -133,7 +133,7 @@ def scene_animation(
             drawn: list[Any] = axes.plot(*goal[:2], **_STAR)
             drawn += axes.plot(*robots[: index + 1, :2].T, color=_ROBOT, lw=1.0, zorder=5)
             for (name, movable), pose in zip(world.movables.items(), objects[index], strict=True):
-                corners = placed(movable.outline, pose)
+                corners = place_points(movable.outline, pose)
                 drawn += _draw_object(axes, corners, left=name == held[index])
                 if movability is not None and name in movability[index]:
                     text = f"{movability[index][name]:.0%}"
@@ -234,7 +234,7 @@ def _draw_ghosts(axes: Axes, world: Map, plan: Plan) -> None:
             continue
         chosen = np.linspace(0, len(segment.object_poses) - 1, _GHOSTS).round().astype(int)
         for pose in segment.object_poses[chosen[1:-1]]:
-            corners = placed(world.movables[segment.name].outline, pose)
+            corners = place_points(world.movables[segment.name].outline, pose)
             axes.add_patch(Polygon(corners, fc=_MOVED, alpha=0.12, ec=_CARRY, lw=0.4, zorder=3))
 
 

@@ -10,7 +10,7 @@ from palpate.families.furniture.plan_picture import plan_animation, plan_picture
 from palpate.families.options import Problem
 from palpate.planning.movable_obstacles.maps.files import read_map
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan, read_plan, write_plan
-from palpate.planning.movable_obstacles.search.planner import Planner, unmoved
+from palpate.planning.movable_obstacles.search.planner import Planner, static_map
 from palpate.planning.movable_obstacles.search.policy import NoWayError
 from palpate.planning.movable_obstacles.search.verification import faults_of
 from palpate.runs import Figure, Run
@@ -52,7 +52,7 @@ def read(
 
     # A map may lie in several files; what was read from them decides.
     objects = [(name, movable.pose) for name, movable in world.movables.items()]
-    content = repr((unmoved(world), objects, world.start, world.goals)).encode()
+    content = repr((static_map(world), objects, world.start, world.goals)).encode()
     inputs = {"map": {"file": file.name, "sha256": hashlib.sha256(content).hexdigest()}}
     return Problem(f"A plan on {world.name}", inputs, solve, lambda path: steps(read_plan(path)))
 

@@ -14,7 +14,7 @@ from palpate.errors import PalpateError
 from palpate.models.planar import Planar, furniture
 from palpate.models.planar.geometry import Shapes, nearest
 from palpate.models.planar.shapes import rectangle
-from palpate.numerics.polygons import shown
+from palpate.numerics.polygons import quote
 from palpate.parameters import as_floating
 from palpate.recordings import Channel, Labels, Polygons, Recording, Role
 from palpate.worlds.furniture.furniture import FurnitureWorld
@@ -101,7 +101,7 @@ def names_of(recording: Recording) -> tuple[str, ...]:
         return tuple(f"body {number + 1}" for number in range(count))
     if len(bodies.labels) != count:
         raise PalpateError(
-            f'the recording\'s "bodies" are {shown(bodies.labels)}: expected names of its {count} '
+            f'the recording\'s "bodies" are {quote(bodies.labels)}: expected names of its {count} '
             "bodies"
         )
     return tuple(bodies.labels)

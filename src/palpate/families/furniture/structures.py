@@ -26,7 +26,7 @@ from palpate.families.options import Hypotheses
 from palpate.identification.posterior.comparison import explore, posterior_of, shares
 from palpate.models.model import Model
 from palpate.models.planar import Planar
-from palpate.models.planar.planar import wrapped
+from palpate.models.planar.planar import wrap_angle
 from palpate.parameters import declare, parameters_of, value_of, with_values
 from palpate.recordings import Recording
 from palpate.runs.progress import progress
@@ -215,7 +215,7 @@ def _with_bolts(model: Planar, recording: Recording) -> Planar:
     for body in range(model.bodies):
         seen = _seen(recording, [body])[:, 0]
         off = seen - seen[0]
-        off[:, 2] = wrapped(jnp.asarray(off[:, 2]))
+        off[:, 2] = wrap_angle(jnp.asarray(off[:, 2]))
         standing.append(seen[0] + off.mean(axis=0))
     return dataclasses.replace(model, bolted_pose=np.array(standing))
 

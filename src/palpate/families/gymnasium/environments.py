@@ -17,7 +17,7 @@ LOOKED_AT = 200  # random steps, in which an environment that tells costs does s
 BROUGHT_BY = {"imageio": "palpate[gymnasium]"}  # which Gymnasium's MuJoCo environments want
 
 
-def made(name: str, count: int) -> VectorEnv:
+def make_environments(name: str, count: int) -> VectorEnv:
     """So many of the environment `name` side by side, as `gymnasium.make` knows it.
 
     "module:Name-v0" imports the module first, which may lie in the current folder.
@@ -52,13 +52,13 @@ def made(name: str, count: int) -> VectorEnv:
     return environments
 
 
-def described(name: str) -> dict[str, Any]:
+def describe_environment(name: str) -> dict[str, Any]:
     """What is found of an environment in `LOOKED_AT` random steps.
 
     The bounds of its actions ("low", "high"), s of a step by its frames per second ("period", 1
-    where it has none), and whether its info had a "cost" ("costs"). Raises as `made`.
+    where it has none), and whether its info had a "cost" ("costs"). Raises as `make_environments`.
     """
-    environments, costs = made(name, 1), False
+    environments, costs = make_environments(name, 1), False
     space, frames = environments.single_action_space, environments.metadata.get("render_fps")
     assert isinstance(space, Box)
     environments.reset(seed=0)

@@ -65,9 +65,9 @@ class TrainGymnasium(TrainInWorld):
     @functools.cached_property
     def described(self) -> dict[str, Any]:
         """What the environment is; raises `PalpateError` where nothing can learn in it."""
-        from palpate.families.gymnasium.environments import LOOKED_AT, described
+        from palpate.families.gymnasium.environments import LOOKED_AT, describe_environment
 
-        found = described(self.environment)
+        found = describe_environment(self.environment)
         silent = f"'{self.environment}' told no info[\"cost\"] in {LOOKED_AT} random steps"
         if not found["costs"] and self.method != "no-recovery":
             raise PalpateError(
@@ -79,9 +79,9 @@ class TrainGymnasium(TrainInWorld):
         return found
 
     def make(self, count: int, policy: ActorPolicy | None = None) -> VectorEnv:
-        from palpate.families.gymnasium.environments import made
+        from palpate.families.gymnasium.environments import make_environments
 
-        return made(self.environment, count)
+        return make_environments(self.environment, count)
 
     def agent(self) -> Agent:
         from palpate.families.gymnasium.methods import agent_of
@@ -119,9 +119,9 @@ class EvaluateGymnasium(EvaluateInWorld):
     def make(
         self, count: int, manifest: Mapping[str, Any], policy: ActorPolicy | None
     ) -> VectorEnv:
-        from palpate.families.gymnasium.environments import made
+        from palpate.families.gymnasium.environments import make_environments
 
-        return made(manifest["options"]["environment"], count)
+        return make_environments(manifest["options"]["environment"], count)
 
     def figures(self, episodes: Mapping[str, np.ndarray], suffix: str = "") -> list[Figure]:
         return figures(episodes, suffix)

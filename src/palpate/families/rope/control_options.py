@@ -152,7 +152,7 @@ class EvaluateRope(Evaluate):
         self, policy: CommandPolicy, manifest: Mapping[str, Any], model: Rope | None
     ) -> tuple[RopeConfiguration, str]:
         """See `Evaluate.base` and `palpate.families.rope.counterpart`."""
-        from palpate.families.rope.counterpart import adapted, described, rope_for
+        from palpate.families.rope.counterpart import describe_rope, rope_for, with_constants
 
         around, whose = rope_for(policy, manifest, model)
         names = "length", "mass", "tip_mass", "bending_stiffness", "joint_damping"
@@ -160,9 +160,10 @@ class EvaluateRope(Evaluate):
         if self.world is not None:
             from palpate.worlds.rope.mjcf import read_cable
 
-            around, whose = adapted(around, read_cable(self.world)), f"the cable of {self.world}"
-        around = adapted(around, {name: n for name, n in given.items() if n is not None})
-        return around, f"tried in MuJoCo ropes drawn around {whose}: {described(around)}"
+            around = with_constants(around, read_cable(self.world))
+            whose = f"the cable of {self.world}"
+        around = with_constants(around, {name: n for name, n in given.items() if n is not None})
+        return around, f"tried in MuJoCo ropes drawn around {whose}: {describe_rope(around)}"
 
     @abstractmethod
     def controlled(self, policy: CommandPolicy) -> Controller:
@@ -224,7 +225,7 @@ class EvaluateRopeStabilization(EvaluateRope):
     def controllers(
         self, policy: CommandPolicy, manifest: Mapping[str, Any], base: RopeConfiguration
     ) -> dict[str, Controller]:
-        from palpate.trials.rope.baselines import baselines, tuned
+        from palpate.trials.rope.baselines import baselines, tune_gains
 
         found = {"controlled": self.controlled(policy)}
         if self.onnx is not None:
@@ -233,7 +234,7 @@ class EvaluateRopeStabilization(EvaluateRope):
 
             deployment = RopeDeployment(policy, manifest, {"markers": base.markers})
             found["served"] = ServedController(deployment, self.onnx)
-        return found | baselines(base, tuned(base))
+        return found | baselines(base, tune_gains(base))
 
     def show(
         self, run: Run, trials: Sequence[StabilizationTrial], evaluated: Mapping[str, Any]

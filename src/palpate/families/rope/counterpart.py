@@ -171,7 +171,7 @@ def rope_for(
     return seen(counterpart(own, noise)), "that of the model it was trained on"
 
 
-def adapted(base: RopeConfiguration, constants: Mapping[str, float]) -> RopeConfiguration:
+def with_constants(base: RopeConfiguration, constants: Mapping[str, float]) -> RopeConfiguration:
     """The rope with other constants; raises as `in_step`."""
     if not constants:
         return base
@@ -191,7 +191,7 @@ def with_markers(rope: RopeConfiguration, count: int) -> RopeConfiguration:
     return dataclasses.replace(rope, markers=count, marker_places=places)
 
 
-def described(rope: RopeConfiguration) -> str:
+def describe_rope(rope: RopeConfiguration) -> str:
     """What it is, in a line."""
     tip = f" and {1e3 * rope.tip_mass:.3g} g at its tip" if rope.tip_mass else ""
     return (

@@ -125,7 +125,7 @@ class RopeDeployment(Deployment[CommandPolicy]):
 
         period, rope = self.policy.period, rope_for(self.policy, self.manifest)[0]
         rope = with_markers(rope, self.markers)
-        robot.servoed(rope, period)
+        robot.with_servo(rope, period)
         described = json.dumps(dataclasses.asdict(rope))
         arguments = {"rope": described, "period": period, "seconds": seconds, "seed": seed}
         if self.filter is not None:

@@ -10,7 +10,7 @@ from palpate.errors import PalpateError
 from palpate.report.charts import quantiles
 from palpate.report.evidence import Curves, Motion
 from palpate.report.picture import band, canvas_of, curve, legend_of, save_picture
-from palpate.report.style import STYLES, numbered
+from palpate.report.style import STYLES, style_indices
 
 _INK, _QUIET, _RULE = "#1c2127", "#5b6570", "#dfe3e7"
 _SETTINGS: Any = {
@@ -35,7 +35,7 @@ def motion_figure(out: Path, motion: Motion, instants: Sequence[float], energy: 
     """
     import matplotlib
 
-    looks = {of: STYLES[i] for of, i in numbered([*motion.chains, *energy.values]).items()}
+    looks = {of: STYLES[i] for of, i in style_indices([*motion.chains, *energy.values]).items()}
     frames = [int(np.argmin(np.abs(motion.time - instant))) for instant in instants]
     seen = {of: chain[frames] for of, chain in _in_plane(motion).items()}
     points = np.concatenate([chain.reshape(-1, 2) for chain in seen.values()])

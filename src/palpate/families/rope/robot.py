@@ -21,10 +21,10 @@ from palpate.deployment.messages import (
     encode_state,
 )
 from palpate.deployment.scheduling import ROBOT, real_time
-from palpate.deployment.supervisor import PAUSE, Mode, slowed
+from palpate.deployment.supervisor import PAUSE, Mode, brake
 from palpate.deployment.tank import TANK
 from palpate.deployment.transport import COMMAND, STATE, ZenohLink
-from palpate.families.rope.counterpart import adapted
+from palpate.families.rope.counterpart import with_constants
 from palpate.safety.filtered_drive import FilteredDrive
 from palpate.safety.filters import filter_of
 from palpate.worlds.rope.rope import (
@@ -118,12 +118,12 @@ class RopeRobot:
             self.released = self.released or command.mode == Mode.RUNNING
             self.heard += heard
         elif self._link.clock() - self._heard_at > PAUSE * self.period:
-            self.velocity = slowed(self.velocity, self._change)
+            self.velocity = brake(self.velocity, self._change)
 
 
-def servoed(rope: RopeConfiguration, period: float) -> RopeConfiguration:
+def with_servo(rope: RopeConfiguration, period: float) -> RopeConfiguration:
     """The rope behind a servo that is asked a whole number of times in a loop's `period` (s)."""
-    return adapted(rope, {"control_period": period / max(1, round(period / SERVO))})
+    return with_constants(rope, {"control_period": period / max(1, round(period / SERVO))})
 
 
 def main() -> None:
@@ -142,7 +142,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's, which says when to end
     # Urgent, because it stands for a robot with a computer of its own.
     with real_time(ROBOT), ZenohLink(COMMAND, STATE, connect=options.connect) as link:
-        rope = servoed(RopeConfiguration(**options.rope), options.period)
+        rope = with_servo(RopeConfiguration(**options.rope), options.period)
         drive = None
         if options.filter is not None:
             mass = GRIPPER_MASS * np.eye(3)

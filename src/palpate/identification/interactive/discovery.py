@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from palpate.identification.interactive.explanation import FURTHER, labels_near
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import LEAST_MOTION, evidence, telling
+from palpate.identification.interactive.labels import LEAST_MOTION, distinguishing_looks, evidence
 from palpate.identification.interactive.part import Part, support_of
 from palpate.identification.interactive.refinement import Estimate, refine, sighting, surprise
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
@@ -212,7 +212,7 @@ def _carries(
     cloud, places = tree.looks[before], np.array([one.positions for one in tree.parts])
     points, normals = cloud.points[mask], cloud.normals[mask]
     gain = 0.0
-    for look in telling(places, before):
+    for look in distinguishing_looks(places, before):
         pose = tree.motion(part, before, look)
         if look != after and abs(places[part, look] - places[part, before]) > LEAST_MOTION:
             gone = evidence(tree.looks[look], pose.at(points), pose.turned(normals))

@@ -21,7 +21,7 @@ from palpate.identification.interactive.resistance import JointMotion, Resistanc
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.articulated import ACTION, Articulated
-from palpate.models.articulated.assembly import assembled
+from palpate.models.articulated.assembly import assemble
 from palpate.models.articulated.description import Description
 from palpate.models.articulated.links import FREE, GRAVITY, Link, tree_of
 from palpate.parameters import LogNormal, declare, with_values
@@ -130,7 +130,7 @@ def dynamics_of(twin: Twin) -> Dynamics:
     What happens at the end of a joint, where a stop pushes, is left out; where a latch is found to
     pull, so is its reach. Raises `PalpateError` where no such action is left.
     """
-    found = assembled(describe(twin, "twin"))
+    found = assemble(describe(twin, "twin"))
     parts = [int(name.split()[-1]) - 1 for name in found.joints]
     links = [
         dataclasses.replace(link, axis=_upright(np.asarray(link.axis), _interval(twin, part)))

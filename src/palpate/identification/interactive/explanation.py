@@ -18,7 +18,7 @@ SHORT = 0.05  # m that a hand went: a way so short fits many joints
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 
 
-def moved_part(tree: PartTree, before: int, after: int, handling: Handling) -> int:
+def find_moved_part(tree: PartTree, before: int, after: int, handling: Handling) -> int:
     """The part that moved with the hand, which has one way more; -1 if none that is known has."""
     for explain in (_by_way, _by_clouds, _by_all_ways):
         if (part := explain(tree, before, after, handling)) >= 0:

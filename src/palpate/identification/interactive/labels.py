@@ -89,7 +89,7 @@ def scores(
     return np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
 
 
-def telling(places: Float[np.ndarray, "parts looks"], look: int) -> list[int]:
+def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) -> list[int]:
     """The looks that tell labels from each other: where one has moved and the other has not.
 
     `places` are positions of joints, rad or m. What has moved may have shown another side: then
@@ -159,7 +159,7 @@ def _at_hinges(
     return found
 
 
-def smoothed(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels points"]:
+def smooth_labels(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels points"]:
     """Probabilities of the labels, with neighbours on one surface likely of one part.
 
     Mean field of a Potts model on the graph of nearest neighbours (Krahenbuhl and Koltun 2011).

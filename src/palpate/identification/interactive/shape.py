@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_cdt
 from scipy.spatial import cKDTree
 
-from palpate.identification.interactive.labels import TOLERANCE, telling
+from palpate.identification.interactive.labels import TOLERANCE, distinguishing_looks
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.models.articulated.description import Geometry, Place
 from palpate.perception.surfaces import smallest_rectangle
@@ -36,7 +36,7 @@ def boxes_of(tree: PartTree, part: int) -> list[Geometry]:
     """
     look = len(tree.looks) - 1
     places = np.array([one.positions for one in tree.parts]).reshape(-1, look + 1)
-    looks = [look, *telling(places, look)] if look else [look]
+    looks = [look, *distinguishing_looks(places, look)] if look else [look]
     own = _points(tree, part)
     if len(own) < FEWEST:
         return []

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 
 from palpate.identification.interactive.labels import (
     ON,
+    distinguishing_looks,
     evidence,
     prior,
     scores,
-    smoothed,
-    telling,
+    smooth_labels,
 )
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Estimate, Sighting, refine, sighting
@@ -206,7 +206,7 @@ class PartTree:
         given = scores(cloud, [self.looks[other] for other in others], motions)
         given += prior(cloud, given, motions)
         given[0] = np.maximum(given[0], UNKNOWN * len(others))
-        return smoothed(cloud, given)
+        return smooth_labels(cloud, given)
 
     def _telling(
         self, look: int, candidate: Candidate | None
@@ -218,7 +218,7 @@ class PartTree:
             known = [[self.motion(part, look, other)] for part in parts]
             return [other], [[NOWHERE], *known, [motion]]
         places = np.array([one.positions for one in self.parts]).reshape(-1, len(self.looks))
-        others = telling(places, look)
+        others = distinguishing_looks(places, look)
         motions = [[self.motion(part, look, other) for other in others] for part in parts]
         return others, [[NOWHERE] * len(others), *motions]
 

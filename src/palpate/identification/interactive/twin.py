@@ -8,7 +8,7 @@ carries it.
 import numpy as np
 
 from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
-from palpate.identification.interactive.explanation import FURTHER, may_have_moved, moved_part
+from palpate.identification.interactive.explanation import FURTHER, find_moved_part, may_have_moved
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import HIDDEN, evidence
 from palpate.identification.interactive.splitting import split
@@ -146,7 +146,7 @@ class Twin(PartTree):
         if not handling.moved:
             nearest = self.looks[before].tree.query(handling.push.point)[1]
             return int(self.labels[before][nearest]), False
-        if (part := moved_part(self, before, after, handling)) >= 0:
+        if (part := find_moved_part(self, before, after, handling)) >= 0:
             return part, False
         if handling.travel > TELLS and discover(self, before, after, handling):
             return len(self.parts) - 1, True

@@ -19,13 +19,13 @@ from palpate.identification.posterior.posterior import (
     LOCAL_GLOBAL,
     Posterior,
     check_numbers,
-    preparing,
+    prepare_sampler,
     sample,
 )
 from palpate.identification.posterior.settled import Settled, settle_each
 from palpate.models.model import Model
 from palpate.recordings import Aligned
-from palpate.runs.progress import Watch, unwatched
+from palpate.runs.progress import Watch, without_progress
 
 PIECE = 2.0  # s, of what is fitted, and of what is predicted open loop
 STILL = 0.1  # s
@@ -46,7 +46,7 @@ def compare(
     chains: int | None = None,
     seed: int = 0,
     method: str = LOCAL_GLOBAL,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Comparison:
     """Compare hypotheses by their evidence and sample the posterior of the most probable.
 
@@ -55,7 +55,7 @@ def compare(
     `posterior.sample`.
     """
     check_numbers(chains, draws)
-    with preparing(next(iter(targets.values())), chains, method):
+    with prepare_sampler(next(iter(targets.values())), chains, method):
         explored = explore(targets, seed, watch)
     probability = shares({name: settled.evidence for name, settled in explored.items()})
     structure = max(probability, key=probability.__getitem__)
@@ -66,7 +66,7 @@ def compare(
 
 
 def explore(
-    targets: Mapping[str, MotionPosterior], seed: int = 0, watch: Watch = unwatched
+    targets: Mapping[str, MotionPosterior], seed: int = 0, watch: Watch = without_progress
 ) -> dict[str, Settled]:
     """The modes of each."""
     key = jax.random.fold_in(jax.random.key(seed), 1)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from palpate.errors import PalpateError
 from palpate.identification.posterior.posterior import Posterior, spread_out
-from palpate.models.files import built, file_of, kind_of, registered, structure_of
+from palpate.models.files import build, file_of, kind_name, kind_of, structure_of
 from palpate.models.model import Model
 from palpate.parameters import parameters_of
 from palpate.runs.storage import DamagedFileError, parse_json, plain, write_bytes
@@ -34,7 +34,7 @@ def write_posterior(path: str | Path, posterior: Posterior, model: Model | None 
     arrays: dict[str, np.ndarray] = {"position": draws.position, "density": draws.density}
     arrays |= {f"value.{path}": value for path, value in posterior.values.items()}
     whole: Model = posterior.target.coordinates.reference if model is None else model
-    kind, settings = registered(whole), {}
+    kind, settings = kind_name(whole), {}
     if kind is not None:
         fields = {*parameters_of(whole), *structure_of(type(whole))} - set(posterior.values)
         of = {name: getattr(whole, name) for name in fields}
@@ -109,7 +109,7 @@ def read_models(
     drawn = {name: v.reshape(-1, *v.shape[2:])[chosen] for name, v in values.items()}
     settings = {name: tuple(v) if isinstance(v, list) else v for name, v in settings.items()}
     try:
-        return built(path, kind, fields | drawn, settings)
+        return build(path, kind, fields | drawn, settings)
     except PalpateError as error:
         raise DamagedFileError(str(error)) from error
 

@@ -16,8 +16,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from palpate.errors import PalpateError
 from palpate.identification.posterior.likelihood import MotionPosterior, initial_position
 from palpate.identification.samplers.target import Target
-from palpate.numerics.devices import compiled_at_once, over_devices
-from palpate.runs.progress import Watch, unwatched
+from palpate.numerics.devices import compile_at_once, over_devices
+from palpate.runs.progress import Watch, without_progress
 
 LONGEST = 1.5  # prior standard deviations that a step may have
 DAMPING = 1e-2, 1e-6, 1e8  # first, least and greatest
@@ -85,7 +85,7 @@ def climb_each(
     position: Float[np.ndarray, "starts free"],
     steps: int = 40,
     moving: Bool[np.ndarray, " free"] | None = None,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Modes:
     """Climb side by side, with density, slope and `curvature` at positions shaped like these.
 
@@ -174,7 +174,7 @@ def _each(target: Target, position: ArrayLike) -> tuple[np.ndarray, ...]:
     return tuple(np.concatenate(of)[:count] for of in zip(*found, strict=True))
 
 
-@compiled_at_once
+@compile_at_once
 def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
     return over_devices(lambda target, part: target.curvatures(part))(target, position)
 
@@ -196,7 +196,7 @@ def _screened(
 
 
 def settle(
-    target: MotionPosterior, key: PRNGKeyArray, watch: Watch = unwatched
+    target: MotionPosterior, key: PRNGKeyArray, watch: Watch = without_progress
 ) -> tuple[MotionPosterior, Modes]:
     """Modes, and the target linearised about the best of them, by turns.
 

@@ -34,7 +34,7 @@ from palpate.identification.data.segments import Segments
 from palpate.identification.posterior.discrepancy import eigenvectors
 from palpate.identification.samplers.target import Target
 from palpate.models.model import FORCES, Model
-from palpate.numerics.devices import compiled_at_once
+from palpate.numerics.devices import compile_at_once
 from palpate.numerics.small_systems import cholesky, solve, solve_lower
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
 
@@ -413,7 +413,7 @@ def _legal_values(target: MotionPosterior, position: Array) -> dict[str, Array]:
     return jax.vmap(values)(position)
 
 
-@compiled_at_once
+@compile_at_once
 def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     """Derivatives of rotated residuals by the start's errors in vague standard deviations."""
     segments, model = target._begun(), target.model(position)
@@ -428,7 +428,7 @@ def _sensitivity(target: MotionPosterior, position: Array) -> Array:
     return jnp.moveaxis(jax.vmap(target._rotate)(columns), 0, 1)
 
 
-@compiled_at_once
+@compile_at_once
 def _likely_error(target: MotionPosterior, position: Array) -> Array:
     """The most probable errors of the starts, by the sensitivity that the target has."""
     residual, variance = (moments[0] for moments in target._rotated(position[None]))

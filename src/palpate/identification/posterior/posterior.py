@@ -28,7 +28,7 @@ from palpate.identification.posterior import predictive
 from palpate.identification.posterior.diagnostics import FEWEST, bulk_size, rhat, tail_size
 from palpate.identification.posterior.likelihood import MotionPosterior
 from palpate.identification.posterior.predictive import Predicted, Score
-from palpate.identification.posterior.settled import Settled, factors_of, joined, settle_each
+from palpate.identification.posterior.settled import Settled, factors_of, join_draws, settle_each
 from palpate.identification.samplers.draws import Draws
 from palpate.identification.samplers.hamiltonian import no_u_turn
 from palpate.identification.samplers.local_global import CHAINS, compile_beside, local_global
@@ -37,7 +37,7 @@ from palpate.identification.samplers.tempered import populations
 from palpate.identification.verdicts import undecided
 from palpate.models.model import Model
 from palpate.parameters import value_of
-from palpate.runs.progress import Watch, unwatched
+from palpate.runs.progress import Watch, without_progress
 
 MIXED, EFFECTIVE = 1.01, 400.0  # R-hat and effective sizes to reach (Vehtari et al.)
 WIDEST = 40  # coordinates among which a mixture that proposes can be learnt
@@ -282,7 +282,7 @@ def sample(
     draws: int | None = None,
     seed: int = 0,
     probes: Segments | None = None,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Posterior:
     """Draws of a posterior by one of the `SAMPLERS`, as many as it wants where no number is given.
 
@@ -299,7 +299,7 @@ def sample(
     check_name("sampler", method, SAMPLERS)
     climbing, sampling = jax.random.split(jax.random.key(seed))
     if isinstance(target, MotionPosterior):
-        with preparing(target, chains, method):
+        with prepare_sampler(target, chains, method):
             target = settle_each(target, climbing, watch)
     chosen = [
         "nuts" if method == LOCAL_GLOBAL and part.target.dimension > WIDEST else method
@@ -310,12 +310,12 @@ def sample(
     for number, (name, part) in enumerate(zip(chosen, target.parts, strict=True)):
         key = jax.random.fold_in(sampling, number) if number else sampling
         found.append(SAMPLERS[name].run(part.target, part.modes, key, *numbers, watch))
-    every = joined(target, found, jax.random.fold_in(sampling, len(found)))
+    every = join_draws(target, found, jax.random.fold_in(sampling, len(found)))
     probes = target.target.segments if probes is None else probes
     return Posterior(target, every, probes, " and ".join(dict.fromkeys(chosen)))
 
 
-def preparing(
+def prepare_sampler(
     target: MotionPosterior, chains: int | None, method: str = LOCAL_GLOBAL
 ) -> AbstractContextManager[None]:
     """Within it modes may be searched for, while the sampler of such a target is compiled."""

@@ -21,7 +21,7 @@ from palpate.identification.samplers.draws import Draws
 from palpate.identification.samplers.target import log_prior
 from palpate.models.model import Model
 from palpate.parameters import value_of, with_values
-from palpate.runs.progress import Watch, unwatched
+from palpate.runs.progress import Watch, without_progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,9 @@ class Settled:
         return self.target.model(jnp.asarray(self.position))
 
 
-def settle_each(target: MotionPosterior, key: PRNGKeyArray, watch: Watch = unwatched) -> Settled:
+def settle_each(
+    target: MotionPosterior, key: PRNGKeyArray, watch: Watch = without_progress
+) -> Settled:
     """Settle what is independent of the rest by itself; raises as `settle`.
 
     What several bodies need is then not to be met with by luck in one of the starts of a search.
@@ -100,7 +102,7 @@ def factors_of(target: MotionPosterior) -> list[tuple[MotionPosterior, Int[np.nd
     return factors
 
 
-def joined(settled: Settled, draws: Sequence[Draws], key: PRNGKeyArray) -> Draws:
+def join_draws(settled: Settled, draws: Sequence[Draws], key: PRNGKeyArray) -> Draws:
     """Draws of the whole from those of its parts, as many of each.
 
     Coordinates of no part are draws of the prior.

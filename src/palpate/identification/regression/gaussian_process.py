@@ -20,7 +20,7 @@ import scipy.optimize
 from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
-from palpate.identification.regression.locally_weighted import Regression, checked, standard
+from palpate.identification.regression.locally_weighted import Regression, check_data, standard
 
 LARGEST = 2000  # data: time grows with the cube of their number
 _LENGTHS = 1.0, 8.0  # standard deviations, where the two descents begin
@@ -83,7 +83,7 @@ def gaussian_process(inputs: np.ndarray, targets: np.ndarray) -> GaussianProcess
     Raises:
         PalpateError: no data, more than 2000, other shapes, or numbers that are not finite.
     """
-    inputs, targets, _ = checked(inputs, targets)
+    inputs, targets, _ = check_data(inputs, targets)
     if len(inputs) > LARGEST:
         raise PalpateError(
             f"an exact Gaussian process of {len(inputs)} data takes too long: expected at most "

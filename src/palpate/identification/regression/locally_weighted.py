@@ -97,7 +97,7 @@ def locally_weighted(
     Raises:
         PalpateError: no data, other shapes, numbers that are not finite, or too little room.
     """
-    inputs, targets, condition = checked(inputs, targets, condition)
+    inputs, targets, condition = check_data(inputs, targets, condition)
     count = len(inputs)
     room = count if capacity is None else capacity
     if room < count:
@@ -123,7 +123,7 @@ def locally_weighted(
     return eqx.tree_at(lambda r: (r.bandwidth, r.ridge), regression, (bandwidth, ridge))
 
 
-def checked(
+def check_data(
     inputs: np.ndarray, targets: np.ndarray, condition: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The data of a regression in double precision, and its conditions, of no bits if None.

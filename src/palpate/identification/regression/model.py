@@ -58,7 +58,7 @@ class RegressedModel(Wrapper):
         return self.features.apply(state, change)
 
 
-def regressed(
+def fit_regression(
     prototype: Model,
     features: Features,
     kind: str,

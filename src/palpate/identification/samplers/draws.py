@@ -46,7 +46,7 @@ def time_to_compile(
     return float(sum(max(0.0, spent[index] - pace * done[index]) for index in first))
 
 
-def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
+def pooled_covariance(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Covariance of the draws of all chains, with the earlier one worth a few draws.
 
     As few draws as two for each coordinate: it keeps the estimate positive definite.
@@ -57,7 +57,7 @@ def pooled(position: np.ndarray, prior: np.ndarray) -> np.ndarray:
     return (scatter + weight * prior) / (len(flat) + weight)
 
 
-def begun(
+def start_chains(
     target: Target, modes: Modes, key: PRNGKeyArray, chains: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where chains begin, (chains, free), with density and slope: at draws of the modes' mixture.

@@ -17,11 +17,16 @@ from blackjax.mcmc.hmc import HMCState
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from palpate.identification.posterior.laplace import Modes
-from palpate.identification.samplers.draws import Draws, begun, pooled, time_to_compile
+from palpate.identification.samplers.draws import (
+    Draws,
+    pooled_covariance,
+    start_chains,
+    time_to_compile,
+)
 from palpate.identification.samplers.target import Target
-from palpate.numerics.devices import compiled_sooner, over_devices
+from palpate.numerics.devices import compile_sooner, over_devices
 from palpate.numerics.small_systems import solve_lower, solve_upper
-from palpate.runs.progress import Watch, unwatched
+from palpate.runs.progress import Watch, without_progress
 
 BLOCK = 50  # draws between two looks at the chains: one compiled piece of work
 WARM_UP = 4  # blocks
@@ -50,7 +55,7 @@ def no_u_turn(
     key: PRNGKeyArray,
     chains: int = 4,
     draws: int = 300,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Draws:
     """Sample `draws` of each of `chains`, rounded up to whole blocks, after the warm-up.
 
@@ -59,7 +64,7 @@ def no_u_turn(
     """
     began = time.monotonic()
     begin, *keys = jax.random.split(key, 1 + WARM_UP + -(-draws // BLOCK))
-    state = begun(target, modes, begin, chains)
+    state = start_chains(target, modes, begin, chains)
     position = state[0]
     covariance = np.asarray(modes.covariance[0], np.float64)
     step = np.full(chains, np.log(1.2 * target.dimension**-0.25))
@@ -80,7 +85,7 @@ def no_u_turn(
             # One for all, from the half in which it has settled; a chain that is stuck is outvoted.
             step[:] = np.median(block.step[:, BLOCK // 2 :])
             if LEARNED <= index + 1 < WARM_UP:
-                covariance = pooled(block.position, covariance)
+                covariance = pooled_covariance(block.position, covariance)
         else:
             blocks.append(block)
     return Draws(
@@ -94,7 +99,7 @@ def no_u_turn(
     )
 
 
-@compiled_sooner
+@compile_sooner
 def _block(
     target: Target,
     state: State,

@@ -26,11 +26,16 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.identification.posterior.laplace import Modes
-from palpate.identification.samplers.draws import Draws, begun, pooled, time_to_compile
+from palpate.identification.samplers.draws import (
+    Draws,
+    pooled_covariance,
+    start_chains,
+    time_to_compile,
+)
 from palpate.identification.samplers.mixture import DEGREES, Mixture, fit_mixture, one_of
 from palpate.identification.samplers.target import Target, log_prior
-from palpate.numerics.devices import compiled_sooner, over_devices, own_device
-from palpate.runs.progress import Watch, unwatched
+from palpate.numerics.devices import compile_sooner, over_devices, own_device
+from palpate.runs.progress import Watch, without_progress
 
 CHAINS = 32  # 16 a core: a vector of as many numbers is computed as soon as one of fewer
 STEPS = 3  # between two draws, for each coordinate
@@ -51,7 +56,7 @@ def local_global(
     key: PRNGKeyArray,
     chains: int = CHAINS,
     draws: int = 100,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Draws:
     """Sample `draws` of each of `chains` after the warm-up.
 
@@ -62,7 +67,7 @@ def local_global(
     began = time.monotonic()
     begin, fitting, key = jax.random.split(key, 3)
     size = target.dimension
-    position, value, _ = begun(target, modes, begin, chains)
+    position, value, _ = start_chains(target, modes, begin, chains)
     covariance = np.asarray(modes.covariance[0], np.float64)
     mixture = fit_mixture(np.asarray(modes.draw(fitting, 20 * size)), covariance)
     log_length = float(np.log(LENGTH / np.sqrt(size)))
@@ -96,7 +101,10 @@ def local_global(
                 learnt = index + 1
                 known = np.concatenate(positions[-int(np.ceil(REMEMBERED * learnt)) :], axis=1)
                 known = known.reshape(-1, size)
-                mixture, covariance = fit_mixture(known, covariance), pooled(known, covariance)
+                mixture, covariance = (
+                    fit_mixture(known, covariance),
+                    pooled_covariance(known, covariance),
+                )
     return Draws(
         position=np.concatenate(positions[ROUNDS:], axis=1),
         density=np.concatenate(values[ROUNDS:], axis=1),
@@ -135,7 +143,7 @@ def compile_beside(target: Target, chains: int = CHAINS) -> Iterator[None]:
     compiling.result()
 
 
-@compiled_sooner
+@compile_sooner
 def _walked(
     target: Target,
     mixture: Mixture,

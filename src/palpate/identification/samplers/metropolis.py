@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.identification.posterior.laplace import Modes
-from palpate.identification.samplers.draws import Draws, begun, check_start, time_to_compile
+from palpate.identification.samplers.draws import Draws, check_start, start_chains, time_to_compile
 from palpate.identification.samplers.target import Target
 from palpate.numerics.devices import over_devices
-from palpate.runs.progress import Watch, unwatched
+from palpate.runs.progress import Watch, without_progress
 
 ACCEPTANCE = 0.234
 LOOKS = 20  # at the chains during the warm-up
@@ -40,7 +40,7 @@ def metropolis(
     key: PRNGKeyArray,
     chains: int,
     draws: int,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Draws:
     """Sample `draws` of each of `chains` as `covariance_adapted`.
 
@@ -48,7 +48,7 @@ def metropolis(
     are draws to learn it from. `watch` goes through the looks of the warm-up.
     """
     begin, walking = jax.random.split(key)
-    start, *_ = begun(target, modes, begin, chains)
+    start, *_ = start_chains(target, modes, begin, chains)
     size = target.dimension
     return _sampled(
         target, jnp.asarray(start), walking, draws, WARM_UP * size, STEPS * size, adapted=True,
@@ -93,7 +93,7 @@ def _sampled(
     thin: int,
     adapted: bool,
     covariance=None,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Draws:
     began = time.monotonic()
     check_start(target, np.asarray(start), np.asarray(_densities(target, start)))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.special import gammaln
 
-from palpate.identification.samplers.draws import pooled
+from palpate.identification.samplers.draws import pooled_covariance
 
 COMPONENTS = 8  # at most
 DEGREES = 10  # of freedom of Student's distributions
@@ -85,7 +85,7 @@ def fit_mixture(
     count, size = flat.shape
     used = int(np.clip(count // (DRAWN * size), 1, COMPONENTS))
     centre = flat.mean(axis=0)
-    whole = np.linalg.cholesky(pooled(flat, covariance))
+    whole = np.linalg.cholesky(pooled_covariance(flat, covariance))
     white = np.linalg.solve(whole, (flat - centre).T)
     begin = np.random.default_rng(seed).choice(count, used, replace=False)
     weight, mean = np.full(used, 1.0 / used), white[:, begin].T

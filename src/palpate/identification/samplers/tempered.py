@@ -20,7 +20,7 @@ from palpate.errors import PalpateError
 from palpate.identification.posterior.laplace import Modes
 from palpate.identification.samplers.draws import Draws
 from palpate.identification.samplers.target import Target, log_prior
-from palpate.runs.progress import Watch, unwatched
+from palpate.runs.progress import Watch, without_progress
 
 KEPT = 0.5  # share of the particles that one change of temperature may leave effective
 LONGEST = 200  # temperatures
@@ -62,7 +62,7 @@ def populations(
     key: PRNGKeyArray,
     chains: int,
     draws: int,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Draws:
     """As many independent populations as `chains`, of as many particles each as `draws`.
 

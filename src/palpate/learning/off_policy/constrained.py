@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.learning.off_policy.agent import Agent, Batch, adam, copied, descend, follow
+from palpate.learning.off_policy.agent import Agent, Batch, adam, copy_arrays, descend, follow
 from palpate.networks.actor import Critic
 
 
@@ -110,7 +110,7 @@ class Lagrangian:
         return LagrangianState(
             self.agent.init(keys[0], observation, action),
             critic,
-            copied(critic),
+            copy_arrays(critic),
             multiplier,
             adam(self.learning_rate).init(critic),
             adam(self.multiplier_rate).init(multiplier),

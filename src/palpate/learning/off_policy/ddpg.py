@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, PRNGKeyArray
 
-from palpate.learning.off_policy.agent import Batch, adam, copied, descend, follow
+from palpate.learning.off_policy.agent import Batch, adam, copy_arrays, descend, follow
 from palpate.networks.actor import Critic, DeterministicActor
 
 
@@ -43,7 +43,7 @@ class DeterministicPolicyGradient:
         actor = DeterministicActor.create(keys[0], *shape)
         critic = Critic.create(keys[1], *shape, members=1)
         moments = [adam(self.learning_rate).init(network) for network in (actor, critic)]
-        targets = copied(actor), copied(critic)
+        targets = copy_arrays(actor), copy_arrays(critic)
         return DeterministicPolicyGradientState(actor, critic, *targets, *moments)
 
     def propose(

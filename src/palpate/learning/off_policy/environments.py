@@ -56,7 +56,7 @@ def reflex_of(environments: VectorEnv, agent: Any) -> Reflex | None:
     return law
 
 
-def begun(environments: VectorEnv, seed: int, step: int) -> np.ndarray:
+def begin_episodes(environments: VectorEnv, seed: int, step: int) -> np.ndarray:
     """The first observations (environments, features) of episodes that follow from seed and step.
 
     Raises `PalpateError` for one that is not finite.

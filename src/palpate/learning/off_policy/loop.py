@@ -19,9 +19,15 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Array, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.learning.off_policy.agent import Agent, Batch, copied
+from palpate.learning.off_policy.agent import Agent, Batch, copy_arrays
 from palpate.learning.off_policy.buffer import Motion, ReplayBuffer, Transition
-from palpate.learning.off_policy.environments import advance, begun, check, motions_of, reflex_of
+from palpate.learning.off_policy.environments import (
+    advance,
+    begin_episodes,
+    check,
+    motions_of,
+    reflex_of,
+)
 from palpate.learning.off_policy.episodes import REMEMBERED, Episodes
 from palpate.runs import Run
 from palpate.runs.progress import interruptible, progress
@@ -125,7 +131,7 @@ def train_off_policy(
             "pretraining needs transitions that were collected before and an agent that learns from"
             f" them: got {'none' if offline is None else type(agent).__name__}"
         )
-    compiled = compiled_for(agent, settings)
+    compiled = compile_for(agent, settings)
     key = jax.random.key(seed)
     pieces = reflex and ReplayBuffer.create(*sizes, settings.capacity, kind=Motion)
     start = TrainingState(
@@ -138,7 +144,7 @@ def train_off_policy(
     restored = None if run is None else run.restore(start)
     done, state = restored or (0, start)
     history = state.totals, state.episode_costs
-    learnt, memory = copied((state.agent, (state.buffer, state.motions)))
+    learnt, memory = copy_arrays((state.agent, (state.buffer, state.motions)))
     if restored is None and offline is not None:
         memory = compiled.keep(memory, offline)
         if settings.pretraining:
@@ -152,7 +158,7 @@ def train_off_policy(
     with interruptible() as stop:
         for step in bar:
             if observation is None:
-                observation = begun(environments, seed, step - count)
+                observation = begin_episodes(environments, seed, step - count)
                 episodes.begin()
             for_action, for_updates = jax.random.split(jax.random.fold_in(key, 1 + step))
             at_random = step <= settings.warm_up
@@ -270,7 +276,7 @@ class Compiled:
 
 
 @functools.lru_cache(maxsize=8)
-def compiled_for(agent: Agent, settings: OffPolicyTraining) -> Compiled:
+def compile_for(agent: Agent, settings: OffPolicyTraining) -> Compiled:
     """The same for the same agent and settings: another seed need not be compiled anew."""
     return Compiled(agent, settings)
 

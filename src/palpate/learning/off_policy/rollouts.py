@@ -10,8 +10,14 @@ from gymnasium.vector import VectorEnv
 from palpate.errors import PalpateError
 from palpate.learning.off_policy.agent import Agent
 from palpate.learning.off_policy.buffer import Motion, Transition
-from palpate.learning.off_policy.environments import REPORTED, advance, begun, check, motions_of
-from palpate.runs.progress import Watch, unwatched
+from palpate.learning.off_policy.environments import (
+    REPORTED,
+    advance,
+    begin_episodes,
+    check,
+    motions_of,
+)
+from palpate.runs.progress import Watch, without_progress
 
 # From observations (environments, features), whether each has just begun, and a generator:
 # actions (environments, actions) in [-1, 1].
@@ -33,7 +39,7 @@ def collect(
     script: Script,
     steps: int,
     seed: int,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> Transition:
     """The transitions (steps, ...) of a scripted policy, to learn from before a training.
 
@@ -46,7 +52,7 @@ def collect(
     if steps < 1:
         raise PalpateError(f"{steps} steps were asked for: expected at least one")
     random, count = np.random.default_rng((seed, 1)), environments.num_envs
-    observation, fresh = begun(environments, seed, 0), np.ones(count, bool)
+    observation, fresh = begin_episodes(environments, seed, 0), np.ones(count, bool)
     seen = []
     for _ in watch(range(-(-steps // count))):
         action = np.asarray(script(observation, fresh, random), np.float32)
@@ -70,7 +76,7 @@ def evaluate(
     act: Callable[[np.ndarray], np.ndarray],
     episodes: int,
     seed: int,
-    watch: Watch = unwatched,
+    watch: Watch = without_progress,
 ) -> dict[str, np.ndarray]:
     """What exactly `episodes` episodes gave, each array (episodes,).
 
@@ -93,7 +99,7 @@ def evaluate(
     found |= {name: np.full(episodes, np.nan) for name in REPORTED}
     found["end"] = np.full(episodes, "", object)
     playing = np.arange(count)  # the number of the episode that each environment plays
-    observation, due = begun(environments, seed, 0), iter(watch(range(episodes)))
+    observation, due = begin_episodes(environments, seed, 0), iter(watch(range(episodes)))
     while np.any(playing < episodes):
         action = np.asarray(act(observation), np.float32)
         lived, observation, info = advance(environments, observation, action, action)

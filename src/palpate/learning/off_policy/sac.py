@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from palpate.learning.off_policy.agent import Batch, adam, copied, descend, follow
+from palpate.learning.off_policy.agent import Batch, adam, copy_arrays, descend, follow
 from palpate.networks.actor import Critic, GaussianActor
 
 
@@ -49,7 +49,7 @@ class SoftActorCritic:
         log_temperature = jnp.log(jnp.asarray(temperature, jnp.float32))
         learned = {"actor": actor, "critic": critic, "temperature": log_temperature}
         moments = {name: adam(self.learning_rate).init(one) for name, one in learned.items()}
-        return SoftActorCriticState(actor, critic, copied(critic), log_temperature, moments)
+        return SoftActorCriticState(actor, critic, copy_arrays(critic), log_temperature, moments)
 
     def propose(
         self, state: SoftActorCriticState, observation: Array, key: PRNGKeyArray | None

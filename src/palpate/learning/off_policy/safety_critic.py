@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
-from palpate.learning.off_policy.agent import adam, copied, descend, follow
+from palpate.learning.off_policy.agent import adam, copy_arrays, descend, follow
 from palpate.learning.off_policy.buffer import Transition
 from palpate.networks.actor import Critic, DeterministicActor
 from palpate.networks.guarded import Guard, untrained_guard
@@ -64,7 +64,7 @@ class SafetyCritic:
         guard = untrained_guard(key, features, action, layers, seen)
         optimiser = adam(self.learning_rate)
         moments = optimiser.init(guard.critic), optimiser.init(guard.recovery)
-        return SafetyCriticState(guard, copied(guard.critic), *moments)
+        return SafetyCriticState(guard, copy_arrays(guard.critic), *moments)
 
     def update(
         self,

@@ -31,10 +31,10 @@ def read_articulated(path: str | Path, **settings: Any) -> Articulated:
     Raises `PalpateError` for a file that is no URDF, has a fault that cannot be mended by itself,
     or in which nothing moves.
     """
-    return tree_of(assembled(usable(read_urdf(path))).links, **settings)
+    return tree_of(assemble(usable(read_urdf(path))).links, **settings)
 
 
-def assembled(description: Description) -> Assembly:
+def assemble(description: Description) -> Assembly:
     """The links of a description without faults. Floating ones are six links in a row."""
     below: dict[str, list[DescribedJoint]] = {}
     for joint in description.joints:

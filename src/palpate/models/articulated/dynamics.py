@@ -21,7 +21,7 @@ from palpate.models.articulated.kinematics import (
     Joints,
     Matrix,
     Vector,
-    applied,
+    apply,
     fields,
     inwards,
     outer,
@@ -75,7 +75,7 @@ def motion(
         spin, flow = spin + own.matrix * rate, flow + own.vector * rate
         # a field that is carried along by another changes by their commutator
         twice = product(spin, own.matrix)
-        moved = applied(spin, own.vector) - applied(own.matrix, flow)
+        moved = apply(spin, own.vector) - apply(own.matrix, flow)
         turns = turns + (twice - jnp.swapaxes(twice, 0, 1)) * rate
         return Affine(spin, flow), Affine(turns, moves + moved * rate)
 
@@ -84,12 +84,12 @@ def motion(
     of = own, velocity
     rates, changes = outwards(joints.parent, carried_along, (at_rest, falling), of)
     gradient = changes.matrix + product(rates.matrix, rates.matrix)
-    value = changes.vector + applied(rates.matrix, rates.vector)
+    value = changes.vector + apply(rates.matrix, rates.vector)
     moment = product(gradient, second) + outer(value, first)  # sum of dm (acceleration) x'
-    force = applied(gradient, first) + value * mass[:, None]
+    force = apply(gradient, first) + value * mass[:, None]
     if push is not None:
         acts, at = push
-        moment = moment - outer(acts, pose.vector + applied(pose.matrix, at))
+        moment = moment - outer(acts, pose.vector + apply(pose.matrix, at))
         force = force - acts
 
     def balanced(whole: Any, each: tuple[Affine, Array]) -> tuple[Array, Array]:
@@ -98,7 +98,7 @@ def motion(
         field, below = each
         bias = work(field, moment, force)
         moment = product(field.matrix, second) + outer(field.vector, first)
-        force = applied(field.matrix, first) + field.vector * mass
+        force = apply(field.matrix, first) + field.vector * mass
         return bias, work(own, moment, force) * below[:, None]
 
     of = moment, force, mass, first, second
@@ -124,7 +124,7 @@ def work(field: Affine, moment: Array, force: Array) -> Array:
 
 def in_world(bodies: Bodies, pose: Affine) -> tuple[Each, Vector, Matrix]:
     """Mass, first and second moments of each link in the world's frame."""
-    turned = applied(pose.matrix, bodies.first)
+    turned = apply(pose.matrix, bodies.first)
     shifted = bodies.mass[:, None] * pose.vector
     second = product_transposed(product(pose.matrix, bodies.second), pose.matrix)
     second = second + outer(pose.vector, turned) + outer(turned + shifted, pose.vector)

@@ -64,23 +64,23 @@ class Fault(NamedTuple):
 Faults = list[Fault]
 
 
-def mended(description: Description) -> tuple[Description, Faults]:
+def mend(description: Description) -> tuple[Description, Faults]:
     """The description with all mended that can be, and every fault that was found."""
     faults: Faults = []
     faults += structure_faults(description)
     if any(not fault.mend for fault in faults):
         return description, faults
-    joints = tuple(mended_joint(joint, description, faults) for joint in description.joints)
+    joints = tuple(mend_joint(joint, description, faults) for joint in description.joints)
     joints = tuple(_with_own_names(joints, faults))
-    links = tuple(mended_shapes(link, description, faults) for link in description.links)
+    links = tuple(mend_shapes(link, description, faults) for link in description.links)
     whole = dataclasses.replace(description, links=links, joints=joints)
-    links = tuple(mended_inertia(link, whole, faults) for link in links)
+    links = tuple(mend_inertia(link, whole, faults) for link in links)
     return _with_one_root(dataclasses.replace(whole, links=links), faults), faults
 
 
 def usable(description: Description) -> Description:
     """The description, mended; raises `PalpateError` for the first fault without a mend."""
-    whole, faults = mended(description)
+    whole, faults = mend(description)
     for fault in faults:
         if not fault.mend:
             raise PalpateError(str(fault))
@@ -184,7 +184,7 @@ def _with_own_names(joints: Sequence[DescribedJoint], faults: Faults) -> Iterabl
 # --- joints -----------------------------------------------------------------------------------
 
 
-def mended_joint(joint: DescribedJoint, of: Description, faults: Faults) -> DescribedJoint:
+def mend_joint(joint: DescribedJoint, of: Description, faults: Faults) -> DescribedJoint:
     """A joint with an axis, a range and limits that every reader takes."""
     where = f"joint '{joint.name}'"
 
@@ -250,7 +250,7 @@ def _moved(joint: DescribedJoint, position: float) -> Place:
 # --- links ------------------------------------------------------------------------------------
 
 
-def mended_shapes(link: DescribedLink, of: Description, faults: Faults) -> DescribedLink:
+def mend_shapes(link: DescribedLink, of: Description, faults: Faults) -> DescribedLink:
     """A link with shapes that MuJoCo can make hulls of."""
     kept = {
         kind: tuple(
@@ -296,7 +296,7 @@ def _mended_shape(where: str, shape: Geometry, of: Description, faults: Faults) 
     return dataclasses.replace(shape, file=str(path))
 
 
-def mended_inertia(link: DescribedLink, of: Description, faults: Faults) -> DescribedLink:
+def mend_inertia(link: DescribedLink, of: Description, faults: Faults) -> DescribedLink:
     """A link with a mass and an inertia that a rigid body can have, where it has to have them.
 
     That is where a joint moves it; one that is fixed to a link with a mass needs none.

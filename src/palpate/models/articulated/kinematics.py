@@ -68,7 +68,7 @@ def joints_of(
     spin, shift = turning * revolute[:, None, None], axis * prismatic[:, None]
     sine = product(rotation, spin)
     return Joints(
-        parent, rotation, sine, product(sine, spin), origin, applied(rotation, shift), spin, shift
+        parent, rotation, sine, product(sine, spin), origin, apply(rotation, shift), spin, shift
     )
 
 
@@ -84,7 +84,7 @@ def product_transposed(a: Matrix, b: Matrix) -> Matrix:
     return terms[0] + terms[1] + terms[2]
 
 
-def applied(a: Matrix, v: Vector) -> Vector:
+def apply(a: Matrix, v: Vector) -> Vector:
     """a v."""
     terms = [a[..., :, k, :] * v[..., None, k, :] for k in range(3)]
     return terms[0] + terms[1] + terms[2]
@@ -166,7 +166,7 @@ def poses(joints: Joints, position: Each) -> Affine:
     """World from link, from joint positions (rad or m)."""
 
     def joined(above: Affine, own: Affine) -> Affine:
-        vector = above.vector + applied(above.matrix, own.vector)
+        vector = above.vector + apply(above.matrix, own.vector)
         return Affine(product(above.matrix, own.matrix), vector)
 
     lanes = position.shape[1:]
@@ -179,7 +179,7 @@ def poses(joints: Joints, position: Each) -> Affine:
 def fields(joints: Joints, pose: Affine) -> Affine:
     """Velocity of the points that each joint carries, per rad/s or m/s."""
     matrix = product_transposed(product(pose.matrix, joints.spin), pose.matrix)
-    vector = applied(pose.matrix, joints.shift) - applied(matrix, pose.vector)
+    vector = apply(pose.matrix, joints.shift) - apply(matrix, pose.vector)
     return Affine(matrix, vector)
 
 

@@ -2,4 +2,4 @@
 
 from palpate.models.contact.tip import Tip as Tip
 from palpate.models.contact.tip import TipState as TipState
-from palpate.models.contact.tip import facing as facing
+from palpate.models.contact.tip import tip_with_walls as tip_with_walls

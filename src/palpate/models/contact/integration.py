@@ -188,12 +188,12 @@ def _rubbed(
     """
     answer = _product(inverse, along)
     sliding = jnp.sum(along * (2.0 * mean - velocity), axis=-1)
-    rest = slowed(sliding, 2.0 * jnp.sum(along * answer, axis=-1) * most, slip)
+    rest = velocity_after_friction(sliding, 2.0 * jnp.sum(along * answer, axis=-1) * most, slip)
     force = most * grip(rest, slip)
     return mean - answer * force[..., None], force
 
 
-def slowed(
+def velocity_after_friction(
     sliding: Float[Array, "*#batch"], most: Float[Array, "*#batch"], slip: Array | float
 ) -> Float[Array, "*_"]:
     """The velocity u that dry friction leaves: u + `most` `grip(u, slip)` = `sliding`."""

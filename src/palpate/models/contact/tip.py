@@ -229,7 +229,7 @@ class Tip(Model):
         return state.velocity
 
 
-def facing(directions: Sequence[float], **values: Any) -> Tip:
+def tip_with_walls(directions: Sequence[float], **values: Any) -> Tip:
     """A tip between walls whose outward normals point to `directions` (rad).
 
     `values` are fields of `Tip`: parameters that are not given are at their prior's centre, and a

@@ -42,7 +42,7 @@ def check_indices(model: Any) -> None:
         _check_range("pairs", pairs[..., 3][wall], 0, walls)
 
 
-def coupled(model: Any) -> tuple[tuple[int, ...], ...]:
+def coupled_groups(model: Any) -> tuple[tuple[int, ...], ...]:
     """Bodies in groups: which of them links or possible contacts couple, if only by others.
 
     `model` has no batch axis.

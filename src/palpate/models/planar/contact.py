@@ -182,11 +182,11 @@ def weights(
         bearing = before[lacking.shape[0] :]
     held = found.friction * load
     speed = size(sliding) * (1.0 + bearing / found.sliding_mass)
-    weight = held / remaining(speed, held / found.sliding_mass)
+    weight = held / remaining_speed(speed, held / found.sliding_mass)
     return jnp.concatenate([jnp.where(lacking > 0.0, stiffness, 0.0), weight])
 
 
-def delayed(
+def delayed_impulse(
     found: Contacts, weight: Float[Array, " rows"], velocity: Float[Array, "bodies 3"]
 ) -> Float[Array, "bodies 3"]:
     """Impulse times the delay by which it counts in positions, on each body (kg m, kg m^2).
@@ -205,7 +205,7 @@ def size(speed: Array) -> Array:
     return jnp.sqrt(jnp.square(speed) + AT_REST**2)
 
 
-def remaining(speed: Array, taken: Array) -> Array:
+def remaining_speed(speed: Array, taken: Array) -> Array:
     """What is left of a speed (m/s) from which some is taken, smoothly, and at least a little."""
     left = speed - taken
     left = 0.5 * (left + jnp.sqrt(jnp.square(left) + 4.0 * SLOWEST**2))

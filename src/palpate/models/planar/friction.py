@@ -168,7 +168,7 @@ def at_point(x: Array, y: Array, tensor: Tensor) -> Entries:
 def pulls(resisting: Resistance, velocity: Triple) -> Pull:
     """What dry elements take at a velocity."""
     first, second = rates(resisting.dry, velocity)
-    soft = softened(first, second)
+    soft = inverse_size(first, second)
     return Pull(soft * first, soft * second)
 
 
@@ -184,7 +184,7 @@ def pulls_after(resisting: Resistance, velocity: Triple, pull: Pull, step: Tripl
     now = pulls(resisting, velocity)
     first = now.first - soft * (first - pull.first * growth)
     second = now.second - soft * (second - pull.second * growth)
-    within = softened(first, second)
+    within = inverse_size(first, second)
     return Pull(within * first, within * second)
 
 
@@ -220,7 +220,7 @@ def curvature(resisting: Resistance, velocity: Triple, pull: Pull) -> Entries:
 def _directions(dry: Dry, velocity: Triple) -> tuple[Array, Pull]:
     """One over the size of the rates, at most one, and where they point; zero for what sticks."""
     first, second = rates(dry, velocity)
-    soft = softened(first, second)
+    soft = inverse_size(first, second)
     sliding = jnp.where(soft < 1.0, soft, 0.0)
     return soft, Pull(sliding * first, sliding * second)
 
@@ -231,7 +231,7 @@ def as_viscous(resisting: Resistance, velocity: Triple) -> Entries:
     With it a step takes energy whatever the velocity is that the forces are of.
     """
     dry = resisting.dry
-    soft = softened(*rates(dry, velocity))
+    soft = inverse_size(*rates(dry, velocity))
     one = jnp.ones_like(soft)
     even = Tensor(one, one, jnp.zeros_like(soft))
     return _plus(resisting.entries, _weighted(dry, dry.impulse * soft, even))
@@ -268,7 +268,7 @@ def least_power(log: Tensor, friction: Tensor) -> Array:
     return STICTION * jnp.sqrt(1e-8 + mean)
 
 
-def softened(first: Array, second: Array) -> Array:
+def inverse_size(first: Array, second: Array) -> Array:
     """One over the size of two rates, or one where they are smaller."""
     return jax.lax.rsqrt(jnp.maximum(jnp.square(first) + jnp.square(second), 1.0))
 

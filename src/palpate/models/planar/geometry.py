@@ -56,10 +56,10 @@ def nearest(shapes: Shapes, pose: Float[Array, "bodies 3"]) -> Near:
     if shapes.walls.shape[0]:
         first, second, walls = _as_long(first, second, shapes.walls[shapes.pairs[:, 3]])
         second = jnp.where((shapes.pairs[:, 2] < 0)[:, None, None], walls, second)
-    return jax.vmap(between)(first, second)
+    return jax.vmap(nearest_points)(first, second)
 
 
-def between(first: Float[Array, "corners 2"], second: Float[Array, "corners 2"]) -> Near:
+def nearest_points(first: Float[Array, "corners 2"], second: Float[Array, "corners 2"]) -> Near:
     """The nearest points of two convex polygons."""
     ours, theirs = _furthest_edge(first, second), _furthest_edge(second, first)
     swapped = theirs[0] > ours[0]

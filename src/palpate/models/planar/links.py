@@ -102,7 +102,7 @@ def link_rows(
     )
 
 
-def allowed(
+def project_onto_links(
     links: Links,
     gyration: Float[Array, " bodies"],
     loose: Float[Array, " bodies"],

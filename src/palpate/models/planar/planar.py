@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from palpate.models.planar.checks import coupled
+from palpate.models.planar.checks import coupled_groups
 from palpate.models.planar.drawing import drawing
 from palpate.models.planar.integration import advance
-from palpate.models.planar.links import allowed, turn
+from palpate.models.planar.links import project_onto_links, turn
 from palpate.models.planar.parameters import PlanarParameters, PlanarState
 from palpate.models.planar.system import System, links_of, system_of
 from palpate.parameters import axes_of
@@ -81,7 +81,7 @@ class Planar(PlanarParameters):
     ) -> Float[Array, "*_ bodies 3"]:
         """Predicted minus observed poses, angles between -pi and pi."""
         off = predicted - observed
-        return off.at[..., 2].set(wrapped(off[..., 2]))
+        return off.at[..., 2].set(wrap_angle(off[..., 2]))
 
     def initial_state(self, observations: Float[Array, "*batch frames bodies 3"]) -> PlanarState:
         """The state at the last of a few frames: on the straight line that fits them best.
@@ -138,7 +138,7 @@ class Planar(PlanarParameters):
         self, state: PlanarState, action: Float[Array, "*batch bodies 3"]
     ) -> Float[Array, "*batch bodies 6"]:
         """Velocity and wrench of each body in its own axes: m/s, m/s, rad/s, N, N, N m."""
-        own = [turned(each, -state.pose[..., 2]) for each in (state.velocity, action)]
+        own = [rotate(each, -state.pose[..., 2]) for each in (state.velocity, action)]
         return jnp.concatenate(own, axis=-1)
 
     def corrected(
@@ -149,7 +149,7 @@ class Planar(PlanarParameters):
         In m/s along each body's own axes, and in m/s at `even_gyration` from its origin.
         """
         turning = correction[..., 2] / self.even_gyration
-        added = turned(correction.at[..., 2].set(turning), state.pose[..., 2])
+        added = rotate(correction.at[..., 2].set(turning), state.pose[..., 2])
         return PlanarState(state.pose, state.velocity + (1.0 - self.bolted[..., None]) * added)
 
     def correction_between(
@@ -157,12 +157,12 @@ class Planar(PlanarParameters):
     ) -> Float[Array, "*batch bodies 3"]:
         """Change of the velocities of what is not bolted, as `corrected` adds them."""
         change = (1.0 - self.bolted[..., None]) * (following.velocity - state.velocity)
-        change = turned(change, -state.pose[..., 2])
+        change = rotate(change, -state.pose[..., 2])
         return change.at[..., 2].set(change[..., 2] * self.even_gyration)
 
     def independent_parts(self) -> tuple[tuple["Planar", tuple[int, ...]], ...]:
         """Groups of bodies that no link and no contact couples; without links, no room for them."""
-        groups = coupled(self)
+        groups = coupled_groups(self)
         return tuple((self._only(of) if len(groups) > 1 else self, of) for of in groups)
 
     def _only(self, group: tuple[int, ...]) -> "Planar":
@@ -210,7 +210,7 @@ class Planar(PlanarParameters):
 
         def nearest(model: Planar, state: PlanarState) -> tuple[Array, Array]:
             links, loose = links_of(model), 1.0 - model.bolted
-            return allowed(links, model.even_gyration, loose, state.pose, state.velocity)
+            return project_onto_links(links, model.even_gyration, loose, state.pose, state.velocity)
 
         return _one_by_one(nearest, self, state) if self.link_to.shape[-1] else state
 
@@ -255,14 +255,14 @@ def _side_by_side(arrays: Sequence[Array], axes: Sequence[int], lanes: int = 1) 
     return [jnp.broadcast_to(array, (*array.shape[:-1], lanes)) for array in last]
 
 
-def turned(vectors: Array, angle: Array) -> Array:
+def rotate(vectors: Array, angle: Array) -> Array:
     """(..., 2 or 3) points, velocities or wrenches after their body was turned by an angle."""
     x, y = turn(vectors[..., 0], vectors[..., 1], jnp.cos(angle), jnp.sin(angle))
     rest = jnp.broadcast_to(vectors[..., 2:], (*x.shape, vectors.shape[-1] - 2))
     return jnp.concatenate([jnp.stack([x, y], axis=-1), rest], axis=-1)
 
 
-def wrapped(angle: Array) -> Array:
+def wrap_angle(angle: Array) -> Array:
     """The angle between -pi and pi that points the same way."""
     return angle - 2.0 * jnp.pi * jnp.round(angle / (2.0 * jnp.pi))
 

@@ -33,7 +33,7 @@ def furniture(
     """A planar model of bodies with these outlines.
 
     `outlines` has, for each body, a polygon (corners, 2) in m in the body's frame, whose origin is
-    the centroid (`centred` puts it there), or a list of such polygons that make up the body;
+    the centroid (`centre_outline` puts it there), or a list of such polygons that make up the body;
     `walls` are polygons in the world. Polygons may be concave: they are cut into convex parts.
     Each body gets `wheels` wheels under the given `law`. `pivots` and `distances` map a body to
     the body that a point of it is joined to, None for the world, as it stands at `poses`
@@ -62,7 +62,7 @@ def furniture(
         if np.max(np.abs(centroid)) > OFF_CENTRE * np.max(extent[index]):
             raise PalpateError(
                 f"the centroid of outline {index} lies at ({centroid[0]:.4g}, {centroid[1]:.4g}) "
-                "m: expected at the origin of the body's frame (`centred` moves it there)"
+                "m: expected at the origin of the body's frame (`centre_outline` moves it there)"
             )
         gyration[index] = even_gyration(pieces)
     bolts = np.zeros(count)
@@ -101,7 +101,9 @@ def rectangle(width: float, depth: float) -> Float[np.ndarray, "4 2"]:
     return 0.5 * np.array([[-width, -depth], [width, -depth], [width, depth], [-width, depth]])
 
 
-def centred(outline: ArrayLike) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "2"]]:
+def centre_outline(
+    outline: ArrayLike,
+) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "2"]]:
     """A polygon (corners, 2) moved so that its centroid is the origin, and the centroid, in m."""
     centroid = _shape(outline, "the outline").centroid
     place = np.array([centroid.x, centroid.y])

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from palpate.models.planar.system import WEAKEST
 
 
-def turned_wheel(
+def wheel_at_angle(
     direction: Float[ArrayLike, "*#batch"],
     along: Float[ArrayLike, "*#batch"],
     across: Float[ArrayLike, "*#batch"],
@@ -37,7 +37,7 @@ def wheel_axes(
     """Where a wheel rolls, and the forces at which it gives way there and sideways.
 
     The direction is of its weaker axis, rad from the body's x axis, between -pi/2 and pi/2; forces
-    are in N, or in N s/m: those of `turned_wheel`, the weaker one first.
+    are in N, or in N s/m: those of `wheel_at_angle`, the weaker one first.
     """
     log_along, log_across = _logarithms(wheel_along, wheel_across)
     mean, turned = 0.5 * (log_along + log_across), 0.5 * (log_along - log_across)

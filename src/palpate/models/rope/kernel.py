@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from palpate.numerics.devices import compiled_alone
+from palpate.numerics.devices import compile_alone
 
 TWIST_FADE = 0.01  # S above: twist counts half at joints of 0.1 rad
 COINCIDENT = 1e-12  # m^2, added to l^2, which vanishes where two nodes meet
@@ -142,7 +142,7 @@ def edge_forces(
     return force[0], force[1], force[2]
 
 
-@compiled_alone
+@compile_alone
 def _stretch(
     position: Axes, velocity: Axes, rest_length: Flat, stiffness: Flat, damping: Flat, *, lanes: int
 ) -> tuple[Axes, Axes, Axes, Flat]:
@@ -158,7 +158,7 @@ def _stretch(
     return edge, direction, turning, tension
 
 
-@compiled_alone
+@compile_alone
 def _bending(
     direction: Axes,
     turning: Axes,
@@ -183,7 +183,7 @@ def _bending(
     return earlier, later, bend, moment
 
 
-@compiled_alone
+@compile_alone
 def _twist(
     earlier: Axes, later: Axes, bend: Axes, stiffness: Flat, *, lanes: int
 ) -> tuple[Axes, Axes]:

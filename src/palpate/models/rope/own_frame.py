@@ -31,7 +31,7 @@ def features(
     span = place[..., -1:, :]
     distance = jnp.sqrt(jnp.sum(jnp.square(span[..., :2]), axis=-1, keepdims=True) + 1e-12)
     ends = jnp.concatenate([distance, span[..., 2:]], axis=-1)
-    local = [turned_in(vectors, along) for vectors in (following, edge, place)]
+    local = [to_rope_frame(vectors, along) for vectors in (following, edge, place)]
     ends = jnp.broadcast_to(ends, (*local[0].shape[:-1], ends.shape[-1]))
     return jnp.concatenate([*local, ends], axis=-1)
 
@@ -50,15 +50,15 @@ def axes(
     return chord / jnp.sqrt(jnp.sum(jnp.square(chord), axis=-1, keepdims=True) + jnp.square(fade))
 
 
-def turned_in(vectors: Array, along: Array) -> Array:
+def to_rope_frame(vectors: Array, along: Array) -> Array:
     """(*batch, nodes, 3) world vectors along, across and up in the rope's frame."""
     x, y = along[..., None, 0], along[..., None, 1]
     a, b, c = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     return jnp.stack([x * a + y * b, x * b - y * a, jnp.broadcast_to(c, (x * a).shape)], axis=-1)
 
 
-def turned_out(vectors: Array, along: Array) -> Array:
-    """The inverse of `turned_in` where the axes do not fade: world vectors."""
+def from_rope_frame(vectors: Array, along: Array) -> Array:
+    """The inverse of `to_rope_frame` where the axes do not fade: world vectors."""
     x, y = along[..., None, 0], along[..., None, 1]
     a, b, c = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     return jnp.stack([x * a - y * b, y * a + x * b, jnp.broadcast_to(c, (x * a).shape)], axis=-1)

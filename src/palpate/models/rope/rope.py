@@ -112,7 +112,7 @@ class Rope(RopeParameters):
             return None
         chord = position[..., -1, :2] - position[..., 0, :2]
         along = chord / jnp.sqrt(jnp.sum(jnp.square(chord), axis=-1, keepdims=True) + 1e-6)
-        return own_frame.turned_out(self.rest_bend, along)
+        return own_frame.from_rope_frame(self.rest_bend, along)
 
     def _drive(self, state: RopeState, action: Array) -> tuple[RopeState, Array]:
         """Start velocity of the driven nodes, and what each integration step adds to it."""
@@ -224,7 +224,7 @@ class Rope(RopeParameters):
     def corrected(self, state: RopeState, correction: Float[Array, "*batch nodes 3"]) -> RopeState:
         """The state with velocities (m/s, in the rope's own frame) added to its free nodes."""
         frame = own_frame.axes(self, state.position)
-        added = self.free_nodes()[:, None] * own_frame.turned_out(correction, frame)
+        added = self.free_nodes()[:, None] * own_frame.from_rope_frame(correction, frame)
         return RopeState(state.position, state.velocity + added)
 
     def correction_between(
@@ -233,7 +233,7 @@ class Rope(RopeParameters):
         """Change of the free nodes' velocities (m/s), in the rope's own frame at `state`."""
         frame = own_frame.axes(self, state.position)
         change = self.free_nodes()[:, None] * (following.velocity - state.velocity)
-        return own_frame.turned_in(change, frame)
+        return own_frame.to_rope_frame(change, frame)
 
     def constrain(self) -> "Rope":
         """The rope softened where the integration would be unstable: see `stability`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 from palpate.recordings.alignment import DRIVEN_GAP, ON_STAMP
 from palpate.recordings.channel import Role
 from palpate.recordings.rosbag.files import Bag, open_bag
@@ -115,6 +115,6 @@ def _pieces(times: list[np.ndarray], chosen: Chosen) -> list[tuple[float, float]
     if begin < end:
         pieces.append((begin, end))
     if not pieces:
-        topics = listed(track.topic for track in chosen.tracks)
+        topics = list_names(track.topic for track in chosen.tracks)
         raise PalpateError(f"{topics}: no time is covered by all of them without gaps")
     return pieces

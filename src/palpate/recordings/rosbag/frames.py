@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 
 LATEST = 0.25  # s before the first pose of a frame, or after its last one, at which it is there too
 
@@ -44,7 +44,7 @@ class Frames:
         while seen[-1] in self._parents:
             seen.append(self._parents[seen[-1]])
             if seen[-1] in seen[:-1]:
-                raise PalpateError(f"the frames {listed(seen)} hang on one another in a circle")
+                raise PalpateError(f"the frames {list_names(seen)} hang on one another in a circle")
         return seen[-1]
 
     def poses(self, frame: str, stamps: np.ndarray) -> Float[np.ndarray, "n 4 4"]:

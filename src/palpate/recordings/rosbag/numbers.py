@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 from palpate.recordings.channel import Channel, Role
 from palpate.recordings.recording import Recording
 from palpate.recordings.rosbag.files import open_bag
@@ -62,11 +62,11 @@ def read_numbers(path: Path, names: Sequence[str]) -> Recording:
         if not found:
             raise PalpateError(
                 f"there is no topic {topic} with messages that can be read; there are: "
-                f"{listed(sorted(bag.types))}"
+                f"{list_names(sorted(bag.types))}"
             )
         if all(math.isnan(value) for _, _, value in found):
             raise PalpateError(
-                f"no message has a number at {name}; {topic} has {listed(fields[topic])}"
+                f"no message has a number at {name}; {topic} has {list_names(fields[topic])}"
             )
     stamped = all(stamp is not None for found in rows.values() for _, stamp, _ in found)
     channels = {}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from palpate.errors import PalpateError, listed
+from palpate.errors import PalpateError, list_names
 from palpate.recordings.alignment import MAX_BYTES
 from palpate.recordings.csv import in_natural_order
 from palpate.recordings.rosbag.files import Bag
@@ -158,8 +158,8 @@ def choose(tracks: dict[str, Track], bag: Bag, topics: Sequence[str]) -> Chosen:
             notes.append(f"{gripper.topic} stays at the first marker and is taken as the gripper")
         elif poses:
             notes.append(
-                f"poses were left out: {listed(track.topic for track in poses)}; --topics takes "
-                "one of them as the gripper's"
+                f"poses were left out: {list_names(track.topic for track in poses)}; --topics "
+                "takes one of them as the gripper's"
             )
     for track in (gripper, command):
         if track is None:
@@ -179,7 +179,7 @@ def _one(kind: Kind, tracks: dict[str, Track]) -> Track | None:
     if len(found) > 1:
         what = "markers" if kind is Kind.MARKERS else f"a {kind.value}"
         raise PalpateError(
-            f"several topics hold {what}: {listed(str(track) for track in found)}; say which "
+            f"several topics hold {what}: {list_names(str(track) for track in found)}; say which "
             f"with --topics, e.g. --topics {found[0].topic}"
         )
     return found[0] if found else None
@@ -191,7 +191,7 @@ def _unusable(topic: str, tracks: dict[str, Track], bag: Bag) -> str:
         return f"topic '{topic}' cannot be read: {bag.unreadable[topic]}"
     children = [name for name in tracks if name.startswith(f"{topic}:")]
     if children:
-        return f"topic '{topic}' holds transforms: name one of them, {listed(children)}"
+        return f"topic '{topic}' holds transforms: name one of them, {list_names(children)}"
     if topic in bag.types:
         return (
             f"topic '{topic}' of type {bag.types[topic]} has no messages that show markers, a "
@@ -205,7 +205,7 @@ def _listed(bag: Bag) -> str:
     for topic, kind in bag.types.items():
         why = bag.unreadable.get(topic)
         there.append(f"{topic} ({kind}{f', not read: {why}' if why else ''})")
-    return f"there are: {listed(there)}" if there else "there are no topics"
+    return f"there are: {list_names(there)}" if there else "there are no topics"
 
 
 def _holds_the_first(pose: Track, markers: Track, positions: np.ndarray) -> bool:
@@ -239,7 +239,7 @@ def _check_whole(track: Track, bag: Bag) -> None:
     frames = {sight.frame for sight in track.sights}
     if len(frames) > 1:
         raise PalpateError(
-            f"topic '{track.topic}' changes its frame: {listed(sorted(map(str, frames)))}"
+            f"topic '{track.topic}' changes its frame: {list_names(sorted(map(str, frames)))}"
         )
 
 

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.worlds.furniture.furniture import FurnitureWorld
 from palpate.worlds.furniture.pieces import KINDS, Piece
 
@@ -133,7 +133,7 @@ def apartment() -> CartTask:
 def clearance(kinds: tuple[str, ...], poses: np.ndarray) -> float:
     """The least distance (m) between any two of the pieces at poses (bodies, 3)."""
     shapes = [
-        shapely.Polygon(placed(np.asarray(KINDS[kind].outline), pose))
+        shapely.Polygon(place_points(np.asarray(KINDS[kind].outline), pose))
         for kind, pose in zip(kinds, poses, strict=True)
     ]
     return min(one.distance(other) for one, other in itertools.combinations(shapes, 2))

@@ -22,7 +22,7 @@ from palpate.identification.regression.locally_weighted import LocallyWeighted, 
 from palpate.identification.regression.model import Features, RegressedModel
 from palpate.models.model import Model, Wrapper
 from palpate.models.planar import Planar, PlanarState, furniture
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.parameters import Parameter, as_floating, declare, parameters_of, value_of, with_values
 from palpate.planning.sampling import Mppi, SamplingPlanner
 from palpate.recordings import Aligned
@@ -266,7 +266,7 @@ class CartController(FeedbackController):
     def _touching(self, poses: np.ndarray) -> np.ndarray:
         """Which pieces (bodies,) are near another or a wall."""
         shapes = [
-            shapely.Polygon(placed(outline, pose))
+            shapely.Polygon(place_points(outline, pose))
             for outline, pose in zip(self._task.outlines, poses, strict=True)
         ]
         others = [[self._walls, *(o for o in shapes if o is not one)] for one in shapes]

@@ -88,7 +88,9 @@ class PiecePosterior:
     def _target(self, parts: list[Segments]) -> MotionPosterior | None:
         if not parts:
             return None
-        return motion_posterior(self.model, telling(parts), inferred_scales(self.model, NOISE))
+        return motion_posterior(
+            self.model, most_informative(parts), inferred_scales(self.model, NOISE)
+        )
 
     def _best(self, target: MotionPosterior, modes: Float[Array, "modes free"]) -> Planar:
         self._modes = modes
@@ -105,7 +107,7 @@ def _position(target: MotionPosterior, model: Planar) -> Array:
     return initial_position(motion_posterior(model, target.segments, target.scales))
 
 
-def telling(parts: list[Segments]) -> Segments:
+def most_informative(parts: list[Segments]) -> Segments:
     """The `MOST` pieces in which most happened; padded by ones in which nothing is seen.
 
     Most of the time of who is good at it passes at the goal, where next to nothing moves, and a

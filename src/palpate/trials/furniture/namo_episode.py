@@ -15,7 +15,7 @@ from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.motion.belief import ObjectBelief, cut
 from palpate.planning.movable_obstacles.motion.constrained import ConstrainedManipulation, Drawn
 from palpate.planning.movable_obstacles.motion.primitives import Constraint
-from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan, timed
+from palpate.planning.movable_obstacles.search.plan import TRANSFER, Plan, planning_clock
 from palpate.planning.movable_obstacles.search.planner import Planner
 from palpate.planning.movable_obstacles.search.policy import NoWayError
 from palpate.planning.movable_obstacles.search.tree_search import Settings
@@ -201,14 +201,14 @@ def _planned(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> 
         maps = {TIGHT: maps[TIGHT]}
     for again in range(SEARCHES):
         for world in maps.values():
-            began = timed()
+            began = planning_clock()
             planner = Planner(opinion.model(), SEARCH, seed=SEARCHES * outcome.attempts + again)
             try:
                 plan = planner.plan(world, immovable=opinion.immovable())
             except NoWayError:
                 continue
             finally:
-                outcome.planning_s += timed() - began
+                outcome.planning_s += planning_clock() - began
             outcome.plans.append((world, plan))
             return plan
         opinion.relent()

@@ -15,8 +15,8 @@ import numpy as np
 import shapely
 from shapely.ops import nearest_points
 
-from palpate.numerics.polygons import placed, turned
-from palpate.planning.movable_obstacles.motion.body_controller import BodyController, moved_with
+from palpate.numerics.polygons import place_points, rotate
+from palpate.planning.movable_obstacles.motion.body_controller import BodyController, velocity_at
 from palpate.planning.movable_obstacles.search.plan import Segment
 from palpate.trials.furniture.rooms import BASE_RADIUS, MARGIN, POSTURE, RADIUS, REACH, Pose, Room
 from palpate.worlds.furniture.furniture import FurnitureObservation, RobotAction
@@ -247,7 +247,7 @@ class Execution:
             off = np.append(target[:2] - pose[:2], _wrapped(target[2] - pose[2]))
             velocity = wanted + np.clip(CORRECTION * off, *_both(MOST_CORRECTION))
             gripper = robot.gripper_pose
-            hand = moved_with(velocity, pose, gripper[:2])
+            hand = velocity_at(velocity, pose, gripper[:2])
             wrench += SMOOTHING * (robot.wrist_wrench - wrench)
             hand -= wrench / np.array([GIVING, GIVING, TURN_GIVING])
             self._hand(hand, body)
@@ -261,13 +261,13 @@ class Execution:
             pose, gripper = self.now.poses[body], _robot(self.now).gripper_pose
             off = np.append(place[:2] - pose[:2], _wrapped(place[2] - pose[2]))
             velocity = np.clip(CORRECTION * off, *_both(MOST_CORRECTION))
-            self._hand(moved_with(velocity, pose, gripper[:2]), body)
+            self._hand(velocity_at(velocity, pose, gripper[:2]), body)
 
     def _examine(self, body: int) -> None:
         """Pull sideways, back and forth, as hard as the hand may."""
         wrench = np.zeros(3)
         for forward, left in WIGGLES:
-            wanted = np.append(turned((forward, left), _robot(self.now).gripper_pose[2]), 0.0)
+            wanted = np.append(rotate((forward, left), _robot(self.now).gripper_pose[2]), 0.0)
             for _ in range(round(WIGGLING / self.period)):
                 wrench += SMOOTHING * (_robot(self.now).wrist_wrench - wrench)
                 # Free to turn: what pivots can then follow the hand.
@@ -288,8 +288,8 @@ class Execution:
         """The object's velocity (3,) here and now that the path has at step `at`."""
         change = path[at + 1] - path[at]
         angle = pose[2] - 0.5 * (path[at, 2] + path[at + 1, 2])
-        moved = np.append(turned(change[:2], angle), change[2])
-        hand = moved_with(moved, pose, gripper[:2])
+        moved = np.append(rotate(change[:2], angle), change[2])
+        hand = velocity_at(moved, pose, gripper[:2])
         time = max(*(np.hypot(*of[:2]) / SPEED for of in (hand, moved)), abs(moved[2]) / RATE)
         return moved / max(time, 1e-9)
 
@@ -368,7 +368,7 @@ class Execution:
 
     def _shapes(self) -> list[shapely.Polygon]:
         return [
-            shapely.Polygon(placed(np.asarray(outline), pose))
+            shapely.Polygon(place_points(np.asarray(outline), pose))
             for outline, pose in zip(self.outlines.values(), self.now.poses, strict=True)
         ]
 

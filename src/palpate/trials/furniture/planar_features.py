@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from palpate.identification.regression.model import Features
 from palpate.models.planar import PlanarState
-from palpate.models.planar.planar import turned
+from palpate.models.planar.planar import rotate
 
 SECTORS = 12  # around each object: the deck's P
 NEAR = 0.03  # m: what is nearer counts as touching
@@ -36,7 +36,7 @@ def body_features(
 
     How an object moves does not depend on where it stands or how it is turned: every datum is worth
     as much there as here. With outlines (points, 2) of the bodies, in their frames, and convex
-    walls (points, 2), conditions tell on which sides an object touches what (`touching`).
+    walls (points, 2), conditions tell on which sides an object touches what (`contact_predicates`).
     """
     if not len(outlines):
         return Features(_body_inputs, _body_change, _body_apply)
@@ -45,7 +45,7 @@ def body_features(
     points = [shapely.get_coordinates(ring)[:-1] for ring in rings]
     tried = np.stack([np.resize(p, (max(map(len, points)), 2)) for p in points])
     condition = functools.partial(
-        touching,
+        contact_predicates,
         points=jnp.asarray(tried, jnp.zeros(()).dtype),
         sides=[_sides(np.asarray(outline, float)) for outline in outlines],
         walls=[_sides(np.asarray(wall, float)) for wall in walls],
@@ -54,7 +54,7 @@ def body_features(
     return Features(_body_inputs, _body_change, _body_apply, condition)
 
 
-def touching(
+def contact_predicates(
     state: PlanarState,
     points: Float[Array, "bodies points 2"],
     sides: Sequence[np.ndarray],
@@ -71,7 +71,7 @@ def touching(
     """
     pose = state.pose
     count = pose.shape[-2]
-    world = turned(points, pose[..., None, 2]) + pose[..., None, :2]  # (..., bodies, points, 2)
+    world = rotate(points, pose[..., None, 2]) + pose[..., None, :2]  # (..., bodies, points, 2)
     bits = []
     for body in range(count):
         own = world[..., body, :, :]
@@ -80,7 +80,7 @@ def touching(
                 bits.append(jnp.zeros((*pose.shape[:-2], sectors), bool))
                 continue
             there = pose[..., other, None, :]
-            local = turned(own - there[..., :2], -there[..., 2])
+            local = rotate(own - there[..., :2], -there[..., 2])
             inside = _inside(local, sides[other])
             bits.append(_by_sector(points[body], inside, sectors))
         at_walls = jnp.zeros(own.shape[:-1], bool)
@@ -108,19 +108,19 @@ def _raw_apply(state: PlanarState, change: Array) -> PlanarState:
 
 def _body_inputs(state: PlanarState, action: Array) -> Array:
     angle = -state.pose[..., 2]
-    return jnp.concatenate([turned(state.velocity, angle), turned(action, angle)], axis=-1)
+    return jnp.concatenate([rotate(state.velocity, angle), rotate(action, angle)], axis=-1)
 
 
 def _body_change(state: PlanarState, following: PlanarState) -> Array:
     angle = -state.pose[..., 2]
-    moved = turned(following.pose - state.pose, angle)
-    return jnp.concatenate([moved, turned(following.velocity - state.velocity, angle)], axis=-1)
+    moved = rotate(following.pose - state.pose, angle)
+    return jnp.concatenate([moved, rotate(following.velocity - state.velocity, angle)], axis=-1)
 
 
 def _body_apply(state: PlanarState, change: Array) -> PlanarState:
     angle = state.pose[..., 2]
-    pose = state.pose + turned(change[..., :3], angle)
-    return PlanarState(pose, state.velocity + turned(change[..., 3:], angle))
+    pose = state.pose + rotate(change[..., :3], angle)
+    return PlanarState(pose, state.velocity + rotate(change[..., 3:], angle))
 
 
 def _inside(points: Array, sides: np.ndarray) -> Array:

@@ -108,7 +108,7 @@ def baselines(base: RopeConfiguration, gains: Gains = TUNED) -> dict[str, Contro
 
 
 @functools.cache
-def tuned(base: RopeConfiguration) -> Gains:
+def tune_gains(base: RopeConfiguration) -> Gains:
     """Gains for ropes like this one: it takes a minute but for the rope that palpate records."""
     if base == RopeConfiguration():
         return TUNED

@@ -12,7 +12,7 @@ import numpy as np
 from palpate.networks import Controller
 from palpate.report.evidence import write_evidence
 from palpate.report.picture import canvas_of, legend_of, save_picture
-from palpate.report.style import STYLES, numbered
+from palpate.report.style import STYLES, style_indices
 from palpate.runs import Figure, Run
 from palpate.tasks.rope import RopeTracking
 from palpate.tasks.rope.paths import CURVES, DesiredPath, named_path, read_path
@@ -244,7 +244,7 @@ def draw(file: Path, trials: Sequence[PathTrial], followed: Mapping[str, Followe
         path = trial.path[: trial.steps + 1]
         above.plot(path[:, 0], path[:, 1], color="black", linewidth=4, alpha=0.25, label="desired")
         time = np.arange(trial.steps + 1) * trial.control_period
-        looks = {name: STYLES[index] for name, index in numbered(followed).items()}
+        looks = {name: STYLES[index] for name, index in style_indices(followed).items()}
         for name, whole in followed.items():
             style = looks[name]
             look = {"color": style.light, "linestyle": (0, style.dash), "linewidth": 1}

@@ -16,12 +16,12 @@ from palpate.worlds.appliance.design import GRAVITY, Design, Front, Part, Shape,
 from palpate.worlds.appliance.fittings import (
     Random,
     Side,
-    between,
     chance,
     door,
     drawer,
     hatch,
     sliding_panel,
+    uniform,
 )
 
 MOST_PARTS = 6
@@ -41,10 +41,10 @@ def draw_design(category: str, seed: int) -> Design:
 
 def box(random: Random) -> Design:
     """A chest or a carton: one lid, two, a lid that slides, one that folds, or one in a slope."""
-    width, depth = between(random, 0.3, 0.7), between(random, 0.25, 0.5)
-    height, wall = between(random, 0.15, 0.4), between(random, 0.008, 0.015)
+    width, depth = uniform(random, 0.3, 0.7), uniform(random, 0.25, 0.5)
+    height, wall = uniform(random, 0.15, 0.4), uniform(random, 0.008, 0.015)
     material = str(random.choice(["wood", "board", "plastic"]))
-    slope = math.radians(between(random, 10.0, 30.0)) if chance(random, TILTED) else 0.0
+    slope = math.radians(uniform(random, 10.0, 30.0)) if chance(random, TILTED) else 0.0
     low = max(height - depth * math.tan(slope), 0.4 * height)  # of the front
     slope = math.atan2(height - low, depth)
     body = _open_box(width, depth, low, height, wall)
@@ -52,7 +52,7 @@ def box(random: Random) -> Design:
     turn = _about_y(slope - 0.5 * math.pi)
     top = Front(np.array([0.0, -0.5 * width, low]), turn, width, depth / math.cos(slope))
     kind = random.choice(["lid", "two", "slide", "fold"], p=[0.45, 0.25, 0.15, 0.15])
-    thickness = between(random, 0.008, 0.018)
+    thickness = uniform(random, 0.008, 0.018)
     parts: list[Part] = []
     if kind == "lid":
         side: Side = random.choice(["top", "left", "right"], p=[0.8, 0.1, 0.1])
@@ -76,13 +76,13 @@ def box(random: Random) -> Design:
             door(random, back, "lid", "top", material, thickness=thickness, with_handle=False),
             door(random, front, "leaf", "top", material, thickness=thickness, parent=0),
         ]
-    return Design("box", body, tuple(parts), float(random.choice([0.0, between(random, 0.3, 0.8)])))
+    return Design("box", body, tuple(parts), float(random.choice([0.0, uniform(random, 0.3, 0.8)])))
 
 
 def door_frame(random: Random) -> Design:
     """A door in a piece of wall: one leaf or two on hinges, or a leaf that slides."""
-    width, height = between(random, 0.65, 1.0), between(random, 1.7, 2.1)
-    post, thick = between(random, 0.06, 0.3), between(random, 0.08, 0.15)
+    width, height = uniform(random, 0.65, 1.0), uniform(random, 1.7, 2.1)
+    post, thick = uniform(random, 0.06, 0.3), uniform(random, 0.08, 0.15)
     double = chance(random, 0.25)
     whole = width * (1.7 if double else 1.0)
     material = str(random.choice(["wood", "board"]))
@@ -94,7 +94,7 @@ def door_frame(random: Random) -> Design:
     ]
     front = Front(np.array([0.0, -half, 0.0]), np.eye(3), whole, height)
     parts: list[Part] = []
-    thickness = between(random, 0.03, 0.045)
+    thickness = uniform(random, 0.03, 0.045)
     if double:
         sides: list[Side] = ["right", "left"]
         for index, side in enumerate(sides):
@@ -116,10 +116,10 @@ def door_frame(random: Random) -> Design:
 
 def microwave(random: Random) -> Design:
     """A cavity with a door beside a panel of controls, perhaps over a drawer."""
-    width, depth = between(random, 0.42, 0.6), between(random, 0.3, 0.45)
-    height = between(random, 0.25, 0.36)
-    below = between(random, 0.1, 0.16) if chance(random, 0.25) else 0.0
-    wall, panel = 0.02, between(random, 0.09, 0.14)
+    width, depth = uniform(random, 0.42, 0.6), uniform(random, 0.3, 0.45)
+    height = uniform(random, 0.25, 0.36)
+    below = uniform(random, 0.1, 0.16) if chance(random, 0.25) else 0.0
+    wall, panel = 0.02, uniform(random, 0.09, 0.14)
     body = _shell(width, depth, height + below, wall)
     hinge: Side = "left" if chance(random, 0.2) else "right"  # most of them: panel on the right
     whole = Front(np.array([0.0, -0.5 * width, 0.0]), np.eye(3), width, height + below)
@@ -129,22 +129,22 @@ def microwave(random: Random) -> Design:
         knob = (0.008, at + 0.5 * panel, below + (0.25 + 0.3 * row) * height)
         body.append(whole.rod(knob, 0, 0.018, 0.016))
     opening = whole.part(panel if hinge == "left" else 0.0, below, width - panel, height)
-    inset, thickness = chance(random, 0.3), between(random, 0.02, 0.035)
+    inset, thickness = chance(random, 0.3), uniform(random, 0.02, 0.035)
     if inset:
         opening = opening.part(wall, wall, opening.width - 2 * wall, height - 2 * wall)
     parts = [door(random, opening, "door", hinge, "plastic", thickness=thickness, inset=inset)]
     if below:
         parts.append(drawer(random, whole.part(0.0, 0.0, width, below), "drawer", depth, "sheet"))
-    return Design("microwave", tuple(body), tuple(parts), between(random, 0.0, 0.9))
+    return Design("microwave", tuple(body), tuple(parts), uniform(random, 0.0, 0.9))
 
 
 def oven(random: Random) -> Design:
     """A door that opens downwards below a panel of controls; perhaps two, perhaps a drawer."""
-    width, depth = between(random, 0.5, 0.76), between(random, 0.5, 0.62)
-    panel, second = between(random, 0.08, 0.14), chance(random, 0.3)
-    low = between(random, 0.12, 0.2) if chance(random, 0.5) else 0.0
-    tall = between(random, 0.42, 0.55)
-    upper = between(random, 0.28, 0.35) if second else 0.0
+    width, depth = uniform(random, 0.5, 0.76), uniform(random, 0.5, 0.62)
+    panel, second = uniform(random, 0.08, 0.14), chance(random, 0.3)
+    low = uniform(random, 0.12, 0.2) if chance(random, 0.5) else 0.0
+    tall = uniform(random, 0.42, 0.55)
+    upper = uniform(random, 0.28, 0.35) if second else 0.0
     height = low + tall + upper + panel
     body = _shell(width, depth, height, 0.025)
     whole = Front(np.array([0.0, -0.5 * width, 0.0]), np.eye(3), width, height)
@@ -153,7 +153,7 @@ def oven(random: Random) -> Design:
     )
     for place in np.linspace(0.15, 0.85, int(random.integers(2, 6))):
         body.append(whole.rod((0.032, place * width, height - 0.5 * panel), 0, 0.02, 0.025))
-    thickness = between(random, 0.03, 0.045)
+    thickness = uniform(random, 0.03, 0.045)
     most = math.radians(95.0)
     front = whole.part(0.0, low, width, tall)
     parts = [door(random, front, "door", "bottom", "sheet", thickness=thickness, most=most)]
@@ -164,17 +164,17 @@ def oven(random: Random) -> Design:
         )
     if low:
         parts.append(drawer(random, whole.part(0.0, 0.0, width, low), "drawer", depth, "sheet"))
-    stands = between(random, 0.0, 0.8) if not low and not second else 0.0
+    stands = uniform(random, 0.0, 0.8) if not low and not second else 0.0
     return Design("oven", tuple(body), tuple(parts), stands)
 
 
 def refrigerator(random: Random) -> Design:
     """One door, two above or beside each other, drawers below; perhaps a flap in a door."""
-    width, depth = between(random, 0.5, 0.9), between(random, 0.5, 0.65)
-    height = between(random, 0.85, 1.9)
+    width, depth = uniform(random, 0.5, 0.9), uniform(random, 0.5, 0.65)
+    height = uniform(random, 0.85, 1.9)
     body = _shell(width, depth, height, 0.05)
     whole = Front(np.array([0.0, -0.5 * width, 0.0]), np.eye(3), width, height)
-    thickness = between(random, 0.04, 0.07)
+    thickness = uniform(random, 0.04, 0.07)
     kind = random.choice(["one", "above", "beside", "drawers"], p=[0.25, 0.3, 0.25, 0.2])
     side: Side = "left" if chance(random, 0.5) else "right"
     parts: list[Part] = []
@@ -185,16 +185,16 @@ def refrigerator(random: Random) -> Design:
     if kind == "one":
         leaf("door", whole, side)
     elif kind == "above":
-        split = between(random, 0.55, 0.75) * height
+        split = uniform(random, 0.55, 0.75) * height
         leaf("door", whole.part(0.0, 0.0, width, split), side)
         leaf("freezer", whole.part(0.0, split, width, height - split), side)
     elif kind == "beside":
-        split = between(random, 0.4, 0.6) * width
+        split = uniform(random, 0.4, 0.6) * width
         leaf("right door", whole.part(0.0, 0.0, split, height), "right")
         leaf("left door", whole.part(split, 0.0, width - split, height), "left")
     else:
         count = int(random.integers(1, 3))
-        tall = between(random, 0.22, 0.3)
+        tall = uniform(random, 0.22, 0.3)
         leaf("door", whole.part(0.0, count * tall, width, height - count * tall), side)
         for index in range(count):
             front = whole.part(0.0, index * tall, width, tall)
@@ -208,11 +208,11 @@ def refrigerator(random: Random) -> Design:
 def storage_furniture(random: Random) -> Design:
     """A cabinet: columns and rows of doors, drawers and open shelves, perhaps with a front that
     leans back."""
-    width, depth = between(random, 0.4, 1.2), between(random, 0.3, 0.6)
-    height = between(random, 0.4, 1.4)
+    width, depth = uniform(random, 0.4, 1.2), uniform(random, 0.3, 0.6)
+    height = uniform(random, 0.4, 1.4)
     columns = 1 if width < 0.6 else int(random.integers(1, 4))
     rows = int(random.integers(1, min(int(height / 0.2), 4) + 1))
-    lean = math.radians(between(random, 5.0, 20.0)) if chance(random, TILTED) else 0.0
+    lean = math.radians(uniform(random, 5.0, 20.0)) if chance(random, TILTED) else 0.0
     body = _shell(width, depth, height, 0.018)
     material = str(random.choice(["wood", "board"]))
     # a front that leans stands before the box, its lower edge further out
@@ -259,7 +259,7 @@ def storage_furniture(random: Random) -> Design:
             continue
         wide = width if not merged or row in (0, rows) else width * (columns - 1) / columns
         body.append(whole.part(0.0, at, wide, rails).box((-0.018, 0.0, 0.0), (0.0, wide, rails)))
-    stands = between(random, 0.5, 1.2) if height < 0.7 and chance(random, 0.3) else 0.0
+    stands = uniform(random, 0.5, 1.2) if height < 0.7 and chance(random, 0.3) else 0.0
     return Design("storage furniture", tuple(body), tuple(parts), stands)
 
 

@@ -30,7 +30,7 @@ GAP = 0.003  # m between a part and what is around it
 HANDLE_REACH = (0.025, 0.05)  # m that a handle stands off
 
 
-def between(random: Random, low: float, high: float) -> float:
+def uniform(random: Random, low: float, high: float) -> float:
     """A number between two."""
     return float(random.uniform(low, high))
 
@@ -43,15 +43,15 @@ def chance(random: Random, share: float) -> bool:
 def handle(random: Random, front: Front, middle: tuple[float, float], along: int) -> list[Shape]:
     """A bar, a knob, a rail or nothing, on a panel whose face is at `out` = 0."""
     kind = random.choice(["bar", "knob", "rail", "none"], p=[0.5, 0.2, 0.15, 0.15])
-    reach, radius = between(random, *HANDLE_REACH), between(random, 0.005, 0.011)
+    reach, radius = uniform(random, *HANDLE_REACH), uniform(random, 0.005, 0.011)
     room = front.height if along == 2 else front.width
     if kind == "none":
         return []
     left, up = middle
     if kind == "knob":
-        radius = between(random, 0.012, 0.02)
+        radius = uniform(random, 0.012, 0.02)
         return [front.rod((0.5 * reach, left, up), 0, radius, reach)]
-    length = min(between(random, 0.08, 0.35), 0.8 * room)
+    length = min(uniform(random, 0.08, 0.35), 0.8 * room)
     if kind == "rail":
         half = 0.5 * length
         edges = (
@@ -94,14 +94,14 @@ def door(
     face = low_out + thickness
     panel = front.box((low_out, GAP, GAP), (face, width - GAP, height - GAP))
     upright = side in ("left", "right")
-    away = between(random, 0.0, 0.01)
+    away = uniform(random, 0.0, 0.01)
     out = low_out + thickness * float(random.choice([0.0, 0.5, 1.0]))
     length = width if upright else height
     if upright:
         left = width - away if side == "left" else away
         position, axis = front.at(out, left, 0.5 * height), front.rotation[:, 2]
         turn = 1.0 if side == "left" else -1.0  # so that a positive angle opens it outwards
-        grip = 0.06 if side == "left" else width - 0.06, between(random, 0.3, 0.7) * height
+        grip = 0.06 if side == "left" else width - 0.06, uniform(random, 0.3, 0.7) * height
     else:
         up = away if side == "bottom" else height - away
         position, axis = front.at(out, 0.5 * width, up), front.rotation[:, 1]
@@ -111,16 +111,16 @@ def door(
     if with_handle:
         raised = replace(front, origin=front.at(face, 0.0, 0.0))
         shapes += handle(random, raised, grip, 2 if upright else 1)
-    reach = between(random, math.radians(70.0), most)
+    reach = uniform(random, math.radians(70.0), most)
     resistance = Resistance(
-        friction=between(random, 0.5, 3.0) * length, damping=between(random, 0.3, 2.0) * length**2
+        friction=uniform(random, 0.5, 3.0) * length, damping=uniform(random, 0.3, 2.0) * length**2
     )
     if chance(random, 0.35):
-        latch, angle = between(random, 2.0, 8.0) * length, between(random, 0.03, 0.08)
+        latch, angle = uniform(random, 2.0, 8.0) * length, uniform(random, 0.03, 0.08)
         resistance = replace(resistance, latch=latch, reach=angle)
     if chance(random, 0.2):
-        stiffness = between(random, 0.5, 2.0) * length
-        resistance = replace(resistance, stiffness=stiffness, rest=between(random, -0.2, 0.3))
+        stiffness = uniform(random, 0.5, 2.0) * length
+        resistance = replace(resistance, stiffness=stiffness, rest=uniform(random, -0.2, 0.3))
     share = math.hypot(axis[0], axis[1])  # of its weight that turns it
     weight = 0.5 * share * mass_of(shapes, DENSITIES[material]) * GRAVITY * length
     density, resistance = _held_up(resistance, weight, length, DENSITIES[material])
@@ -135,8 +135,8 @@ def drawer(
 ) -> Part:
     """A box without a lid behind a panel, which slides out of the front."""
     width, height = front.width, front.height
-    thickness, wall = between(random, 0.015, 0.022), 0.01
-    depth, tall = depth - 0.03, between(random, 0.5, 0.85) * height
+    thickness, wall = uniform(random, 0.015, 0.022), 0.01
+    depth, tall = depth - 0.03, uniform(random, 0.5, 0.85) * height
     side = 0.012
     shapes = [
         front.box((GAP, GAP, GAP), (GAP + thickness, width - GAP, height - GAP)),
@@ -146,17 +146,17 @@ def drawer(
         front.box((-depth, width - side - wall, side), (GAP, width - side, tall)),
     ]
     raised = replace(front, origin=front.at(GAP + thickness, 0.0, 0.0))
-    place = (0.5 * width, between(random, 0.45, 0.85) * height)
+    place = (0.5 * width, uniform(random, 0.45, 0.85) * height)
     shapes += handle(random, raised, place, 1)
-    resistance = Resistance(between(random, 1.0, 6.0), between(random, 1.0, 12.0))
+    resistance = Resistance(uniform(random, 1.0, 6.0), uniform(random, 1.0, 12.0))
     if chance(random, 0.35):
-        latch, reach = between(random, 2.0, 7.0), between(random, 0.01, 0.03)
+        latch, reach = uniform(random, 2.0, 7.0), uniform(random, 0.01, 0.03)
         resistance = replace(resistance, latch=latch, reach=reach)
     weight = abs(front.rotation[2, 0]) * mass_of(shapes, DENSITIES[material]) * GRAVITY
     density, resistance = _held_up(resistance, weight, 1.0, DENSITIES[material])
     return Part(
         name, parent, "prismatic", front.rotation[:, 0], front.at(0.0, 0.5 * width, 0.5 * height),
-        between(random, 0.55, 0.9) * depth, tuple(shapes), density, resistance,
+        uniform(random, 0.55, 0.9) * depth, tuple(shapes), density, resistance,
     )  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def sliding_panel(
     random: Random, front: Front, name: str, toward: float, material: str, *, parent: int = -1
 ) -> Part:
     """A panel before the front that slides along it, to the left (`toward` 1) or to the right."""
-    thickness = between(random, 0.012, 0.025)
+    thickness = uniform(random, 0.012, 0.025)
     width, height = front.width, front.height
     face = 2.0 * GAP + thickness
     raised = replace(front, origin=front.at(face, 0.0, 0.0))
@@ -173,20 +173,20 @@ def sliding_panel(
         front.box((2.0 * GAP, GAP, GAP), (face, width - GAP, height - GAP)),
         *handle(random, raised, place, 2),
     ]
-    resistance = Resistance(between(random, 2.0, 8.0), between(random, 2.0, 15.0))
+    resistance = Resistance(uniform(random, 2.0, 8.0), uniform(random, 2.0, 15.0))
     return Part(
         name, parent, "prismatic", toward * front.rotation[:, 1],
-        front.at(0.0, 0.5 * width, 0.5 * height), between(random, 0.6, 0.9) * width,
+        front.at(0.0, 0.5 * width, 0.5 * height), uniform(random, 0.6, 0.9) * width,
         tuple(shapes), DENSITIES[material], resistance,
     )  # fmt: skip
 
 
 def hatch(random: Random, front: Front, face: float, name: str, parent: int, material: str) -> Part:
     """A flap on a panel of the front, whose face is at `face`: a part that another carries."""
-    width = between(random, 0.35, 0.6) * front.width
-    height = between(random, 0.25, 0.45) * front.height
-    right = between(random, 0.15, 0.85) * (front.width - width)
-    low = between(random, 0.15, 0.6) * (front.height - height)
+    width = uniform(random, 0.35, 0.6) * front.width
+    height = uniform(random, 0.25, 0.45) * front.height
+    right = uniform(random, 0.15, 0.85) * (front.width - width)
+    low = uniform(random, 0.15, 0.6) * (front.height - height)
     place = front.part(right, low, width, height)
     raised = replace(place, origin=place.at(face, 0.0, 0.0))
     side: Side = "top" if chance(random, 0.5) else str(random.choice(["left", "right"]))  # type: ignore[assignment]

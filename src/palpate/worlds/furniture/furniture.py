@@ -16,7 +16,7 @@ import shapely
 from numpy.typing import ArrayLike
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.worlds.furniture.bodies import Bodies
 from palpate.worlds.furniture.pieces import (
     Piece,
@@ -287,7 +287,7 @@ class FurnitureWorld(World):
 
     def _refuse_overlaps(self, poses: np.ndarray) -> None:
         named = [
-            (name, shapely.Polygon(placed(outline, pose)))
+            (name, shapely.Polygon(place_points(outline, pose)))
             for (name, outline), pose in zip(self.outlines.items(), poses, strict=True)
         ]
         robot = self._robot

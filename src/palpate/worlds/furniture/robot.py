@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.worlds.furniture.bodies import Bodies
 from palpate.worlds.furniture.pieces import BAND, HANDLE_HEIGHT
 from palpate.worlds.furniture.scene import BODY_BIT, DRAWN, SOLID
@@ -326,7 +326,7 @@ class RobotInScene:
 
     def _distance(self, body: int) -> float:
         """From the gripper's surface to the outline of a body, m."""
-        outline = shapely.Polygon(placed(self._outlines[body], self._bodies.poses()[body]))
+        outline = shapely.Polygon(place_points(self._outlines[body], self._bodies.poses()[body]))
         gripper = shapely.Point(self.truth().gripper_pose[:2])
         return outline.distance(gripper) - GRIPPER_RADIUS
 

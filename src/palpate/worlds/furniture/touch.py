@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from shapely.ops import nearest_points
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.worlds.furniture.robot import GRIPPER_RADIUS, RobotObservation
 
 TOUCHING = 0.03  # m between surfaces that may touch
@@ -59,7 +59,7 @@ def _nearest(
 ) -> tuple[int | None, np.ndarray]:
     """The body nearest to `centre`, if nearer than `reach` and any wall, and where."""
     here = shapely.Point(centre)
-    shapes = [shapely.Polygon(placed(o, p)) for o, p in zip(outlines, poses, strict=True)]
+    shapes = [shapely.Polygon(place_points(o, p)) for o, p in zip(outlines, poses, strict=True)]
     distances = [shape.distance(here) for shape in shapes]
     body = int(np.argmin(distances))
     wall = min((shapely.Polygon(wall).distance(here) for wall in walls), default=np.inf)

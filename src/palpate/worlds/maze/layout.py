@@ -177,7 +177,7 @@ def _shifted(step: tuple[int, int], shape: tuple[int, ...]) -> tuple[tuple, tupl
     return tuple(here), tuple(there)
 
 
-def made_layout(
+def make_layout(
     name: str, *, entrance: float, left_gap: float, channel: float, right_gap: float, goal: float
 ) -> Layout:
     """The maze whose parts lie at these y, in m."""
@@ -215,11 +215,11 @@ def _barrier(x: float, half: float, gap: float, width: float) -> list[Wall]:
     return [Wall((x, (low + high) / 2), (half, (high - low) / 2)) for low, high in ends]
 
 
-def drawn_layout(seed: int, name: str = "") -> Layout:
+def draw_layout(seed: int, name: str = "") -> Layout:
     """A maze whose parts lie at random y, evenly within `MOST_OFFSET` of the middle."""
     places = np.random.default_rng(seed).uniform(-MOST_OFFSET, MOST_OFFSET, 5)
     entrance, left_gap, channel, right_gap, goal = (round(float(y), 3) for y in places)
-    return made_layout(
+    return make_layout(
         name or f"drawn-{seed}", entrance=entrance, left_gap=left_gap, channel=channel,
         right_gap=right_gap, goal=goal,
     )  # fmt: skip
@@ -230,7 +230,7 @@ UNSEEN = tuple(f"unseen-{number}" for number in range(1, 13))
 _MADE: dict[str, Layout] = {}
 
 
-def named_layout(name: str) -> Layout:
+def find_layout(name: str) -> Layout:
     """The maze of this name, always the same one; raises `PalpateError` that lists all there are.
 
     "home" is where policies are trained; the "unseen" are kept for testing.
@@ -239,10 +239,10 @@ def named_layout(name: str) -> Layout:
         raise PalpateError(f"unknown maze '{name}'; there are: {', '.join((*TRAINING, *UNSEEN))}")
     if name not in _MADE:
         _MADE[name] = (
-            made_layout(
+            make_layout(
                 "home", entrance=0.0, left_gap=0.06, channel=-0.04, right_gap=0.05, goal=0.0
             )
             if name == "home"
-            else drawn_layout(zlib.crc32(name.encode()), name)
+            else draw_layout(zlib.crc32(name.encode()), name)
         )
     return _MADE[name]

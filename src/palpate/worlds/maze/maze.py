@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.worlds.maze.layout import TIP_RADIUS, Layout, named_layout
+from palpate.worlds.maze.layout import TIP_RADIUS, Layout, find_layout
 from palpate.worlds.maze.rollout import STATE, MazeRollout, Springs
 from palpate.worlds.maze.scene import (
     BASE_MASS,
@@ -300,4 +300,4 @@ class BlindMaze(TipWorld):
 
 
 def _layout(given: str | Layout) -> Layout:
-    return given if isinstance(given, Layout) else named_layout(given)
+    return given if isinstance(given, Layout) else find_layout(given)

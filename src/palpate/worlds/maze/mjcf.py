@@ -17,7 +17,7 @@ from palpate.errors import PalpateError
 from palpate.worlds.maze.layout import SCATTER
 from palpate.worlds.maze.scene import TIME_STEP, TIP
 from palpate.worlds.maze.tip import TipObservation, TipWorld, not_negative
-from palpate.worlds.mjcf import compiled, read_mjcf
+from palpate.worlds.mjcf import compile_model, read_mjcf
 
 GOAL, START, SENSOR = "goal", "start", "palpate: net contact of the tip"
 # kg. What is lighter a damper of the law would make unstable; what is heavier it cannot move.
@@ -107,7 +107,7 @@ class MjcfWorld(TipWorld):
             objtype=mujoco.mjtObj.mjOBJ_XBODY, intprm=NET_FORCE,
         )  # fmt: skip
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        model = self._model = compiled(path, spec)
+        model = self._model = compile_model(path, spec)
         try:
             super().__init__(noise, control_period, model.opt.timestep)
         except PalpateError as error:

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.worlds.mjcf import compiled, read_mjcf
+from palpate.worlds.mjcf import compile_model, read_mjcf
 
 CABLE = "mujoco.elasticity.cable"
 EVEN = 0.01  # relative: by which the spacing of a cable's bodies may vary
@@ -27,7 +27,7 @@ def read_cable(path: str | Path) -> dict[str, Any]:
     body is a point at the tip. Raises `PalpateError` for a file that MuJoCo cannot read, and for a
     cable that is not one straight chain of equally long round bodies on ball joints.
     """
-    model = compiled(path, read_mjcf(path, CABLE))
+    model = compile_model(path, read_mjcf(path, CABLE))
     chain = np.flatnonzero(model.body_plugin >= 0)
     if len(chain) < 3 or len(set(model.body_plugin[chain])) > 1:
         count = len(set(model.body_plugin[chain]))

@@ -32,14 +32,14 @@ from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import (
-    centred,
-    checked_polygon,
-    checked_pose,
+    centre_polygon,
+    check_polygon,
+    check_pose,
     circumscribed_radius,
     corners_of,
-    listed,
-    placed,
-    shown,
+    list_names,
+    place_points,
+    quote,
 )
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose, Robot, map_of
 from palpate.runs.storage import read_json
@@ -61,10 +61,10 @@ _CENTRED = 1e-9  # m: a centroid nearer to the body's origin is there
 def read_described(path: str | Path) -> Map:
     """A map of our own format; raises `PalpateError` for a file that is none."""
     path = Path(path)
-    content = checked_keys(read_json(path), str(path), _MAP_KEYS)
+    content = check_keys(read_json(path), str(path), _MAP_KEYS)
     if content.get("format") != FORMAT:
         raise PalpateError(
-            f"{path} has the format {shown(content.get('format'))}: expected {FORMAT!r}"
+            f"{path} has the format {quote(content.get('format'))}: expected {FORMAT!r}"
         )
     for key in ("robot", "start", "bounds", "cell_size"):
         if key not in content:
@@ -72,15 +72,15 @@ def read_described(path: str | Path) -> Map:
     walls = list_of(content.get("walls", []), f"walls of {path}", "a list of outlines")
     name = content.get("name", path.stem)
     if not isinstance(name, str):
-        raise PalpateError(f"{path} has the name {shown(name)}: expected a text")
+        raise PalpateError(f"{path} has the name {quote(name)}: expected a text")
     solid = shapely.union_all([_wall(wall, f"wall {k}") for k, wall in enumerate(walls)])
     what = f"bounds of {path}"
     sides = list_of(content["bounds"], what, "[left, bottom, right, top] in m", lengths=(4,))
     bounds = tuple(number(side, what) for side in sides)
-    return described_map(name, str(path), content, solid, bounds, content["cell_size"])
+    return build_map(name, str(path), content, solid, bounds, content["cell_size"])
 
 
-def described_map(
+def build_map(
     name: str, what: str, content: Mapping[str, Any], walls: BaseGeometry, bounds: Any, cell: Any
 ) -> Map:
     """The map of these walls and bounds (m), with all else as `content` describes it.
@@ -114,7 +114,7 @@ def side_car(path: Path, known: set[str]) -> dict[str, Any]:
         return {}
     beside = found[0]
     content = read_json(beside) if beside.suffix == ".json" else read_yaml(beside)
-    return checked_keys(content, str(beside), known)
+    return check_keys(content, str(beside), known)
 
 
 def with_hints(world: Map, path: Path) -> Map:
@@ -130,11 +130,11 @@ def with_hints(world: Map, path: Path) -> Map:
         name = str(key)
         if name not in movables:
             raise PalpateError(
-                f"{what} has hints for {shown(name)}, which is not on the map; there are: "
-                + listed(world.movables)
+                f"{what} has hints for {quote(name)}, which is not on the map; there are: "
+                + list_names(world.movables)
             )
-        said = checked_keys(item, f"movable {shown(name)} in {what}", {"hints"})
-        hints = keys_of(said.get("hints") or {}, f"hints of {shown(name)} in {what}")
+        said = check_keys(item, f"movable {quote(name)} in {what}", {"hints"})
+        hints = keys_of(said.get("hints") or {}, f"hints of {quote(name)} in {what}")
         movables[name] = dataclasses.replace(movables[name], hints=hints)
     return dataclasses.replace(world, movables=movables)
 
@@ -159,7 +159,7 @@ def read_yaml(path: Path) -> Any:
                 raise PalpateError(f"{path} is nested more than {_DEEPEST} deep")
             if isinstance(event, AliasEvent):
                 raise PalpateError(
-                    f"{path} has the alias {shown(event.anchor)}: expected what it stands for"
+                    f"{path} has the alias {quote(event.anchor)}: expected what it stands for"
                 )
         return YAML(typ="safe", pure=True).load(content)
     except PalpateError:
@@ -184,13 +184,13 @@ def read_bytes(path: Path, most: int) -> bytes:
 # --- parts ------------------------------------------------------------------------------------
 
 
-def checked_keys(content: Any, what: str, known: set[str]) -> dict[str, Any]:
+def check_keys(content: Any, what: str, known: set[str]) -> dict[str, Any]:
     """A mapping with no other keys; raises `PalpateError` otherwise."""
     content = keys_of(content, what)
     unknown = sorted({str(key) for key in content} - known)
     if unknown:
         raise PalpateError(
-            f"{what} has the unknown key {shown(unknown[0])}; there are: "
+            f"{what} has the unknown key {quote(unknown[0])}; there are: "
             + ", ".join(sorted(known))
         )
     return content
@@ -200,25 +200,25 @@ def keys_of(content: Any, what: str, meant: str = "keys and values") -> dict[str
     """A mapping; raises `PalpateError` for anything else, with what is `meant`."""
     if not isinstance(content, Mapping):
         kind = type(content).__name__
-        raise PalpateError(f"{what}: expected {meant}, not {shown(content)} of type {kind}")
+        raise PalpateError(f"{what}: expected {meant}, not {quote(content)} of type {kind}")
     return dict(content)
 
 
 def list_of(value: Any, what: str, meant: str, lengths: tuple[int, ...] = ()) -> list[Any]:
     """A list, of one of the `lengths` if there are any; raises `PalpateError` for anything else."""
     if not isinstance(value, list) or (lengths and len(value) not in lengths):
-        raise PalpateError(f"{what}: expected {meant}, not {shown(value)}")
+        raise PalpateError(f"{what}: expected {meant}, not {quote(value)}")
     return value
 
 
 def robot_from(content: Any, what: str) -> Robot:
     """The robot that `content` describes; see the head of this file."""
-    item = checked_keys(content, f"robot of {what}", _ROBOT_KEYS)
+    item = check_keys(content, f"robot of {what}", _ROBOT_KEYS)
     if ("radius" in item) == ("footprint" in item):
         raise PalpateError(f"robot of {what}: expected either a radius or a footprint")
     outline = None
     if "footprint" in item:
-        outline = corners_of(checked_polygon(item["footprint"], f"the robot's footprint in {what}"))
+        outline = corners_of(check_polygon(item["footprint"], f"the robot's footprint in {what}"))
         radius = circumscribed_radius(outline)
     else:
         radius = number(item["radius"], f"the robot's radius in {what}")
@@ -232,14 +232,14 @@ def movables_from(content: Any, what: str) -> list[Movable]:
     movables = []
     for key, value in keys_of(content, f"movables of {what}", _OBJECTS).items():
         name = str(key)
-        called = f"movable {shown(name)} of {what}"
+        called = f"movable {quote(name)} of {what}"
         item: Any = value if isinstance(value, Mapping) else {"polygon": value}
-        item = checked_keys(item, called, {"polygon", "pose", "hints"})
+        item = check_keys(item, called, {"polygon", "pose", "hints"})
         if "polygon" not in item:
             raise PalpateError(f"{called} lacks its polygon: expected [[x, y], ...] in m")
         hints = keys_of(item.get("hints") or {}, f"hints of {called}")
         if "pose" in item:
-            pose = checked_pose(item["pose"], f"the pose of {called}")
+            pose = check_pose(item["pose"], f"the pose of {called}")
             movables.append(_at(name, item["polygon"], pose, hints, called))
         else:
             movables.append(Movable.from_corners(name, item["polygon"], hints))
@@ -248,11 +248,11 @@ def movables_from(content: Any, what: str) -> list[Movable]:
 
 def _at(name: str, corners: Any, pose: Pose, hints: dict[str, Any], what: str) -> Movable:
     """An object from corners in body coordinates, whose origin is put at `pose`."""
-    polygon = checked_polygon(corners, what)
-    outline, centroid = centred(polygon)
+    polygon = check_polygon(corners, what)
+    outline, centroid = centre_polygon(polygon)
     if np.linalg.norm(centroid) <= _CENTRED:  # the same numbers again
         return Movable(name, corners_of(polygon), pose, hints)
-    ((x, y),) = placed(np.array([centroid]), pose)
+    ((x, y),) = place_points(np.array([centroid]), pose)
     return Movable(name, outline, (float(x), float(y), pose[2]), hints)
 
 
@@ -263,7 +263,7 @@ def number(value: Any, what: str) -> float:
         with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
             found = float(value)
     if not math.isfinite(found):
-        raise PalpateError(f"{what} is {shown(value)}: expected a number")
+        raise PalpateError(f"{what} is {quote(value)}: expected a number")
     return found
 
 
@@ -273,13 +273,13 @@ def truth(value: Any, what: str) -> bool:
         return _TRUTHS[value.strip().lower()]
     if isinstance(value, bool | int) and value in (0, 1):
         return bool(value)
-    raise PalpateError(f"{what} is {shown(value)}: expected 0, 1, true or false")
+    raise PalpateError(f"{what} is {quote(value)}: expected 0, 1, true or false")
 
 
 def _wall(value: Any, what: str) -> BaseGeometry:
     item = value if isinstance(value, Mapping) else {"outline": value}
-    item = checked_keys(item, what, {"outline", "holes"})
-    outline = checked_polygon(item.get("outline", []), what)
+    item = check_keys(item, what, {"outline", "holes"})
+    outline = check_polygon(item.get("outline", []), what)
     holes = list_of(item.get("holes", []), f"holes of {what}", "a list of outlines")
-    every = [checked_polygon(hole, f"a hole of {what}") for hole in holes]
+    every = [check_polygon(hole, f"a hole of {what}") for hole in holes]
     return outline.difference(shapely.union_all(every)) if every else outline

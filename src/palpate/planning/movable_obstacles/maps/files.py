@@ -11,7 +11,7 @@ from palpate.planning.movable_obstacles.maps.description import (
 )
 from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.maps.namosim import read_namosim
-from palpate.planning.movable_obstacles.maps.ros import described, read_ros
+from palpate.planning.movable_obstacles.maps.ros import read_map_yaml, read_ros
 from palpate.planning.movable_obstacles.maps.svg import read_svg
 
 SUFFIXES = (".svg", ".yaml", ".yml", ".json")
@@ -32,7 +32,7 @@ def read_map(path: str | Path) -> Map:
     if suffix == ".svg":
         return with_hints(read_svg(path), path)
     if suffix in (".yaml", ".yml"):
-        return read_namosim(path) if "map_yaml" in described(path) else read_ros(path)
+        return read_namosim(path) if "map_yaml" in read_map_yaml(path) else read_ros(path)
     if suffix == ".json":
         return read_described(path)
     raise PalpateError(f"{path} has the suffix '{path.suffix}': expected {_expected()}")

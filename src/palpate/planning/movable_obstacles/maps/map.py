@@ -19,14 +19,14 @@ from shapely.geometry.base import BaseGeometry
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import (
     LARGEST,
-    centred,
-    checked_polygon,
-    checked_pose,
+    centre_polygon,
+    check_polygon,
+    check_pose,
     circumscribed_radius,
     edges_of,
-    listed,
-    placed,
-    shown,
+    list_names,
+    place_points,
+    quote,
 )
 
 Pose = tuple[float, float, float]
@@ -55,15 +55,15 @@ class Movable:
     ) -> "Movable":
         """From corners in the world; theta counts from how it stands there.
 
-        Raises `PalpateError` as `checked_polygon`.
+        Raises `PalpateError` as `check_polygon`.
         """
-        outline, (x, y) = centred(checked_polygon(corners, f"movable {shown(name)}"))
+        outline, (x, y) = centre_polygon(check_polygon(corners, f"movable {quote(name)}"))
         return Movable(name, outline, (x, y, 0.0), dict(hints or {}))
 
     @cached_property
     def polygon(self) -> Polygon:
         """Where it stands."""
-        return Polygon(placed(self.outline, self.pose))
+        return Polygon(place_points(self.outline, self.pose))
 
     @cached_property
     def radius(self) -> float:
@@ -96,7 +96,7 @@ class Robot:
             raise PalpateError(f"the robot's radius is {self.radius}: expected metres above 0")
         if self.drive not in DRIVES:
             raise PalpateError(
-                f"the robot's drive is {shown(self.drive)}: expected one of {', '.join(DRIVES)}"
+                f"the robot's drive is {quote(self.drive)}: expected one of {', '.join(DRIVES)}"
             )
         if self.reach is not None and not 0 <= self.reach < 1e3:
             raise PalpateError(f"the robot's reach is {self.reach}: expected metres, 0 or more")
@@ -127,7 +127,7 @@ class Map:
     def __post_init__(self) -> None:
         left, bottom, right, top = self.bounds
         width, height = right - left, top - bottom
-        here = f"map {shown(self.name)}"
+        here = f"map {quote(self.name)}"
         if not all(abs(side) <= LARGEST for side in self.bounds) or width <= 0 or height <= 0:
             raise PalpateError(
                 f"{here} has the bounds {self.bounds}: expected left, bottom, right, top in m, "
@@ -160,7 +160,7 @@ class Map:
             x_least, y_least, x_most, y_most = movable.polygon.bounds
             if x_most - x_least > width or y_most - y_least > height:
                 raise PalpateError(
-                    f"movable {shown(movable.name)} takes {x_most - x_least:.4g} m x "
+                    f"movable {quote(movable.name)} takes {x_most - x_least:.4g} m x "
                     f"{y_most - y_least:.4g} m where it stands, more than {here} of {width:.4g} m "
                     f"x {height:.4g} m has: expected one that fits, with its corners in m"
                 )
@@ -200,8 +200,8 @@ class Map:
         unknown = sorted(set(names) - set(self.movables))
         if unknown:
             raise PalpateError(
-                f"map {shown(self.name)} has no movable {shown(unknown[0])}; there are: "
-                + listed(self.movables)
+                f"map {quote(self.name)} has no movable {quote(unknown[0])}; there are: "
+                + list_names(self.movables)
             )
 
     @property
@@ -221,11 +221,11 @@ class Map:
         if goal is None:
             if not self.goals:
                 raise PalpateError(
-                    f"map {shown(self.name)} has no goal: give one as --goal x y theta, in m and "
+                    f"map {quote(self.name)} has no goal: give one as --goal x y theta, in m and "
                     "rad"
                 )
             goal = self.goals[0]
-        goal = checked_pose(goal, "the goal")
+        goal = check_pose(goal, "the goal")
         radius = self.robot.radius
         for place, pose in (("start", self.start), ("goal", goal)):
             x, y = pose[:2]
@@ -234,7 +234,7 @@ class Map:
             if inside < radius:
                 raise PalpateError(
                     f"the robot of radius {radius:.3g} m would not be inside map "
-                    f"{shown(self.name)} at its {place} ({x:.3g}, {y:.3g}): expected a place at "
+                    f"{quote(self.name)} at its {place} ({x:.3g}, {y:.3g}): expected a place at "
                     f"least that far inside x {left:.3g} to {right:.3g}, y {bottom:.3g} to "
                     f"{top:.3g}"
                 )
@@ -248,7 +248,7 @@ class Map:
             gap = movable.polygon.distance(shapely.Point(*self.start[:2]))
             if gap < radius - 1e-9:
                 raise PalpateError(
-                    f"the robot of radius {radius:.3g} m collides with {shown(movable.name)} "
+                    f"the robot of radius {radius:.3g} m collides with {quote(movable.name)} "
                     f"at its start ({gap:.3g} m from its centre): expected a free start"
                 )
         return goal
@@ -280,7 +280,7 @@ def map_of(
     for movable in movables:
         if movable.name in named:
             raise PalpateError(
-                f"map {shown(name)} has two movables named {shown(movable.name)}: expected names "
+                f"map {quote(name)} has two movables named {quote(movable.name)}: expected names "
                 "that differ"
             )
         named[movable.name] = movable
@@ -289,8 +289,8 @@ def map_of(
         walls,
         named,
         robot,
-        checked_pose(start, "the robot's start"),
-        tuple(checked_pose(goal, "a goal") for goal in goals),
+        check_pose(start, "the robot's start"),
+        tuple(check_pose(goal, "a goal") for goal in goals),
         bounds,
         cell_size,
         cell_size if margin is None else margin,

@@ -13,7 +13,7 @@ from typing import Any
 import shapely
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import checked_pose, circumscribed_radius, shown
+from palpate.numerics.polygons import check_pose, circumscribed_radius, quote
 from palpate.planning.movable_obstacles.maps.description import (
     keys_of,
     list_of,
@@ -22,14 +22,14 @@ from palpate.planning.movable_obstacles.maps.description import (
     with_hints,
 )
 from palpate.planning.movable_obstacles.maps.map import Map, Pose, Robot, map_of
-from palpate.planning.movable_obstacles.maps.ros import described, read_grid
+from palpate.planning.movable_obstacles.maps.ros import read_grid, read_map_yaml
 from palpate.planning.movable_obstacles.maps.svg import (
     Drawing,
-    drawn_robot,
-    drawn_walls,
     goals_of,
     movables_of,
     read_drawing,
+    read_robot,
+    read_walls,
 )
 
 
@@ -40,9 +40,9 @@ def read_namosim(path: str | Path) -> Map:
     and the drawing do.
     """
     path = Path(path)
-    content = described(path)
+    content = read_map_yaml(path)
     grid = path.parent / str(content["map_yaml"])
-    walls, bounds, resolution = read_grid(grid, described(grid))
+    walls, bounds, resolution = read_grid(grid, read_map_yaml(grid))
     drawing = None
     if content.get("svg_file") is not None:
         corner = bounds[0], bounds[3]
@@ -54,7 +54,7 @@ def read_namosim(path: str | Path) -> Map:
     besides = [shapely.Point(pose[:2]).buffer(other.radius) for other, pose in others]
     world = map_of(
         grid.stem,
-        walls=shapely.union_all([walls, *besides, *(drawn_walls(drawing) if drawing else [])]),
+        walls=shapely.union_all([walls, *besides, *(read_walls(drawing) if drawing else [])]),
         movables=movables_of(drawing) if drawing else [],
         robot=robot,
         start=start,
@@ -93,10 +93,10 @@ def _agent(content: Any, drawing: Drawing | None, what: str) -> tuple[Robot, Pos
     )
     pose = agent.get("initial_pose")
     if pose is None:
-        drawn = None if drawing is None else drawn_robot(drawing, str(agent["id"]))
+        drawn = None if drawing is None else read_robot(drawing, str(agent["id"]))
         if drawn is None:
             raise PalpateError(
-                f"{what} has the agent {shown(agent['id'])} without an initial_pose: expected "
+                f"{what} has the agent {quote(agent['id'])} without an initial_pose: expected "
                 "one, or in the drawing's robots_layer a path with its agent_id"
             )
         outline, place = drawn
@@ -105,4 +105,4 @@ def _agent(content: Any, drawing: Drawing | None, what: str) -> tuple[Robot, Pos
     pose = list_of(pose, called, "[x, y, angle] in m and degrees", lengths=(2, 3))
     x, y, *degrees = (number(value, called) for value in pose)
     theta = math.radians(degrees[0]) if degrees else 0.0
-    return robot, checked_pose((x, y, theta), called)
+    return robot, check_pose((x, y, theta), called)

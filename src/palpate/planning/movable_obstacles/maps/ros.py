@@ -15,10 +15,10 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from palpate.errors import PalpateError
-from palpate.numerics.polygons import shown
+from palpate.numerics.polygons import quote
 from palpate.planning.movable_obstacles.maps.description import (
     GRID_KEYS,
-    described_map,
+    build_map,
     keys_of,
     list_of,
     number,
@@ -43,7 +43,7 @@ def read_ros(path: str | Path) -> Map:
     nothing says the robot of.
     """
     path = Path(path)
-    content = described(path)
+    content = read_map_yaml(path)
     walls, bounds, resolution = read_grid(path, content)
     beside = side_car(path, GRID_KEYS)
     for key in ("robot", "start"):
@@ -54,10 +54,10 @@ def read_ros(path: str | Path) -> Map:
             )
     if beside.get("margin", 0) is None:  # as if it were left out
         del beside["margin"]
-    return described_map(path.stem, str(path), beside, walls, bounds, resolution)
+    return build_map(path.stem, str(path), beside, walls, bounds, resolution)
 
 
-def described(path: Path) -> dict[str, Any]:
+def read_map_yaml(path: Path) -> dict[str, Any]:
     """The keys and values of a YAML; raises `PalpateError` for a file that holds none."""
     return keys_of(read_yaml(path), f"{path} is no map")
 
@@ -82,7 +82,7 @@ def read_grid(path: Path, content: dict[str, Any]) -> tuple[BaseGeometry, Bounds
         )
     mode = content.get("mode", "trinary")
     if mode not in MODES:
-        raise PalpateError(f"{path} has the mode {shown(mode)}: expected one of {', '.join(MODES)}")
+        raise PalpateError(f"{path} has the mode {quote(mode)}: expected one of {', '.join(MODES)}")
     negate = truth(content.get("negate", 0), f"negate of {path}")
     occupied, free = (
         number(content.get(key, default), f"{key} of {path}")

@@ -22,15 +22,15 @@ from shapely.geometry.base import BaseGeometry
 from palpate.errors import PalpateError
 from palpate.numerics.polygons import (
     LEAST_AREA,
-    centred,
-    checked_polygon,
+    centre_polygon,
+    check_polygon,
     circumscribed_radius,
-    shown,
+    quote,
 )
 from palpate.planning.movable_obstacles.maps.description import read_bytes, truth
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose, Robot, map_of
 from palpate.planning.movable_obstacles.maps.svg_paths import (
-    joined,
+    compose,
     path_outlines,
     transform_matrix,
 )
@@ -89,7 +89,7 @@ class Drawing:
         own = [path for path in self.paths if path.attributes.get("id") == identifier]
         inside = [path for path in self.paths if identifier in path.groups]
         shapes = own or [path for path in inside if path.type == "shape"] or inside[:1]
-        named = f"{what} {shown(identifier)}"
+        named = f"{what} {quote(identifier)}"
         if not shapes:
             raise PalpateError(
                 f"the drawing has no {named}, which its namo_config names: expected a path, or a "
@@ -170,7 +170,7 @@ def read_svg(path: str | Path) -> Map:
         raise PalpateError(f"{path} has no agent in its namo_config: expected one, with its goals")
     agent = agents[0]
     shape, heading = drawing.shape_of(agent.get("agent_id"), "agent")
-    outline, (x, y) = centred(checked_polygon(shape.points, f"agent {shown(shape.name)}"))
+    outline, (x, y) = centre_polygon(check_polygon(shape.points, f"agent {quote(shape.name)}"))
     parameters = [element for element in agent.iter() if _local(element.tag) == "parameters"]
     said = parameters[0].attrib if parameters else {}
     goals = []
@@ -179,10 +179,10 @@ def read_svg(path: str | Path) -> Map:
             found, angle = drawing.shape_of(element.get("goal_id"), "goal")
             goals.append((*_middle(found), angle))
     others = [drawing.shape_of(other.get("agent_id"), "agent")[0] for other in agents[1:]]
-    standing = [checked_polygon(one.points, f"agent {shown(one.name)}") for one in others]
+    standing = [check_polygon(one.points, f"agent {quote(one.name)}") for one in others]
     return map_of(
         path.stem,
-        walls=shapely.union_all([*drawn_walls(drawing), *standing]),
+        walls=shapely.union_all([*read_walls(drawing), *standing]),
         movables=movables_of(drawing),
         robot=Robot(
             circumscribed_radius(outline),
@@ -199,7 +199,7 @@ def read_svg(path: str | Path) -> Map:
     )
 
 
-def drawn_walls(drawing: Drawing) -> list[BaseGeometry]:
+def read_walls(drawing: Drawing) -> list[BaseGeometry]:
     """What each path of type wall covers."""
     return [_wall(drawn) for drawn in drawing.paths if drawn.type == "wall"]
 
@@ -220,22 +220,24 @@ def goals_of(drawing: Drawing, agent: str) -> list[tuple[float, float, float]]:
     return goals
 
 
-def drawn_robot(drawing: Drawing, agent: str) -> tuple[np.ndarray, Pose] | None:
+def read_robot(drawing: Drawing, agent: str) -> tuple[np.ndarray, Pose] | None:
     """Outline about its middle, and pose, of the path in the layer of robots with that `agent_id`.
 
     None where there is no such path.
     """
     for drawn in drawing.paths:
         if "robots_layer" in drawn.groups and drawn.attributes.get("agent_id") == agent:
-            outline, middle = centred(checked_polygon(drawn.points, f"robot {shown(drawn.name)}"))
+            outline, middle = centre_polygon(
+                check_polygon(drawn.points, f"robot {quote(drawn.name)}")
+            )
             return outline, (*middle, _angle(drawn))
     return None
 
 
 def _wall(drawn: _Drawn) -> BaseGeometry:
     """Of one path. An outline within another is a hole (even-odd), whatever its direction."""
-    what = f"wall {shown(drawn.name)}"
-    pieces = np.array([checked_polygon(points, what) for points in drawn.outlines], object)
+    what = f"wall {quote(drawn.name)}"
+    pieces = np.array([check_polygon(points, what) for points in drawn.outlines], object)
     if len(pieces) == 1:
         return pieces[0]
     # where two overlap and neither is within the other, even-odd would drive through the wall
@@ -256,7 +258,7 @@ def _wall(drawn: _Drawn) -> BaseGeometry:
 
 
 def _middle(drawn: _Drawn) -> tuple[float, float]:
-    return centred(checked_polygon(drawn.points, f"goal {shown(drawn.name)}"))[1]
+    return centre_polygon(check_polygon(drawn.points, f"goal {quote(drawn.name)}"))[1]
 
 
 def _direction(drawn: _Drawn) -> float:
@@ -296,7 +298,7 @@ def read_drawing(path: Path, scale: float, corner: tuple[float, float] | None = 
     except (ParseError, ValueError, LookupError) as error:
         raise PalpateError(f"{path} is no XML: {error}") from error
     if _local(root.tag) != "svg":
-        raise PalpateError(f"{path} has the root {shown(_local(root.tag))}: expected <svg>")
+        raise PalpateError(f"{path} has the root {quote(_local(root.tag))}: expected <svg>")
     view = root.get("viewBox")
     if view is None:
         raise PalpateError(f"{path} has no viewBox, which gives its size in cm")
@@ -309,7 +311,7 @@ def read_drawing(path: Path, scale: float, corner: tuple[float, float] | None = 
         [[scale, 0, left - scale * box[0]], [0, -scale, top + scale * box[1]], [0, 0, 1.0]]
     )
     drawing = Drawing((width, height))
-    matrix = joined(to_metres, np.eye(3), f"the viewBox of {path}")
+    matrix = compose(to_metres, np.eye(3), f"the viewBox of {path}")
     _walk(root, matrix, (), drawing, _Meant.within(root), str(path))
     return drawing
 
@@ -328,17 +330,17 @@ def _walk(
     for child in element:
         tag = _local(child.tag)
         name = child.get("id", "")
-        called = f"{tag} {shown(name)} of {what}"
+        called = f"{tag} {quote(name)} of {what}"
         here = matrix
         if child.get("transform") and tag in ("g", "path"):
-            here = joined(matrix, transform_matrix(child.get("transform"), called), called)
+            here = compose(matrix, transform_matrix(child.get("transform"), called), called)
         if tag == "namo_config":
             drawing.config = child
         elif tag == "path":
             kind = child.get("type") or layer
             if kind and kind not in _TYPES:
                 raise PalpateError(
-                    f"{called} has the type {shown(kind)}: expected wall, movable, shape or "
+                    f"{called} has the type {quote(kind)}: expected wall, movable, shape or "
                     "orientation, or none"
                 )
             if child.get("d"):
@@ -367,5 +369,5 @@ def _number(text: str | None, what: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise PalpateError(f"{what} is {shown(text)}: expected a number")
+        raise PalpateError(f"{what} is {quote(text)}: expected a number")
     return value

@@ -171,11 +171,11 @@ def transform_matrix(text: str, what: str) -> np.ndarray:
             step = _step(name, numbers)
         except (ValueError, IndexError) as error:
             raise PalpateError(f"{what} has the transform {name}({inside[:30]})") from error
-        matrix = joined(matrix, step, what)
+        matrix = compose(matrix, step, what)
     return matrix
 
 
-def joined(outer: np.ndarray, inner: np.ndarray, what: str) -> np.ndarray:
+def compose(outer: np.ndarray, inner: np.ndarray, what: str) -> np.ndarray:
     """The product of two matrices (3, 3), the second applied first.
 
     Raises `PalpateError` where it is not finite or much too large for any drawing.

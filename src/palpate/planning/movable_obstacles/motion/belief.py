@@ -23,9 +23,9 @@ from jaxtyping import Array, Float
 from scipy.special import logsumexp
 
 from palpate.models.planar import Planar, PlanarState, furniture
-from palpate.models.planar.shapes import centred, even_gyration, rectangle
+from palpate.models.planar.shapes import centre_outline, even_gyration, rectangle
 from palpate.models.planar.system import GRAVITY
-from palpate.models.planar.wheels import turned_wheel
+from palpate.models.planar.wheels import wheel_at_angle
 from palpate.parameters import LogNormal, Normal, Prior
 from palpate.planning.movable_obstacles.motion.constrained import Drawn
 from palpate.planning.movable_obstacles.motion.primitives import Constraint, Kind
@@ -86,7 +86,7 @@ class ObjectBelief:
     """Hypotheses about one object, by its outline (points, 2) in m in the body frame."""
 
     def __init__(self, outline: np.ndarray, seed: int) -> None:
-        corners, _ = centred(outline)
+        corners, _ = centre_outline(outline)
         self.half_extent = 0.5 * np.ptp(corners, axis=0)
         self._gyration = even_gyration([corners])
         self._random = np.random.default_rng([seed, 23])
@@ -291,7 +291,7 @@ def _model(
     }
     wheel, bolted, along, across = structure
     weak, strong = value["weak"], value["strong"]
-    turned = turned_wheel(
+    turned = wheel_at_angle(
         value["wheel_direction"],
         jnp.where(along > 0, strong, weak),
         jnp.where(across > 0, strong, weak),

@@ -36,7 +36,7 @@ def arm_jacobian(joint_angles: np.ndarray, links: Sequence[float]) -> np.ndarray
     return np.stack([-levers[:, 1], levers[:, 0], np.ones(len(levers))])
 
 
-def moved_with(velocity: np.ndarray, pose: np.ndarray, point: np.ndarray) -> np.ndarray:
+def velocity_at(velocity: np.ndarray, pose: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Velocity (3,) of what is fixed at `point` (2,) of a body that moves with `velocity` (3,).
 
     All in world axes, m/s and rad/s; `pose` (3,) is of the body frame that `velocity` is of.

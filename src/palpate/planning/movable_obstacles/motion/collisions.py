@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from palpate.numerics.polygons import placed, polygons
+from palpate.numerics.polygons import place_points, polygons
 from palpate.planning.movable_obstacles.maps.occupancy import Space
 
 TOUCHING = 1e-3  # m: what is nearer at the start touches, and may slide along
@@ -52,7 +52,7 @@ class Clearance:
     def hits(self, object_poses: np.ndarray, robot_poses: np.ndarray) -> np.ndarray:
         """(steps,): which of the poses (steps, 3) of object and robot are not possible."""
         world, count = self.space.map, len(robot_poses)
-        corners = placed(self.space.movables[self.name].outline, object_poses)
+        corners = place_points(self.space.movables[self.name].outline, object_poses)
         left, bottom, right, top = world.bounds
         lowest, highest = np.array([left, bottom]), np.array([right, top])
         places, radius = robot_poses[:, :2], world.robot.radius

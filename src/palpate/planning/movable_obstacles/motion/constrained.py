@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.numerics.polygons import placed, turned
+from palpate.numerics.polygons import place_points, rotate
 from palpate.planning.movable_obstacles.maps.map import Movable
 from palpate.planning.movable_obstacles.motion.manipulation import (
     BACKWARD,
@@ -24,7 +24,7 @@ from palpate.planning.movable_obstacles.motion.manipulation import (
     Motion,
     Primitive,
     base_poses,
-    carried,
+    carry,
     outline_grasps,
 )
 from palpate.planning.movable_obstacles.motion.primitives import (
@@ -104,17 +104,17 @@ class ConstrainedManipulation(ManipulationModel):
         if isinstance(primitive, Turn):
             x, y = primitive.anchor
             wanted = primitive.turn * np.array([y, -x, 1.0])
-            hand = placed(np.array([primitive.anchor]), object_pose)[0] - robot_pose[:2]
+            hand = place_points(np.array([primitive.anchor]), object_pose)[0] - robot_pose[:2]
             lever = float(np.hypot(*hand))
         else:
             step = base_poses(robot_pose, primitive, np.ones(1))[0] - robot_pose
-            wanted, lever = np.array([*turned(step[:2], -object_pose[2]), step[2]]), 0.0
+            wanted, lever = np.array([*rotate(step[:2], -object_pose[2]), step[2]]), 0.0
         rate = twist(constraint, wanted, lever, YIELDING)
         if constraint.force > self.force:
             rate = np.zeros(3)
         objects = swept(object_pose, rate, lengths)
         # The robot keeps its place by the object, as the object keeps its place in the hand.
-        robots = carried(robot_pose, object_pose, objects)
+        robots = carry(robot_pose, object_pose, objects)
         return Motion(objects, robots, constraint.force * _way(objects, object_pose))
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.numerics.polygons import placed, turned
+from palpate.numerics.polygons import place_points, rotate
 from palpate.planning.movable_obstacles.maps.map import Movable, Pose
 
 _SHORTEST_FACE = 0.5  # of the least distance between grasps
@@ -28,7 +28,10 @@ class Grasp:
 
     def robot_pose(self, pose: Pose | np.ndarray, standoff: float) -> np.ndarray:
         """The base's pose (3,) when the object is at `pose`; `standoff` from its centre, m."""
-        (x, y), angle = placed(np.array([self.point]), np.asarray(pose))[0], self.normal + pose[2]
+        (x, y), angle = (
+            place_points(np.array([self.point]), np.asarray(pose))[0],
+            self.normal + pose[2],
+        )
         cos, sin = math.cos(angle), math.sin(angle)
         return np.array([x + standoff * cos, y + standoff * sin, math.atan2(-sin, -cos)])
 
@@ -115,20 +118,20 @@ class RigidCarry(ManipulationModel):
         draw: int,
     ) -> Motion:
         robot = base_poses(robot_pose, primitive, lengths)
-        return Motion(carried(object_pose, robot_pose, robot), robot, np.zeros(len(lengths)))
+        return Motion(carry(object_pose, robot_pose, robot), robot, np.zeros(len(lengths)))
 
 
 def base_poses(pose: np.ndarray, primitive: Primitive, lengths: np.ndarray) -> np.ndarray:
     """Poses (steps, 3) of a base that starts at `pose` (3,) and follows a primitive."""
-    step = [*turned((primitive.forward, primitive.left), pose[2]), primitive.turn]
+    step = [*rotate((primitive.forward, primitive.left), pose[2]), primitive.turn]
     return pose + lengths[:, None] * np.array(step)
 
 
-def carried(object_pose: np.ndarray, robot_pose: np.ndarray, robot_poses: np.ndarray) -> np.ndarray:
+def carry(object_pose: np.ndarray, robot_pose: np.ndarray, robot_poses: np.ndarray) -> np.ndarray:
     """The object's poses (steps, 3) if it keeps its place (3,) relative to the robot's (3,)."""
-    relative = turned(object_pose[:2] - robot_pose[:2], -robot_pose[2])[None]
+    relative = rotate(object_pose[:2] - robot_pose[:2], -robot_pose[2])[None]
     angles = object_pose[2] + robot_poses[:, 2:] - robot_pose[2]
-    return np.concatenate([placed(relative, robot_poses)[:, 0], angles], axis=1)
+    return np.concatenate([place_points(relative, robot_poses)[:, 0], angles], axis=1)
 
 
 def outline_grasps(outline: np.ndarray, spacing: float) -> tuple[Grasp, ...]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.planning.movable_obstacles.maps.map import as_pose
 from palpate.planning.movable_obstacles.maps.occupancy import Space, Window
 from palpate.planning.movable_obstacles.motion.collisions import Clearance
@@ -271,7 +271,7 @@ class OpeningSearch:
         if not primitive.turn:
             count = math.ceil(self._farthest / self._step)
             return self._step * np.arange(1, count + 1), CARRYING
-        corners = placed(self.movable.outline, pose)
+        corners = place_points(self.movable.outline, pose)
         step = self._step / np.linalg.norm(corners - robot[:2], axis=1).max()
         lengths = step * np.arange(1, math.ceil(math.pi / step) + 1)
         return lengths, TURNING * float(np.linalg.norm(pose[:2] - robot[:2]))

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 
-from palpate.numerics.polygons import placed, polygons
+from palpate.numerics.polygons import place_points, polygons
 from palpate.planning.movable_obstacles.maps.occupancy import Footprint, Space, Window
 from palpate.planning.movable_obstacles.motion.manipulation import Motion
 from palpate.planning.movable_obstacles.search.paths import distances
@@ -91,7 +91,7 @@ class Passage:
         x, y = self._towards
         blocked = self._footprint.at(poses, np.array([x]), np.array([y]))[:, 0, 0]
         if self._keep_out is not None:
-            bodies = polygons(placed(self._movable.outline, poses))
+            bodies = polygons(place_points(self._movable.outline, poses))
             blocked |= shapely.intersects(bodies, self._keep_out)
         looks, poses = looks[~blocked], poses[~blocked]
         if not len(looks):

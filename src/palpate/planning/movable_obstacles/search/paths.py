@@ -67,7 +67,7 @@ class Distances:
         middles = self.space.centres(rows + self.window[0].start, columns + self.window[1].start)
         points = np.vstack([self.source, middles, np.asarray(point, float)[:2]])
         allowed = allowed_at(self.space, point, nearby)
-        return straightened(self.space, points, self._allowed, allowed)
+        return straighten(self.space, points, self._allowed, allowed)
 
     def _link(self, point: np.ndarray, nearby: dict[str, float]) -> tuple[int, float] | None:
         allowed = allowed_at(self.space, point, nearby)
@@ -212,7 +212,7 @@ def clear(space: Space, ways: np.ndarray, allowed: Allowed = _NOTHING) -> np.nda
     return good
 
 
-def straightened(space: Space, points: np.ndarray, first: Allowed, last: Allowed) -> np.ndarray:
+def straighten(space: Space, points: np.ndarray, first: Allowed, last: Allowed) -> np.ndarray:
     """A shorter way (points, 2) with the same ends: from each point to the farthest one in sight.
 
     `first` and `last` are the exceptions at its two ends. Done twice, the second time between

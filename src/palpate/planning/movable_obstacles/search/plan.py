@@ -191,6 +191,6 @@ def _poses(value: Any) -> np.ndarray:
     return poses
 
 
-def timed() -> float:
+def planning_clock() -> float:
     """The clock that planning times are taken with, s."""
     return time.perf_counter()

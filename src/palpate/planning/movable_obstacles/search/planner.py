@@ -20,15 +20,15 @@ from palpate.planning.movable_obstacles.maps.occupancy import Space, Window
 from palpate.planning.movable_obstacles.motion.manipulation import ManipulationModel, RigidCarry
 from palpate.planning.movable_obstacles.search.judgement import open_way
 from palpate.planning.movable_obstacles.search.openings import OpeningSearch
-from palpate.planning.movable_obstacles.search.plan import TRANSIT, Plan, timed
+from palpate.planning.movable_obstacles.search.plan import TRANSIT, Plan, planning_clock
 from palpate.planning.movable_obstacles.search.policy import NoWayError, PolicyGraph, WalledError
 from palpate.planning.movable_obstacles.search.regrasps import stops_of
 from palpate.planning.movable_obstacles.search.situation import (
     Progress,
     at_hand,
     beside,
-    carried_out,
-    driven_to,
+    carry_out,
+    drive_to,
     whole,
 )
 from palpate.planning.movable_obstacles.search.transfers import Move, Opening
@@ -69,7 +69,7 @@ class Planner:
         Raises `NoWayError` when none was found, and `PalpateError` when start or goal are
         impossible.
         """
-        began = timed()
+        began = planning_clock()
         goal = world.check(goal)
         fixed = set(immovable)
         world.check_names(fixed)
@@ -77,13 +77,13 @@ class Planner:
             self._known.clear()
         self._sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
         done = self._found(world, goal, fixed, _HALVINGS)
-        return Plan(world.name, goal, tuple(done.segments), timed() - began, self._sizes)
+        return Plan(world.name, goal, tuple(done.segments), planning_clock() - began, self._sizes)
 
     # --- above --------------------------------------------------------------------------------
 
     def _found(self, world: Map, goal: Pose, fixed: set[str], halvings: int) -> Progress:
         """The situation at the goal; raises `NoWayError`."""
-        self._world = unmoved(world)
+        self._world = static_map(world)
         begin = Progress(Space(world, fixed), np.array(world.start))
         try:
             return self._planned(begin, goal, regrasps=False)
@@ -153,7 +153,7 @@ class Planner:
                     farthest = ahead
             if failed or (changed and not graph.within_tolerance(moves)):
                 continue
-            final = driven_to(ahead, goal)
+            final = drive_to(ahead, goal)
             if final is not None:
                 return final
             if not moves:
@@ -170,7 +170,7 @@ class Planner:
         """
         opening = self._open(ahead, move)
         if opening is not None:
-            return carried_out(ahead, opening)
+            return carry_out(ahead, opening)
         if depth == 0:
             return None
         others = set(ahead.space.movables) - {move.name}
@@ -204,16 +204,16 @@ class Planner:
                 return None
             ahead = resolved
         opening = self._open(ahead, move)
-        return None if opening is None else carried_out(ahead, opening)
+        return None if opening is None else carry_out(ahead, opening)
 
     def _regrasped(self, ahead: Progress, move: Move) -> Progress | None:
         """The move in two carries of the same object, the cheaper the better."""
         found = []
         for stop in self._stops(ahead, move):
-            halfway = carried_out(ahead, stop)
+            halfway = carry_out(ahead, stop)
             opening = self._open(halfway, move)
             if opening is not None:
-                found.append(carried_out(halfway, opening))
+                found.append(carry_out(halfway, opening))
         return min(found, key=lambda one: np.divide(*_spent(ahead, one)), default=None)
 
     def _stops(self, ahead: Progress, move: Move) -> list[Opening]:
@@ -283,7 +283,7 @@ def window_of(space: Space, robot: np.ndarray, move: Move) -> Window:
     return space.window_of(left, bottom, right, top)
 
 
-def unmoved(world: Map) -> Hashable:
+def static_map(world: Map) -> Hashable:
     """All of a map that stays as it is while objects are moved."""
     robot = world.robot
     outlines = tuple((name, one.outline.tobytes()) for name, one in world.movables.items())

@@ -46,10 +46,10 @@ def beside(now: Progress) -> dict[str, float]:
     return {} if last is None else {last: world.robot.radius + world.reach}
 
 
-def carried_out(ahead: Progress, opening: Opening) -> Progress:
+def carry_out(ahead: Progress, opening: Opening) -> Progress:
     """The situation after an opening."""
     poses, bodies = opening.robot_poses, opening.object_poses
-    way = headed(opening.way, ahead.robot[2], poses[0, 2])
+    way = with_headings(opening.way, ahead.robot[2], poses[0, 2])
     transit = Segment(TRANSIT, way, opening.approach)
     transfer = Segment(
         TRANSFER,
@@ -66,7 +66,7 @@ def carried_out(ahead: Progress, opening: Opening) -> Progress:
     return Progress(space, poses[-1], [*ahead.segments, transit, transfer])
 
 
-def driven_to(ahead: Progress, goal: Pose) -> Progress | None:
+def drive_to(ahead: Progress, goal: Pose) -> Progress | None:
     """The last stretch; None if the goal cannot be got to."""
     point = np.array(goal[:2])
     space = ahead.space
@@ -74,12 +74,12 @@ def driven_to(ahead: Progress, goal: Pose) -> Progress | None:
     way = reached.path_to(point)
     if way is None:
         return None
-    poses = headed(way, float(ahead.robot[2]), goal[2])
+    poses = with_headings(way, float(ahead.robot[2]), goal[2])
     segment = Segment(TRANSIT, poses, length_of(way))
     return Progress(space, np.array(goal), [*ahead.segments, segment])
 
 
-def headed(way: np.ndarray, first: float, last: float) -> np.ndarray:
+def with_headings(way: np.ndarray, first: float, last: float) -> np.ndarray:
     """Poses (2 points, 3) along a way (points, 2): turned before each straight and at the end."""
     poses = [(way[0, 0], way[0, 1], first)]
     for here, there in pairwise(way):

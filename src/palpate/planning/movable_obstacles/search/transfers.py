@@ -7,7 +7,7 @@ import shapely
 from shapely.geometry import LineString
 from shapely.geometry.base import BaseGeometry
 
-from palpate.numerics.polygons import placed
+from palpate.numerics.polygons import place_points
 from palpate.planning.movable_obstacles.maps.map import Movable
 from palpate.planning.movable_obstacles.motion.manipulation import Grasp, Primitive
 
@@ -67,7 +67,7 @@ class Opening:
 
     def room(self, movable: Movable, radius: float, margin: float) -> BaseGeometry:
         """What robot and object pass over, and the margin (m) around it."""
-        bodies = np.concatenate([placed(movable.outline, p.object_poses) for p in self.parts])
+        bodies = np.concatenate([place_points(movable.outline, p.object_poses) for p in self.parts])
         pairs = np.concatenate([bodies[:-1], bodies[1:]], axis=1)
         driven = np.concatenate([self.way, *(part.robot_poses[:, :2] for part in self.parts)])
         way = LineString(driven).buffer(radius + margin)

@@ -14,7 +14,7 @@ from shapely import affinity
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from palpate.numerics.polygons import placed, polygons
+from palpate.numerics.polygons import place_points, polygons
 from palpate.planning.movable_obstacles.maps.map import Map
 from palpate.planning.movable_obstacles.search.plan import TRANSFER, TRANSIT, Plan, Segment
 
@@ -159,7 +159,7 @@ def _nearest(outline: np.ndarray, poses: np.ndarray, shape: BaseGeometry) -> flo
     """The least distance to `shape` on the way through poses (steps, 3), from many in between."""
     shares = np.arange(_BETWEEN)[:, None] / _BETWEEN
     between = (poses[:-1, None] + shares * (poses[1:] - poses[:-1])[:, None]).reshape(-1, 3)
-    bodies = polygons(placed(outline, np.vstack([between, poses[-1:]])))
+    bodies = polygons(place_points(outline, np.vstack([between, poses[-1:]])))
     return float(shapely.distance(bodies, shape).min())
 
 

@@ -12,8 +12,8 @@ from shapely.geometry import Polygon
 
 from namo_grids import CORNERS, OWN, room, ros_map
 from namo_rooms import IN_DOOR, two_rooms, write_map
-from palpate.errors import PalpateError
-from palpate.numerics.polygons import check_polygon, check_pose, quote
+from palpate.errors import PalpateError, quote
+from palpate.numerics.polygons import check_polygon, check_pose
 from palpate.planning.movable_obstacles.maps.files import maps_in, read_map
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Robot
 
@@ -241,7 +241,7 @@ def test_sizes_that_are_none_are_refused(changes, says):
 
 def test_only_what_is_there_can_be_moved():
     world = two_rooms({"a": IN_DOOR})
-    with pytest.raises(PalpateError, match="no movable 'b'; there are: a"):
+    with pytest.raises(PalpateError, match="no movable 'b'; there are: 'a'"):
         world.moved({"b": (1.0, 1.0, 0.0)})
     moved = world.moved({"a": (1.0, 1.0, 0.5)}, start=(2.0, 2.0, 0.0))
     assert moved.movables["a"].pose == (1.0, 1.0, 0.5)

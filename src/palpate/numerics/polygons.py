@@ -5,8 +5,7 @@ and theta in radians; an outline in body coordinates has its centroid at the ori
 """
 
 import math
-import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -14,29 +13,11 @@ from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.validation import explain_validity
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, quote
 
 MOST_POINTS = 20_000  # of one outline: a drawing has hundreds
 LARGEST = 1e5  # m: what lies farther out is a broken file, not a room
 LEAST_AREA = 1e-6  # m2: less is a slip of the pen, not a body
-
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 60
-
-
-def quote(value: object) -> str:
-    """What a file gave, for a sentence: as `repr`, but never longer than that sentence."""
-    try:
-        return _SHORT.repr(value)
-    except ValueError:  # Python prints no integers of thousands of digits
-        return f"a huge {type(value).__name__}"
-
-
-def list_names(names: Iterable[str], most: int = 8) -> str:
-    """Names for a sentence, the first few of them."""
-    every = list(names)
-    more = f" and {len(every) - most} more" if len(every) > most else ""
-    return (", ".join(quote(name).strip("'") for name in every[:most]) or "none") + more
 
 
 def check_polygon(points: object, what: str) -> Polygon:

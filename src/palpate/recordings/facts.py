@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import PalpateError
-from palpate.numerics.polygons import check_polygon, quote
+from palpate.errors import PalpateError, quote
+from palpate.numerics.polygons import check_polygon
 from palpate.runs.storage import DamagedFileError, parse_json, plain
 
 

@@ -10,11 +10,10 @@ import jax
 import numpy as np
 import shapely
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, quote
 from palpate.models.planar import Planar, furniture
 from palpate.models.planar.geometry import Shapes, nearest
 from palpate.models.planar.shapes import rectangle
-from palpate.numerics.polygons import quote
 from palpate.parameters import as_floating
 from palpate.recordings import Channel, Labels, Polygons, Recording, Role
 from palpate.worlds.furniture.furniture import FurnitureWorld

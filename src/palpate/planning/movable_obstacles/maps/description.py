@@ -30,16 +30,14 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, list_names, quote
 from palpate.numerics.polygons import (
     centre_polygon,
     check_polygon,
     check_pose,
     circumscribed_radius,
     corners_of,
-    list_names,
     place_points,
-    quote,
 )
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose, Robot, map_of
 from palpate.runs.storage import read_json
@@ -131,7 +129,7 @@ def with_hints(world: Map, path: Path) -> Map:
         if name not in movables:
             raise PalpateError(
                 f"{what} has hints for {quote(name)}, which is not on the map; there are: "
-                + list_names(world.movables)
+                + list_names(map(quote, world.movables))
             )
         said = check_keys(item, f"movable {quote(name)} in {what}", {"hints"})
         hints = keys_of(said.get("hints") or {}, f"hints of {quote(name)} in {what}")

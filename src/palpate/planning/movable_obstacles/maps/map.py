@@ -16,7 +16,7 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, list_names, quote
 from palpate.numerics.polygons import (
     LARGEST,
     centre_polygon,
@@ -24,9 +24,7 @@ from palpate.numerics.polygons import (
     check_pose,
     circumscribed_radius,
     edges_of,
-    list_names,
     place_points,
-    quote,
 )
 
 Pose = tuple[float, float, float]
@@ -201,7 +199,7 @@ class Map:
         if unknown:
             raise PalpateError(
                 f"map {quote(self.name)} has no movable {quote(unknown[0])}; there are: "
-                + list_names(self.movables)
+                + list_names(map(quote, self.movables))
             )
 
     @property

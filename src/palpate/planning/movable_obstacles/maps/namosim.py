@@ -12,8 +12,8 @@ from typing import Any
 
 import shapely
 
-from palpate.errors import PalpateError
-from palpate.numerics.polygons import check_pose, circumscribed_radius, quote
+from palpate.errors import PalpateError, quote
+from palpate.numerics.polygons import check_pose, circumscribed_radius
 from palpate.planning.movable_obstacles.maps.description import (
     keys_of,
     list_of,

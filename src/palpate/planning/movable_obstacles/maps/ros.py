@@ -14,8 +14,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from palpate.errors import PalpateError
-from palpate.numerics.polygons import quote
+from palpate.errors import PalpateError, quote
 from palpate.planning.movable_obstacles.maps.description import (
     GRID_KEYS,
     build_map,

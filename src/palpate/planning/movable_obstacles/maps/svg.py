@@ -19,13 +19,12 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, quote
 from palpate.numerics.polygons import (
     LEAST_AREA,
     centre_polygon,
     check_polygon,
     circumscribed_radius,
-    quote,
 )
 from palpate.planning.movable_obstacles.maps.description import read_bytes, truth
 from palpate.planning.movable_obstacles.maps.map import Map, Movable, Pose, Robot, map_of

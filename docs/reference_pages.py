@@ -35,6 +35,7 @@ STAGES = {
         *("models.contact.tip", "families.contact.touches"),
         *("models.articulated.articulated", "models.articulated.parameters"),
         *("models.articulated.links", "models.articulated.description"),
+        "models.articulated.fingertip",
         *("models.articulated.urdf", "models.articulated.faults", "models.articulated.meshes"),
         *("models.articulated.assembly", "models.articulated.mjcf", "families.appliance.mjcf"),
     ],

@@ -336,7 +336,10 @@ SCENARIO = """<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 400 200'>
         ({"movables": []}, "movables in the side-car of .* of type list"),
         ({"movables": {"box": {"hints": 3}}}, "hints of 'box' .*: expected .* not 3"),
         ({"movables": {"box": 3}}, "movable 'box' .*: expected .* not 3"),
-        ({"movables": {"desk": {"hints": {}}}}, "'desk', which is not on the map; there are: 'box'"),
+        (
+            {"movables": {"desk": {"hints": {}}}},
+            "'desk', which is not on the map; there are: 'box'",
+        ),
         ({"movables": {"box": {"polygon": CORNERS}}}, "unknown key 'polygon'; there are: hints"),
         ({"robot": {"radius": 1}}, "unknown key 'robot'; there are: movables"),
         ({"start": [1, 1]}, "unknown key 'start'"),

@@ -21,8 +21,9 @@ from palpate.models.articulated.kinematics import (
     outer,
     poses,
 )
-from palpate.models.articulated.lanes import in_blocks
+from palpate.models.articulated.lanes import in_blocks, lanes_first, lanes_last
 from palpate.models.articulated.parameters import ArticulatedState, TreeParameters
+from palpate.models.articulated.touch import Face, Tip
 
 ACTION = 7  # of a link: torque or force of its joint, a force on it, and where
 
@@ -65,28 +66,49 @@ class Articulated(TreeParameters):
     def stepper(self) -> Callable[[ArticulatedState, Array], ArticulatedState]:
         if self.parent.ndim > 1:
             return self._one_by_one
+        advance = self.period()
+        return lambda state, action: advance(state, *_forces(action))
+
+    def period(self, face: Face | None = None) -> Callable[..., ArticulatedState]:
+        """What moves a state over a control period: of torques and pushes, and a `Tip` or None.
+
+        All with lanes last, as in `integration`; the tip is where it is when the period begins, and
+        touches `face`.
+        """
         system = self.system()
         time_step = self.control_period / self.substeps
 
-        def advanced(system: System, own: Any) -> tuple[Array, Array]:
+        def advanced(shared: tuple[System, Face | None], own: Any) -> tuple[Array, Array]:
             """Positions and velocities a control period later, lanes last."""
-            position, velocity, torque, push = own
+            system, face = shared
+            position, velocity, torque, push, tip = own
 
-            def once(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+            def once(carry: Any, _: None) -> tuple[Any, None]:
+                position, velocity, tip = carry
+                finger = None if face is None else (face, tip)
                 following = integration.advance(
-                    system, *carry, torque, push, time_step,
-                    resisted=self.resisted, slip=self.slip,
+                    system, position, velocity, torque, push, time_step,
+                    resisted=self.resisted, slip=self.slip, finger=finger,
                 )  # fmt: skip
-                return following, None
+                if tip is not None:
+                    tip = Tip(tip.position + time_step * tip.velocity, tip.velocity)
+                return (*following, tip), None
 
             # the inside of a time step is computed again on the way back: keeping it costs more
             again = jax.checkpoint(once, prevent_cse=False)
-            return jax.lax.scan(again, (position, velocity), None, length=self.substeps)[0]
+            return jax.lax.scan(again, (position, velocity, tip), None, length=self.substeps)[0][:2]
 
-        def step(state: ArticulatedState, action: Array) -> ArticulatedState:
-            own = (_lanes(state.position, 1), _lanes(state.velocity, 1), *_forces(action))
-            found = in_blocks(advanced, system, own)
-            return ArticulatedState(*(_lead(part, state.position.ndim == 1) for part in found))
+        def step(
+            state: ArticulatedState,
+            torque: Array,
+            push: tuple[Array, Array] | None = None,
+            tip: Tip | None = None,
+        ) -> ArticulatedState:
+            own = (lanes_last(state.position, 1), lanes_last(state.velocity, 1), torque, push, tip)
+            found = in_blocks(advanced, (system, face), own)
+            return ArticulatedState(
+                *(lanes_first(part, state.position.ndim == 1) for part in found)
+            )
 
         return step
 
@@ -97,20 +119,20 @@ class Articulated(TreeParameters):
 
     def system(self) -> System:
         """Its parameters as a step uses them: lanes last, one of them where there is no batch."""
-        mass = _lanes(self.mass * self.solid, 1)
-        centre, unit = _lanes(self.centre_of_mass, 2), _lanes(self.shape_inertia, 3)
-        inertia = (mass * jnp.square(_lanes(self.gyration, 1)))[:, None, None] * unit
+        mass = lanes_last(self.mass * self.solid, 1)
+        centre, unit = lanes_last(self.centre_of_mass, 2), lanes_last(self.shape_inertia, 3)
+        inertia = (mass * jnp.square(lanes_last(self.gyration, 1)))[:, None, None] * unit
         trace = inertia[:, 0, 0] + inertia[:, 1, 1] + inertia[:, 2, 2]
         identity = jnp.eye(3, dtype=mass.dtype)[None, :, :, None]
         first = mass[:, None] * centre
-        revolute, prismatic = _lanes(self.revolute, 1), _lanes(self.prismatic, 1)
-        resistance = (_lanes(getattr(self, name), 1) for name in Resistance._fields)
+        revolute, prismatic = lanes_last(self.revolute, 1), lanes_last(self.prismatic, 1)
+        resistance = (lanes_last(getattr(self, name), 1) for name in Resistance._fields)
         return System(
             joints=joints_of(
                 self.parent,
-                _lanes(self.rotation, 3),
-                _lanes(self.origin, 2),
-                _lanes(self.axis, 2),
+                lanes_last(self.rotation, 3),
+                lanes_last(self.origin, 2),
+                lanes_last(self.axis, 2),
                 revolute,
                 prismatic,
             ),
@@ -121,7 +143,7 @@ class Articulated(TreeParameters):
             ),
             resistance=Resistance(*resistance),
             carried=carriers(self.parent, mass.dtype),
-            gravity=_lanes(self.gravity, 1),
+            gravity=lanes_last(self.gravity, 1),
             fixed=1.0 - revolute - prismatic,
         )
 
@@ -129,15 +151,15 @@ class Articulated(TreeParameters):
     def acceleration(self, state: ArticulatedState, action: Array) -> Float[Array, "*batch links"]:
         """Of the joints (rad/s^2 or m/s^2), without dry friction and stops."""
         torque, push = _forces(action)
-        position, velocity = _lanes(state.position, 1), _lanes(state.velocity, 1)
+        position, velocity = lanes_last(state.position, 1), lanes_last(state.velocity, 1)
         found = integration.acceleration(self.system(), position, velocity, torque, push)
-        return _lead(found, state.position.ndim == 1)
+        return lanes_first(found, state.position.ndim == 1)
 
     @eqx.filter_jit
     def energy(self, state: ArticulatedState) -> Float[Array, "*batch"]:
         """Kinetic energy, and that in gravity (zero at the world's origin) and springs, J."""
         system = self.system()
-        position, velocity = _lanes(state.position, 1), _lanes(state.velocity, 1)
+        position, velocity = lanes_last(state.position, 1), lanes_last(state.velocity, 1)
         joints, bodies, resistance = system.joints, system.bodies, system.resistance
         still = jnp.zeros_like(velocity)
         now = motion(joints, bodies, system.carried, system.gravity, position, still)
@@ -155,9 +177,9 @@ class Articulated(TreeParameters):
         self, position: Float[Array, "*batch links"]
     ) -> tuple[Float[Array, "*batch links 3 3"], Float[Array, "*batch links 3"]]:
         """World from link: rotations and origins (m) of the links' frames."""
-        pose = poses(self.system().joints, _lanes(position, 1))
+        pose = poses(self.system().joints, lanes_last(position, 1))
         single = position.ndim == 1
-        return _lead(pose.matrix, single), _lead(pose.vector, single)
+        return lanes_first(pose.matrix, single), lanes_first(pose.vector, single)
 
     @eqx.filter_jit
     def screws(self, position: Float[Array, "*batch links"]) -> Float[Array, "*batch links 6"]:
@@ -166,9 +188,9 @@ class Articulated(TreeParameters):
         In the world's axes, at the world's origin.
         """
         joints = self.system().joints
-        field = fields(joints, poses(joints, _lanes(position, 1)))
+        field = fields(joints, poses(joints, lanes_last(position, 1)))
         found = jnp.concatenate([axial(field.matrix), field.vector], axis=1)
-        return _lead(found, position.ndim == 1)
+        return lanes_first(found, position.ndim == 1)
 
     def observe(self, state: ArticulatedState) -> Float[Array, "*batch links"]:
         """Joint positions, rad or m."""
@@ -227,17 +249,7 @@ class Articulated(TreeParameters):
         return action[..., 0] + jnp.sum(self.screws(position) * on_joint, axis=-1)
 
 
-def _lanes(value: Array, axes: int) -> Array:
-    """The batch axis last, of length one where there is none; `axes` are those of one tree."""
-    return value[..., None] if value.ndim == axes else jnp.moveaxis(value, 0, -1)
-
-
-def _lead(value: Array, single: bool) -> Array:
-    """The batch axis first again, none of a single one."""
-    return value[..., 0] if single else jnp.moveaxis(value, -1, 0)
-
-
 def _forces(action: Array) -> tuple[Array, tuple[Array, Array]]:
     """Of the joints, and on the links: force and point."""
-    laned = _lanes(action, 2)
+    laned = lanes_last(action, 2)
     return laned[:, 0], (laned[:, 1:4], laned[:, 4:])

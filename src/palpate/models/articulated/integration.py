@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 
 from palpate.models.articulated.dynamics import Bodies, Inertia, Motion, motion, solve
 from palpate.models.articulated.kinematics import Among, Each, Joints, Vector
+from palpate.models.articulated.touch import Face, Tip, touch_of
 
-PASSES = 2  # over dry friction and stops
+PASSES, TOUCHED = 2, 3  # over dry friction and stops, and over those and a fingertip
 
 
 class Resistance(NamedTuple):
@@ -70,11 +71,12 @@ def advance(
     *,
     resisted: bool,
     slip: float,
+    finger: tuple[Face, Tip] | None = None,
 ) -> tuple[Each, Each]:
     """Positions and velocities `time_step` (s) later.
 
     Without dry friction and stops unless `resisted`; friction is half its size at `slip` (rad/s or
-    m/s), below which a joint creeps.
+    m/s), below which a joint creeps. A `finger` is a tip that is against a face or near it.
     """
     resistance = system.resistance
     now: Motion = motion(
@@ -87,18 +89,23 @@ def advance(
     impulse = time_step * (torque - now.bias - resistance.stiffness * stretched)
     impulse = impulse + jnp.sum(inertia * velocity[None, :], axis=1)
     following = solve(with_diagonal(inertia, time_step * yields), impulse)
-    if resisted:
-        mass = jnp.diagonal(inertia, axis1=0, axis2=1).T + time_step * yields
-        most = time_step * resistance.friction
-        # a joint by itself would keep this much: the start of what all keep together
-        speed = jnp.maximum(jnp.abs(following) - most / mass, 0.0)
-        ahead = position + time_step * following
-        for _ in range(PASSES):
-            rub = resistance.friction / jnp.sqrt(jnp.square(speed) + slip**2)
-            stop, push_back = stops(resistance, ahead, following, position, time_step)
-            entries = time_step * (yields + rub + stop)
-            following = solve(with_diagonal(inertia, entries), impulse + time_step * push_back)
-            speed = jnp.abs(following)
+    touch = touch_of(*finger, system.joints, now.pose, system.carried) if finger else None
+    if not resisted and touch is None:
+        return position + time_step * following, following
+    mass = jnp.diagonal(inertia, axis1=0, axis2=1).T + time_step * yields
+    # a joint by itself would keep this much: the start of what all keep together
+    speed = jnp.maximum(jnp.abs(following) - time_step * resistance.friction / mass, 0.0)
+    ahead = position + time_step * following
+    for _ in range(PASSES if touch is None else TOUCHED):
+        rub = resistance.friction / jnp.sqrt(jnp.square(speed) + slip**2)
+        stop, push_back = stops(resistance, ahead, following, position, time_step)
+        resisting = with_diagonal(inertia, time_step * (yields + rub + stop))
+        force = impulse + time_step * push_back
+        if touch is not None:
+            damping, given = touch.resistance(following, time_step, slip)
+            resisting, force = resisting + time_step * damping, force + time_step * given
+        following = solve(resisting, force)
+        speed = jnp.abs(following)
     return position + time_step * following, following
 
 

@@ -38,3 +38,13 @@ def in_blocks(function: Callable[[Any, Any], Result], shared: Any, own: Any) -> 
     pieces = jax.tree.map(cut, (varies, own))
     found = jax.lax.map(lambda each: function(eqx.combine(each[0], same), each[1]), pieces)
     return jax.tree.map(joined, found)
+
+
+def lanes_last(value: Array, axes: int) -> Array:
+    """The batch axis last, of length one where there is none; `axes` are those of one tree."""
+    return value[..., None] if value.ndim == axes else jnp.moveaxis(value, 0, -1)
+
+
+def lanes_first(value: Array, single: bool) -> Array:
+    """The batch axis first again, none of a single one."""
+    return value[..., 0] if single else jnp.moveaxis(value, -1, 0)

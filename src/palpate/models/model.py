@@ -16,7 +16,7 @@ from palpate.parameters import Parameter, table
 State = TypeVar("State")
 
 FORCES = "N", "N m"  # units of what a sensor shows of itself, and no motion adds up to
-SOLVED = "solved"  # `checkpoint_name` of a solver's result, which nothing is to solve for again
+KEPT = "kept"  # `checkpoint_name` of what the way back of a rollout does not compute again
 
 
 class Model(eqx.Module):
@@ -180,7 +180,7 @@ def rollout(model: Model, state: State, actions: Array) -> State:
 
     Reverse-mode derivatives keep only the state at each control period and compute the inside of
     a period again: memory grows with control periods, not with integration steps. What a model
-    names `SOLVED` is kept too.
+    names `KEPT` is kept too.
     """
     batched = batch_size(model, actions) is not None
     in_time = jnp.moveaxis(actions, 1, 0) if batched else actions
@@ -190,7 +190,7 @@ def rollout(model: Model, state: State, actions: Array) -> State:
         following = step(state, action)
         return following, following
 
-    keep = jax.checkpoint_policies.save_only_these_names(SOLVED)
+    keep = jax.checkpoint_policies.save_only_these_names(KEPT)
     again = jax.checkpoint(advance, prevent_cse=False, policy=keep)
     _, states = jax.lax.scan(again, state, in_time)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states) if batched else states

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
@@ -24,6 +25,7 @@ from palpate.models.articulated.kinematics import (
 from palpate.models.articulated.lanes import in_blocks, lanes_first, lanes_last
 from palpate.models.articulated.parameters import ArticulatedState, TreeParameters
 from palpate.models.articulated.touch import Face, Tip
+from palpate.models.model import KEPT
 
 ACTION = 7  # of a link: torque or force of its joint, a force on it, and where
 
@@ -83,7 +85,7 @@ class Articulated(TreeParameters):
             system, face = shared
             position, velocity, torque, push, tip = own
 
-            def once(carry: Any, _: None) -> tuple[Any, None]:
+            def once(carry: Any) -> Any:
                 position, velocity, tip = carry
                 finger = None if face is None else (face, tip)
                 following = integration.advance(
@@ -92,11 +94,16 @@ class Articulated(TreeParameters):
                 )  # fmt: skip
                 if tip is not None:
                     tip = Tip(tip.position + time_step * tip.velocity, tip.velocity)
-                return (*following, tip), None
+                return (*following, tip)
 
             # the inside of a time step is computed again on the way back: keeping it costs more
             again = jax.checkpoint(once, prevent_cse=False)
-            return jax.lax.scan(again, (position, velocity, tip), None, length=self.substeps)[0][:2]
+
+            def kept(carry: Any, _: None) -> tuple[Any, None]:
+                # where each step begins is kept: else a rollout would compute all steps once more
+                return again(jax.tree.map(lambda part: checkpoint_name(part, KEPT), carry)), None
+
+            return jax.lax.scan(kept, (position, velocity, tip), None, length=self.substeps)[0][:2]
 
         def step(
             state: ArticulatedState,

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from palpate.models.model import SOLVED
+from palpate.models.model import KEPT
 from palpate.models.planar import contact
 from palpate.models.planar.contact import Contacts
 from palpate.models.planar.friction import (
@@ -116,7 +116,7 @@ def solve_velocity(resisting: Resistance, start: Triple, links: Rows, iterations
     (velocity, _), _ = jax.lax.scan(
         lambda carry, _: (newton(*fixed, *carry), None), (velocity, nothing), length=iterations
     )
-    velocity = jax.tree.map(lambda part: checkpoint_name(part, SOLVED), resist(*fixed, velocity))
+    velocity = jax.tree.map(lambda part: checkpoint_name(part, KEPT), resist(*fixed, velocity))
     # the slope is zero and stays so: its derivative says how the velocity follows what it is of
     left = leftover(resisting, links, velocity)
     change = tuple(part - jax.lax.stop_gradient(part) for part in left)

@@ -55,6 +55,6 @@ def test_a_finished_run_is_only_read(tmp_path, quickly, monkeypatch):
 
 
 def test_the_body_has_fourteen_parameters():
-    given = calibration.push_body(0, 1.0)
+    given = calibration.push_problem(0, 1.0)
     assert given.target.dimension == 14
     assert given.target.sensitivity is None  # every motion begins at rest, at a known pose

@@ -63,7 +63,7 @@ def test_shares_are_pooled_over_pushes_and_not_averaged():
         {"error_m": [0.1], "displacement_m": [1.0]},
         {"error_m": [0.1], "displacement_m": [0.1]},
     ]
-    assert one_shot.pool_errors(stages) == pytest.approx(0.02 / 1.01)
+    assert one_shot.pooled_share(stages) == pytest.approx(0.02 / 1.01)
     assert error_share(np.array([0.3, 0.4]), np.array([0.0, 5.0])) == pytest.approx(0.01)
 
 

@@ -15,7 +15,7 @@ from palpate.experiments.rope.dagger import (
     Work,
     nominal_trials,
     watch,
-    whirl_ropes,
+    whirled_trials,
 )
 from palpate.learning import Training, dagger
 from palpate.learning.loss_monitor import Alarm
@@ -90,10 +90,10 @@ def test_stages_hand_on_what_they_made(small, tmp_path, monkeypatch):
 
 
 def test_whirls_are_drawn_by_their_seed_within_the_limits():
-    trials = whirl_ropes(6, 7)
+    trials = whirled_trials(6, 7)
     whirl = WhirledTrial.goals(trials)
-    np.testing.assert_array_equal(whirl, WhirledTrial.goals(whirl_ropes(6, 7)))
-    assert not np.array_equal(whirl, WhirledTrial.goals(whirl_ropes(6, 8)))
+    np.testing.assert_array_equal(whirl, WhirledTrial.goals(whirled_trials(6, 7)))
+    assert not np.array_equal(whirl, WhirledTrial.goals(whirled_trials(6, 8)))
     speed = np.linalg.norm(whirl, axis=-1)
     acceleration = np.linalg.norm(np.diff(whirl, axis=1), axis=-1) / 0.01
     assert 0.7 < speed[:, -1].min() <= speed.max() < 0.8
@@ -106,7 +106,7 @@ def test_a_policy_takes_over_knowing_what_was_seen(monkeypatch):
     monkeypatch.setattr(nominal, "BASE", RopeConfiguration(**SMALL))
     monkeypatch.setattr(rope_dagger, "WHIRL_DURATION", 0.3)
     monkeypatch.setattr(rope_dagger, "TRIAL_PERIODS", 0.02)
-    trials = whirl_ropes(2, 5)
+    trials = whirled_trials(2, 5)
     whirl = WhirledTrial.goals(trials)
     seen = watch(untrained(), trials)
     assert seen.states.position.shape == (2, trials[0].steps - 30, 6, 3)
@@ -139,7 +139,7 @@ def test_who_is_no_policy_takes_over_as_well():
 def test_nominal_trials_are_the_evaluations():
     trials = nominal_trials(2, 11)
     (steps,) = {trial.steps for trial in trials}
-    assert {trial.steps - len(trial.whirl) for trial in whirl_ropes(2, 3)} == {steps}
+    assert {trial.steps - len(trial.whirl) for trial in whirled_trials(2, 3)} == {steps}
     usual = stabilization.evaluation_trials(nominal.BASE, 2, 11)
     assert [dataclasses.replace(trial, steps=None) for trial in trials] == [
         dataclasses.replace(trial, steps=None) for trial in usual

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.families.rope.options import IdentifyRope
-from palpate.families.rope.recording import BEND_DAMPING, count_nodes, starting_rope
+from palpate.families.rope.recording import BEND_DAMPING, choose_node_count, starting_rope
 from palpate.models.rope import Rope
 from palpate.models.rope.stability import LIMIT, load
 from palpate.recordings import Aligned
@@ -45,7 +45,7 @@ def dense(markers, length, period=0.005, noise=0.0):
 @pytest.mark.parametrize(("length", "substeps"), [(0.6, None), (1.1, 2)])
 def test_nodes_are_as_close_as_their_time_step_can_damp(length, substeps):
     """The rule against the limit of the model itself: one node more would be beyond it."""
-    found = count_nodes(dense(60, length), substeps)
+    found = choose_node_count(dense(60, length), substeps)
     loads = []
     for nodes in (found, found + 1):
         spacing, mass = length / (nodes - 1), 0.1 * length
@@ -62,13 +62,13 @@ def test_nodes_are_as_close_as_their_time_step_can_damp(length, substeps):
 
 @pytest.mark.parametrize("noise", [0.0, 2e-3])
 def test_noise_on_close_markers_brings_no_nodes(noise):
-    assert count_nodes(dense(60, 0.6, noise=noise)) == 13
+    assert choose_node_count(dense(60, 0.6, noise=noise)) == 13
 
 
 def test_markers_far_apart_are_all_nodes():
-    assert count_nodes(dense(21, 1.0)) == 21  # as `palpate record rope` has them
-    assert count_nodes(dense(5, 0.2)) == 5
-    assert count_nodes(dense(8, 0.1)) == 4  # the fewest
+    assert choose_node_count(dense(21, 1.0)) == 21  # as `palpate record rope` has them
+    assert choose_node_count(dense(5, 0.2)) == 5
+    assert choose_node_count(dense(8, 0.1)) == 4  # the fewest
 
 
 def test_a_model_of_fewer_nodes_is_said_and_wanted_ones_are_not(capsys):

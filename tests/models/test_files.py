@@ -19,7 +19,7 @@ from toys import Cart
 REMOVED = object()
 
 KNOWN = "there are: articulated, tip, planar, rope"
-AGAIN = "; identify it again if another version of palpate wrote it"
+AGAIN = "; identify the model again if another version of palpate or of its class wrote the file"
 
 
 def rope() -> Rope:

@@ -16,7 +16,7 @@ from palpate.models.residual import Residual, SiteNetwork
 from palpate.models.rope import Rope, RopeState
 
 REMOVED = object()
-AGAIN = "; identify it again if another version of palpate wrote it"
+AGAIN = "; identify the model again if another version of palpate or of its class wrote the file"
 
 
 def corrected() -> Residual:

@@ -15,7 +15,9 @@ from palpate.identification.gradient.descent import Settings
 from palpate.identification.identify import identify
 from palpate.models import rollout
 from palpate.models.articulated import ArticulatedState, Link, tree_of, with_fingertip
+from palpate.models.articulated.lanes import BLOCK
 from palpate.models.contract import check_model
+from palpate.models.files import save_model
 from palpate.parameters import declare, value_of
 from palpate.recordings import Aligned
 
@@ -27,6 +29,7 @@ LID = Link(
     centre_of_mass=(0.1, 0.02, 0.0), inertia=np.diag([2e-3, 3e-3, 4e-3]), damping=0.05,
 )  # fmt: skip
 AGAINST_X = (-1.0, 0.0, 0.0)
+ACCURATE = 1e-3  # rad
 
 run = eqx.filter_jit(rollout)
 
@@ -114,6 +117,18 @@ def test_a_finger_drags_by_dry_friction_and_no_more(float64, goes):
     np.testing.assert_allclose(speed, expected, rtol=1e-3, atol=2e-5)
 
 
+def test_a_stiff_finger_rubs_no_more_than_a_soft_one(float64):
+    """Pressed to the same 5 N: a drawer that slides under it is slowed by mu F / m."""
+    for stiffness in (1e3, 1e9):
+        tree = tree_of([DRAWER], control_period=0.01, substeps=10, slip=1e-5)
+        face = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+        model = with_fingertip(tree, 0, *face, stiffness=stiffness, damping=0.0, friction=0.5)
+        start = ArticulatedState(jnp.zeros(1), jnp.array([0.1]))
+        moved = run(model, start, way((0.0, 0.0, -5.0 / stiffness), (0.0, 0.0, 0.0), 5, 0.01))
+        lost = 0.1 - np.asarray(moved.velocity)[:, 0]
+        np.testing.assert_allclose(lost, 0.5 * 5.0 / MASS * 0.01 * np.arange(1, 6), rtol=1e-3)
+
+
 def law_in_mujoco(model, start, actions, steps: int) -> np.ndarray:
     """Joint positions after a control period each: MuJoCo's tree with the same finger on it."""
     links = [DOOR, LID]
@@ -158,7 +173,11 @@ def test_a_lid_on_a_door_moves_as_in_mujoco_under_the_same_finger(float64):
     ours = np.asarray(run(model, start, actions).position)
     theirs = law_in_mujoco(model, start, actions, 400)
     assert np.all(np.ptp(theirs, axis=0) > 0.1)  # rad: both joints move
-    np.testing.assert_allclose(ours, theirs, atol=3e-3)
+    np.testing.assert_allclose(ours, theirs, atol=ACCURATE)
+    smooth = with_fingertip(
+        tree, 1, (0.15, 0.03, 0.0), (0.1, 1.0, 0.2), **finger | {"friction": 0.0}
+    )
+    assert np.abs(np.asarray(run(smooth, start, actions).position) - theirs).max() > 5 * ACCURATE
 
 
 def test_derivatives_are_those_of_finite_differences(float64):
@@ -190,12 +209,29 @@ def test_a_batch_is_as_its_members(float64):
     for row in range(3):
         alone = run(model, jax.tree.map(lambda leaf, row=row: leaf[row], start), actions[row])
         np.testing.assert_allclose(together.position[row], alone.position, atol=1e-14)
-    forces = model.force(start, actions[:, 2])
-    assert forces.shape == (3, 3)
+    assert model.force(start, actions[:, 2]).shape == (3, 3)
+
+
+def test_more_lanes_than_a_block_are_as_by_themselves(float64):
+    """Each with a stiffness of its own."""
+    lanes = BLOCK + 3
+    stiffness = jnp.linspace(100.0, 900.0, lanes)
+    every = eqx.tree_at(lambda one: one.stiffness, drawer(2), stiffness)
+    actions = way((0.004, 0.0, 0.0), (0.05, 0.0, 0.0), 3, 0.01)
+    start = ArticulatedState(jnp.zeros((lanes, 1)), jnp.zeros((lanes, 1)))
+    together = run(every, start, jnp.broadcast_to(actions, (lanes, *actions.shape)))
+    for lane in (0, BLOCK - 1, BLOCK, lanes - 1):
+        alone = run(drawer(2, stiffness=float(stiffness[lane])), still(1), actions)
+        np.testing.assert_allclose(together.position[lane], alone.position, atol=1e-14)
+
+
+def test_a_model_on_top_of_another_has_no_file(tmp_path):
+    with pytest.raises(PalpateError, match="a Fingertip is on top of another model"):
+        save_model(tmp_path / "model.json", drawer())
 
 
 def test_mass_and_stiffness_come_out_of_where_finger_and_drawer_were():
-    """By the shared identification, without a force sensor: of what the drawer's damping is."""
+    """By the shared identification, without a force sensor, where the drawer's damping is known."""
     tree = tree_of([dataclasses.replace(DRAWER, damping=20.0)], control_period=0.01, substeps=2)
     tree = declare(tree, centre_of_mass={"fixed": True}, gyration={"fixed": True},
                    friction={"fixed": True}, damping={"fixed": True})  # fmt: skip
@@ -226,6 +262,9 @@ def test_mass_and_stiffness_come_out_of_where_finger_and_drawer_were():
         ({"normal": (0.0, 0.0, 0.0)}, "the normal of a face has a direction"),
         ({"place": (0.0, np.nan, 0.0)}, "a face is a point and a normal of 3 numbers"),
         ({"normal": (1.0, 0.0)}, "a face is a point and a normal of 3 numbers"),
+        ({"stiffness": -1.0}, "the stiffness of a fingertip is at least 0, not -1.0"),
+        ({"damping": np.nan}, "the damping of a fingertip is at least 0, not nan"),
+        ({"stifness": 1.0}, "a fingertip has no stifness; it has stiffness, damping, friction"),
     ],
 )
 def test_a_face_that_is_none_is_refused(changes, text):

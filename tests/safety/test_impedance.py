@@ -13,10 +13,10 @@ from palpate.errors import PalpateError
 from palpate.safety.impedance import (
     ImpedanceLaw,
     approach,
+    directed_stiffness,
     double_diagonalised_damping,
     factorised_damping,
     impedance_force,
-    rotate_stiffness,
 )
 
 
@@ -90,7 +90,7 @@ def test_both_designs_agree_where_mass_and_stiffness_commute():
 def test_damping_takes_power_whatever_the_stiffness():
     random = np.random.default_rng(5)
     along, across = np.exp(random.uniform(math.log(50), math.log(1000), (2, 200)))
-    stiffness = rotate_stiffness(along, across, random.normal(size=(200, 2)))
+    stiffness = directed_stiffness(along, across, random.normal(size=(200, 2)))
     mass = np.array([[2.0, 0.7], [0.7, 1.0]])
     damping = double_diagonalised_damping(mass, stiffness)
     velocity = random.normal(size=(200, 2))
@@ -104,7 +104,7 @@ def test_damping_takes_power_whatever_the_stiffness():
 
 def test_stiffness_is_turned_into_the_motion():
     direction = np.array([[3.0, 4.0], [0.0, 0.0]])
-    stiffness = rotate_stiffness(np.array([900.0, 900.0]), np.array([100.0, 100.0]), direction)
+    stiffness = directed_stiffness(np.array([900.0, 900.0]), np.array([100.0, 100.0]), direction)
     np.testing.assert_allclose(stiffness[0] @ (0.6, 0.8), 900 * np.array([0.6, 0.8]))
     np.testing.assert_allclose(stiffness[0] @ (-0.8, 0.6), 100 * np.array([-0.8, 0.6]))
     np.testing.assert_allclose(stiffness[1], np.diag([900.0, 100.0]))

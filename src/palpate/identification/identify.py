@@ -88,7 +88,7 @@ def identify(
         name: posterior_of(one, aligned, one_object, piece) for name, one in hypotheses.items()
     }
     watch = functools.partial(progress, description="a posterior")
-    return draw(compare(targets, draws, chains, seed, method, watch))
+    return summarise_draws(compare(targets, draws, chains, seed, method, watch))
 
 
 def fit(start: Model, aligned: Aligned, settings: Settings, run: Run | None) -> Identified:
@@ -99,7 +99,7 @@ def fit(start: Model, aligned: Aligned, settings: Settings, run: Run | None) -> 
     return Identified(**vars(found), model=model)
 
 
-def draw(comparison: Comparison) -> Identified:
+def summarise_draws(comparison: Comparison) -> Identified:
     """The draws of the most probable hypothesis with their intervals."""
     posterior = comparison.posterior
     lower, upper = (

@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate.errors import PalpateError, PalpateWarning
 from palpate.family import name_of, places, resolve
-from palpate.models.model import Model
+from palpate.models.model import Model, Wrapper
 from palpate.models.python_files import named_class, source_of
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.parameters import LogNormal, axes_of, describe, parameters_of
@@ -29,10 +29,16 @@ def save_model(path: str | Path, model: Model, about: Mapping[str, Any] | None =
     shared, other priors) is not kept: it belongs to the identification that used it.
 
     A model that no family has is saved as `file.py:Class` with the SHA-256 of that file. Raises
-    `PalpateError` for one that is not in a file either, and for a batch of models.
+    `PalpateError` for one that is not in a file either, for one on top of another that is no
+    `Residual`, and for a batch of models.
     """
     network = model.network if isinstance(model, Residual) else None
     physics = model.physics if isinstance(model, Residual) else model
+    if isinstance(physics, Wrapper):
+        raise PalpateError(
+            f"a {type(physics).__name__} is on top of another model and has no file of its own: "
+            "save its `inner`, and make it anew from that"
+        )
     name = kind_name(physics)
     if name is None:
         raise PalpateError(
@@ -247,7 +253,7 @@ def _check_names(path: str | Path, what: str, came: Any, expected: Any) -> None:
         unknown = sorted(set(came) - set(expected)) or "none"
         raise PalpateError(
             f"the {what} in {path} do not fit: missing {missing}, unknown {unknown}; "
-            "identify it again if another version of palpate wrote it"
+            "identify the model again if another version of palpate or of its class wrote the file"
         )
 
 

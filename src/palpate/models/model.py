@@ -180,7 +180,7 @@ def rollout(model: Model, state: State, actions: Array) -> State:
 
     Reverse-mode derivatives keep only the state at each control period and compute the inside of
     a period again: memory grows with control periods, not with integration steps. What a model
-    names `KEPT` is kept too.
+    names `KEPT` is kept too, as where each integration step of a tree of links begins.
     """
     batched = batch_size(model, actions) is not None
     in_time = jnp.moveaxis(actions, 1, 0) if batched else actions

@@ -53,7 +53,7 @@ def _root(matrix: Matrix) -> Matrix:
     return (modes * xp.sqrt(xp.maximum(values, 0))[..., None, :]) @ modes.swapaxes(-1, -2)
 
 
-def rotate_stiffness(
+def directed_stiffness(
     along: Float[Any, "*batch"], across: Float[Any, "*batch"], direction: Vector
 ) -> Matrix:
     """The stiffness that is `along` N/m in a direction and `across` N/m square to it.
@@ -176,7 +176,8 @@ class ImpedanceLaw:
             along, across = self._low + self._span * (action[:, 2:4].T + 1) / 2
         else:
             along = across = np.full(len(action), self._constant)
-        self._sound, self._wanted = sound, (position + step, rotate_stiffness(along, across, step))
+        stiffness = directed_stiffness(along, across, step)
+        self._sound, self._wanted = sound, (position + step, stiffness)
         if fresh.all():
             springs = np.broadcast_to(self._softest, (len(step), 2, 2))
             self._now = position, springs

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from palpate.errors import PalpateError
-from palpate.safety.impedance import ImpedanceLaw, rotate_stiffness
+from palpate.safety.impedance import ImpedanceLaw, directed_stiffness
 
 
 class SelfTuningLaw(ImpedanceLaw):
@@ -73,6 +73,6 @@ class SelfTuningLaw(ImpedanceLaw):
         felt = (against > self._contact_force) & np.isfinite(against + error)
         self._along = np.where(felt, risen, self._resting)
         across = np.full(len(felt), self._range[0])
-        self._wanted = self._wanted[0], rotate_stiffness(self._along, across, self._direction)
+        self._wanted = self._wanted[0], directed_stiffness(self._along, across, self._direction)
         self._moving = True
         return super().command(observation)

@@ -154,7 +154,7 @@ class Lockstep:
         return np.concatenate([seen, share[:, None].astype(np.float32)], axis=1)
 
     def decide(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
-        """Rewards, who terminated, who was cut off, and what else is known of it, each (worlds,).
+        """Rewards, who terminated, who was cut off, and what else is known, each (worlds,).
 
         A world whose episode ends within the decision stands still until the others are done.
         """

@@ -57,7 +57,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             found[who].append(experiment.found(f"{folder.name}-{who}", about, work)["episodes"])
     settings = {"episodes": whole, "command": f"palpate train maze --method {METHOD}"}
     split = "new episodes in the maze that the policies were trained in, on the tip alone"
-    return experiment.result(compare(found), settings, split)
+    return experiment.result(pooled_figures(found), settings, split)
 
 
 def train_on_tip(experiment: Experiment, seed: int) -> Path:
@@ -81,7 +81,7 @@ def evaluate_policy(folder: Path, who: str, episodes: int, seed: int) -> dict[st
     return {"episodes": {name: values.tolist() for name, values in ended.items()}}
 
 
-def compare(found: dict[str, list[Episodes]]) -> list[Figure]:
+def pooled_figures(found: dict[str, list[Episodes]]) -> list[Figure]:
     """Figures of all policies' episodes together: the arm's with their bars, then the others'."""
     pooled = {
         who: figures({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})

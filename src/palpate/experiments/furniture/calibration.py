@@ -133,7 +133,7 @@ def body() -> Planar:
     return declare(furniture([rectangle(1.2, 0.7)]), **PRIORS)
 
 
-def push_body(seed: int, sigma_factor: float) -> Problem:
+def push_problem(seed: int, sigma_factor: float) -> Problem:
     """Four pushes of the body from rest at the origin, the same for all simulations."""
     rng = np.random.default_rng(seed)
     held = rng.normal(size=(PUSHES, 2, 1, 3)) * (FORCE, FORCE, TORQUE)
@@ -147,7 +147,7 @@ def calibrate(size: Size, seed: int, run: Run) -> tuple[dict[str, np.ndarray], t
     First with the right sigma, then with the wrong one. Batches are checkpoints: a run that was cut
     off repeats one at most.
     """
-    problems = [push_body(seed, factor) for factor in (1.0, WRONG)]
+    problems = [push_problem(seed, factor) for factor in (1.0, WRONG)]
     names = problems[0].target.names
     if size.simulations % BATCH:
         raise PalpateError(f"{size.simulations} simulations are no multiple of {BATCH}")

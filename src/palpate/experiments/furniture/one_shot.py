@@ -225,14 +225,14 @@ def _figures(
     first: int,
 ) -> list[Figure]:
     movable = {kind: of for kind, of in pieces.items() if kind != BOLTED}
-    each = {kind: pool_errors(of) for kind, of in movable.items()}
+    each = {kind: pooled_share(of) for kind, of in movable.items()}
     every = [stage for of in movable.values() for stage in of]
     inside = [stage["inside"] for stage in every]
     paces = {name: Pace(**pace) for name, pace in raced["paces"].items()}
     wins, cells = victories(compared)
     figures = [
-        Figure("error_share", pool_errors(every), "", bar=0.05, seed_document="one-shot learning",
-               spread=two_standard_errors([pool_errors([stage]) for stage in every])),
+        Figure("error_share", pooled_share(every), "", bar=0.05, seed_document="one-shot learning",
+               spread=two_standard_errors([pooled_share([stage]) for stage in every])),
         Figure("error_share_worst_kind", max(each.values()), "", bar=0.2),
         Figure("bolted_drift_cm", 100.0 * max(stage["drift_m"] for stage in pieces[BOLTED]), "cm",
                bar=1.0),
@@ -262,21 +262,21 @@ def _figures(
     ]
     figures += [
         Figure(
-            f"error_share_of_sysid.{kind}", pool_errors([stage]) if stage["error_m"] else None, ""
+            f"error_share_of_sysid.{kind}", pooled_share([stage]) if stage["error_m"] else None, ""
         )
         for kind, stage in sysid.items()
     ]
     ours, theirs = of_the_same_pieces(pieces, sysid, first)
     figures += [
-        Figure("error_share_of_sysid", pool_errors(theirs) if theirs else None, ""),
-        Figure("error_share_of_the_same_pieces", pool_errors(ours) if ours else None, ""),
+        Figure("error_share_of_sysid", pooled_share(theirs) if theirs else None, ""),
+        Figure("error_share_of_the_same_pieces", pooled_share(ours) if ours else None, ""),
     ]
     figures.append(Figure("rhat_worst_piece", max(s["rhat"] for s in every), ""))
     figures.append(Figure("ess_worst_piece", min(s["ess"] for s in every), "", better="higher"))
     return figures
 
 
-def pool_errors(stages: list[dict[str, Any]]) -> float:
+def pooled_share(stages: list[dict[str, Any]]) -> float:
     """Error share over all pushes of these pieces."""
     error = np.concatenate([stage["error_m"] for stage in stages])
     return error_share(error, np.concatenate([stage["displacement_m"] for stage in stages]))

@@ -115,7 +115,7 @@ def nominal_trials(ropes: int, seed: int) -> list[StabilizationTrial]:
     return [dataclasses.replace(trial, steps=_steps()) for trial in trials]
 
 
-def whirl_ropes(ropes: int, seed: int) -> list[WhirledTrial]:
+def whirled_trials(ropes: int, seed: int) -> list[WhirledTrial]:
     """Sampled ropes, each whirled in a circle of its own rate, speed, sense and phase."""
     random = np.random.default_rng((seed, 2))
     configurations = sample_configurations(nominal.BASE, ropes, seed)
@@ -218,7 +218,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         model,
         policy,
         lambda policy, seed: watch(policy, nominal_trials(work.nominal, NOMINAL_SEEDS + seed)),
-        lambda policy, seed: watch(policy, whirl_ropes(work.watched, WATCHED_SEEDS + seed)),
+        lambda policy, seed: watch(policy, whirled_trials(work.watched, WATCHED_SEEDS + seed)),
         training,
         out,
         seed=seed,
@@ -242,7 +242,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         "swing_damper": dataclasses.asdict(TUNED),
     }
     used = {"about": about, **settings}
-    shifted, usual = whirl_ropes(work.evaluated, first), nominal_trials(work.nominal, first)
+    shifted, usual = whirled_trials(work.evaluated, first), nominal_trials(work.nominal, first)
     tried = {
         suffix(name): TakeOver(controller)
         for name, controller in (controllers | baselines(nominal.BASE)).items()

@@ -196,14 +196,14 @@ class IdentifyRope(Identify, Reading):
 
     def reduced(self, *aligned: Aligned) -> tuple[Aligned, ...]:
         """See `Identify.reduced`: the nodes of the model."""
-        from palpate.families.rope.recording import count_nodes
+        from palpate.families.rope.recording import choose_node_count
         from palpate.perception.rope.nodes import at_nodes
 
         fitted, nodes = aligned[0], self.nodes
         markers = fitted.observation.shape[2]
         inside = set(self._driven(fitted)) - {0, markers - 1}
         if nodes is None and not inside:
-            nodes = count_nodes(fitted, self.substeps)
+            nodes = choose_node_count(fitted, self.substeps)
             if nodes < markers:
                 print(
                     f"note: the model has {nodes} nodes between the ends of {markers} markers: "

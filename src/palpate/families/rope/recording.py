@@ -59,7 +59,7 @@ def constants(configuration: RopeConfiguration) -> dict[str, str | float | int]:
     }
 
 
-def count_nodes(aligned: Aligned, substeps: int | None = None) -> int:
+def choose_node_count(aligned: Aligned, substeps: int | None = None) -> int:
     """How many nodes a model of this rope should have: as many as markers, or fewer.
 
     With `substeps` in a period, or the usual number. The most bend damping c (N m^2 s) that steps

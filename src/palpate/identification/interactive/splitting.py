@@ -29,7 +29,7 @@ GAIN = 1.0  # of evidence, for each point: how much better a joint on a carrier 
 POINTS = 120  # of a piece, by which it is tried
 TURNS = np.arange(-2.2, 2.21, 0.1)  # rad
 TRIED = 3  # of the options, the best
-EVIDENCE = 200.0  # of evidence, of all points and looks
+LEAST_EVIDENCE = 200.0  # of evidence, of all points and looks
 SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enough
 UNSURE = 45.0  # deg: a part whose axis is less known than so is shown by no two looks
 LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
@@ -83,7 +83,7 @@ def split(tree: PartTree, looks: list[int]) -> bool:
     found: dict[tuple[int, int, int], list[Option]] = {}
     for look, other in [*pairs, *(pair[::-1] for pair in pairs)]:
         _add_options(tree, look, other, found)
-    options = [one for each in found.values() for one in each if one.gain > EVIDENCE]
+    options = [one for each in found.values() for one in each if one.gain > LEAST_EVIDENCE]
     options.sort(key=lambda option: -option.gain)
     return any(_insert(tree, option) for option in options[:TRIED])
 

@@ -69,7 +69,7 @@ def begin_episodes(environments: VectorEnv, seed: int, step: int) -> np.ndarray:
 def advance(
     environments: VectorEnv, observation: np.ndarray, action: np.ndarray, executed: np.ndarray
 ) -> tuple[Transition, np.ndarray, dict[str, Any]]:
-    """One step of all: the transitions, what is seen then, and what else they report of each.
+    """One step of all: the transitions, what is seen then, and what else is reported.
 
     Actions lie in [-1, 1], which is stretched onto the environments' bounds. Reported are "ended"
     (bool), "end" (how, "" where it goes on or nothing says so), and what is `REPORTED`, NaN where

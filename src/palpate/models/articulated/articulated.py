@@ -68,14 +68,14 @@ class Articulated(TreeParameters):
     def stepper(self) -> Callable[[ArticulatedState, Array], ArticulatedState]:
         if self.parent.ndim > 1:
             return self._one_by_one
-        advance = self.period()
+        advance = self.period_stepper()
         return lambda state, action: advance(state, *_forces(action))
 
-    def period(self, face: Face | None = None) -> Callable[..., ArticulatedState]:
-        """What moves a state over a control period: of torques and pushes, and a `Tip` or None.
+    def period_stepper(self, face: Face | None = None) -> Callable[..., ArticulatedState]:
+        """What moves a state over a control period, by torques, pushes and a `Tip`.
 
-        All with lanes last, as in `integration`; the tip is where it is when the period begins, and
-        touches `face`.
+        The latter with lanes last, as in `integration`, and None for no pushes and no tip; the tip
+        is where it is when the period begins, and touches `face`.
         """
         system = self.system()
         time_step = self.control_period / self.substeps

@@ -26,8 +26,10 @@ class Fingertip(Wrapper):
     The face goes through `place` (m) and its outward `normal` (of length one), both in the frame of
     the link number `link`. An action (6,) is where the finger is when a control period begins (m)
     and how fast it moves in it (m/s), in the world's axes; the tree's own joints have no torques.
+    The face is a plane without an end or a back: a finger beyond an edge still presses.
+
     A finger that is d within the face, with d growing at d', presses with max(0, k d + c d'), and
-    rubs with Coulomb's friction against the sliding of its point, half of it at `inner.slip` m/s.
+    rubs with Coulomb's friction against the sliding of its point, 0.7 of it at `inner.slip` m/s.
     Stiffness and damping are those of finger, hand and face in series.
 
     Parameters of the tree are declared by it, as `inner.mass`. Observed are joint positions.
@@ -56,7 +58,7 @@ class Fingertip(Wrapper):
         return self.stepper()(state, action)
 
     def stepper(self) -> Callable[[ArticulatedState, Array], ArticulatedState]:
-        advance = self.inner.period(self.face())
+        advance = self.inner.period_stepper(self.face())
 
         def step(state: ArticulatedState, action: Array) -> ArticulatedState:
             none = jnp.zeros_like(lanes_last(state.position, 1))
@@ -66,21 +68,20 @@ class Fingertip(Wrapper):
 
     def face(self) -> Face:
         """Its face, as a step uses it."""
-        one = jnp.zeros(self.inner.links).at[self.link].set(1.0)
+        one = jnp.zeros(self.inner.links, self.place.dtype).at[self.link].set(1.0)
         yields = (lanes_last(one, 0) for one in (self.stiffness, self.damping, self.friction))
         return Face(one, lanes_last(self.place, 1), lanes_last(self.normal, 1), *yields)
 
+    @eqx.filter_jit
     def force(self, state: ArticulatedState, action: Array) -> Float[Array, "*batch 3"]:
         """What the finger exerts on the link when a control period begins, N, in the world."""
         system, face = self.inner.system(), self.face()
         pose = poses(system.joints, lanes_last(state.position, 1))
         touch = touch_of(face, _tip(action), system.joints, pose, system.carried)
-        rates = lanes_last(state.velocity, 1)
-        pressing = touch.pressing(rates, 0.0)
-        sliding = touch.speed(rates)
-        sliding = sliding - touch.normal * jnp.sum(touch.normal * sliding, axis=0)
-        rub = touch.rubbing(rates, pressing, self.inner.slip)
-        found = -touch.normal * pressing - rub * sliding
+        deeper, sliding = touch.motion(lanes_last(state.velocity, 1))
+        force = touch.pressing(deeper, 0.0)
+        speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=0) + self.inner.slip**2)
+        found = -touch.normal * force - touch.face.friction * force / speed * sliding
         return lanes_first(found, state.position.ndim == 1)
 
     def constrain(self) -> "Fingertip":
@@ -99,8 +100,8 @@ def with_fingertip(
     Both are in the frame of the link of that number.
     `values` are `stiffness` (N/m), `damping` (N s/m) and `friction`, else their priors' medians.
 
-    Raises `PalpateError` for a link that is not there, a normal without a direction, numbers that
-    are not finite, and trees that differ in structure.
+    Raises `PalpateError` for a link that is not there, a normal without a direction, values that
+    are unknown, negative or not finite, and trees that differ in structure.
     """
     if tree.parent.ndim != 1:
         raise PalpateError("a fingertip presses trees of one structure, not several")
@@ -115,6 +116,11 @@ def with_fingertip(
     fields: dict[str, Any] = {
         name: declared.prior.centre for name, declared in parameters_of(Fingertip).items()
     }
+    if unknown := sorted(values.keys() - fields.keys()):
+        raise PalpateError(f"a fingertip has no {unknown[0]}; it has {', '.join(fields)}")
+    for name, value in values.items():
+        if not 0.0 <= value < np.inf:
+            raise PalpateError(f"the {name} of a fingertip is at least 0, not {value}")
     fields |= {"place": point, "normal": outward / size, "link": link} | values
     return Fingertip(inner=tree, **fields)
 

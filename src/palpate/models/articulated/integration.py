@@ -75,8 +75,8 @@ def advance(
 ) -> tuple[Each, Each]:
     """Positions and velocities `time_step` (s) later.
 
-    Without dry friction and stops unless `resisted`; friction is half its size at `slip` (rad/s or
-    m/s), below which a joint creeps. A `finger` is a tip that is against a face or near it.
+    Without dry friction and stops unless `resisted`; friction is 0.7 of its size at `slip` (rad/s
+    or m/s), below which a joint creeps. A `finger` is a tip that is against a face or near it.
     """
     resistance = system.resistance
     now: Motion = motion(
@@ -96,16 +96,31 @@ def advance(
     # a joint by itself would keep this much: the start of what all keep together
     speed = jnp.maximum(jnp.abs(following) - time_step * resistance.friction / mass, 0.0)
     ahead = position + time_step * following
-    for _ in range(PASSES if touch is None else TOUCHED):
-        rub = resistance.friction / jnp.sqrt(jnp.square(speed) + slip**2)
-        stop, push_back = stops(resistance, ahead, following, position, time_step)
-        resisting = with_diagonal(inertia, time_step * (yields + rub + stop))
-        force = impulse + time_step * push_back
+    finger_rub = jnp.zeros_like(
+        position[0]
+    )  # N s/m: none before it is known how much a stiff finger presses
+    for number in range(PASSES if touch is None else TOUCHED):
+        resisting, force = with_diagonal(inertia, time_step * yields), impulse
+        if resisted:
+            rub = resistance.friction / jnp.sqrt(jnp.square(speed) + slip**2)
+            stop, push_back = stops(resistance, ahead, following, position, time_step)
+            resisting = with_diagonal(resisting, time_step * (rub + stop))
+            force = force + time_step * push_back
         if touch is not None:
-            damping, given = touch.resistance(following, time_step, slip)
+            presses = touch.pressing(touch.motion(following)[0], time_step) > 0.0
+            damping, given = touch.resistance(presses, finger_rub, time_step)
             resisting, force = resisting + time_step * damping, force + time_step * given
         following = solve(resisting, force)
         speed = jnp.abs(following)
+        if touch is not None:
+            deeper, sliding = touch.motion(following)
+            most = touch.face.friction * touch.pressing(deeper, time_step)
+            slides = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=0) + slip**2)
+            if number == 0:  # what friction would take of it, as of a joint by itself
+                drag = jnp.sum(touch.moves * (sliding / slides)[:, None], axis=0)
+                lost = time_step * most * jnp.sum(drag * solve(resisting, drag), axis=0)
+                slides = jnp.maximum(slides - lost, slip)
+            finger_rub = most / slides
     return position + time_step * following, following
 
 

@@ -7,7 +7,7 @@ any stiffness, and never a source of energy by itself. Shapes as in `kinematics`
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from palpate.models.articulated.kinematics import Affine, Among, Each, Joints, apply, fields
 
@@ -46,34 +46,26 @@ class Touch(NamedTuple):
     depth: Number
     velocity: Point
 
-    def speed(self, rates: Each) -> Point:
-        """Of the link's point against the tip, m/s."""
-        return jnp.sum(self.moves * rates, axis=1) - self.velocity
+    def motion(self, rates: Each) -> tuple[Number, Point]:
+        """How fast the tip gets deeper (m/s), and how the link's point slides against it (m/s)."""
+        relative = jnp.sum(self.moves * rates, axis=1) - self.velocity
+        deeper = jnp.sum(self.normal * relative, axis=0)
+        return deeper, relative - self.normal * deeper
 
-    def pressing(self, rates: Each, time_step: float) -> Number:
-        """N, of the tip on the face, at the end of a step that ends with these velocities."""
-        face, deeper = self.face, jnp.sum(self.normal * self.speed(rates), axis=0)
+    def pressing(self, deeper: Number, time_step: float) -> Number:
+        """N, of the tip on the face, at the end of a step in which it gets deeper so (m/s)."""
         ahead = self.depth + time_step * deeper
-        force = face.stiffness * ahead + face.damping * deeper
+        force = self.face.stiffness * ahead + self.face.damping * deeper
         return jnp.where(ahead > 0.0, jnp.maximum(force, 0.0), 0.0)
 
-    def rubbing(self, rates: Each, force: Number, slip: float) -> Number:
-        """Dry friction over sliding velocity, N s/m: half of it is there at `slip` m/s."""
-        sliding = self.speed(rates)
-        sliding = sliding - self.normal * jnp.sum(self.normal * sliding, axis=0)
-        size = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=0) + slip**2)
-        return self.face.friction * force / size
-
     def resistance(
-        self, rates: Each, time_step: float, slip: float
+        self, presses: Bool[Array, "#lanes"], rub: Number, time_step: float
     ) -> tuple[Float[Array, "links links #lanes"], Each]:
         """What it adds to the joints' damping, as a matrix, and what it exerts at no velocity.
 
-        Whether it presses, and how much friction there is, are those of a step that ends with
-        about these velocities.
+        While it presses, with `rub` N s/m of dry friction over the sliding velocity.
         """
-        face, force = self.face, self.pressing(rates, time_step)
-        presses, rub = force > 0.0, self.rubbing(rates, force, slip)
+        face = self.face
         yields = jnp.where(presses, face.damping + time_step * face.stiffness, 0.0)
         along = jnp.sum(self.normal[:, None] * self.moves, axis=0)
         every = jnp.sum(self.moves[:, :, None] * self.moves[:, None, :], axis=0)

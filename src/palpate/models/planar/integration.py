@@ -116,7 +116,8 @@ def solve_velocity(resisting: Resistance, start: Triple, links: Rows, iterations
     (velocity, _), _ = jax.lax.scan(
         lambda carry, _: (newton(*fixed, *carry), None), (velocity, nothing), length=iterations
     )
-    velocity = jax.tree.map(lambda part: checkpoint_name(part, KEPT), resist(*fixed, velocity))
+    velocity = resisted_velocity(*fixed, velocity)
+    velocity = jax.tree.map(lambda part: checkpoint_name(part, KEPT), velocity)
     # the slope is zero and stays so: its derivative says how the velocity follows what it is of
     left = leftover(resisting, links, velocity)
     change = tuple(part - jax.lax.stop_gradient(part) for part in left)
@@ -147,7 +148,7 @@ def solve_contacts(
         length=iterations + MORE_ITERATIONS - 1,
     )
     rows = joined._replace(weight=jnp.concatenate([links.weight, touching]))
-    velocity = resist(resisting, rows, velocity)
+    velocity = resisted_velocity(resisting, rows, velocity)
     delayed = contact.delayed_impulse(contacts, touching, jnp.stack(velocity, axis=-1))
     impulse = (delayed[:, 0], delayed[:, 1], delayed[:, 2])
     return velocity, solve_bodies(own_curvature(resisting, velocity), impulse, links)
@@ -165,7 +166,7 @@ def own_curvature(resisting: Resistance, velocity: Triple) -> Entries:
     return curvature(resisting, velocity, pulls(resisting, velocity))
 
 
-def resist(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
+def resisted_velocity(resisting: Resistance, rows: Rows, velocity: Triple) -> Triple:
     """The velocity that the forces at a velocity leave: the same where that is the least cost.
 
     Elsewhere too it has less energy than a step without resistance. It is solved for as a

@@ -143,7 +143,7 @@ class RopeStabilization(HangingRopeTask):
         hanging = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (motions, *leaf.shape)), hanging)
         states = rollout(model, hanging, commands[:, :, None, :])
         times = jax.random.randint(for_time, (motions, STATES_PER_MOTION), steps // 6, steps)
-        state, command = pick_states((states, commands), times, count)
+        state, command = at_times((states, commands), times, count)
         return Start(state, command[:, None, :])
 
     def _random_commands(  # gripper velocities, m/s
@@ -266,7 +266,7 @@ class RopeStabilization(HangingRopeTask):
         }
 
 
-def pick_states(motions: Any, times: Array, count: int) -> Any:
+def at_times(motions: Any, times: Array, count: int) -> Any:
     """The first `count` of all that (motions, time, ...) are at `times` (motions, picks, ...)."""
     pick = jax.vmap(lambda leaf, index: leaf[index])
     own = jax.tree.map(lambda leaf: pick(leaf, times), motions)

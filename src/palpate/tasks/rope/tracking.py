@@ -16,7 +16,7 @@ from palpate.models.model import rollout
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import Channel
 from palpate.tasks.rope.paths import DesiredPath, random_paths
-from palpate.tasks.rope.stabilization import HangingRopeTask, pick_states
+from palpate.tasks.rope.stabilization import HangingRopeTask, at_times
 from palpate.tasks.task import Start
 
 # What is seen of the path, s ahead. A hanging chain's grip has to know where its tip should be
@@ -88,8 +88,8 @@ class RopeTracking(HangingRopeTask):
         chance = jax.random.uniform(for_time, (motions, STATES_PER_MOTION))
         share = jnp.maximum(chance - AT_THE_BEGINNING, 0.0) / (1.0 - AT_THE_BEGINNING)
         time = jnp.round(share * before).astype(int)
-        states, commands = pick_states((states, commands), time, count)
-        position = pick_states(tip, time[..., None] + jnp.arange(after + 1), count)
+        states, commands = at_times((states, commands), time, count)
+        position = at_times(tip, time[..., None] + jnp.arange(after + 1), count)
         return Start(states, commands[:, None, :], DesiredPath(position, period))
 
     def adapt(self, start: Start, models: Rope) -> Start:

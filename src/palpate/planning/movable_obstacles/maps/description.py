@@ -129,7 +129,7 @@ def with_hints(world: Map, path: Path) -> Map:
         if name not in movables:
             raise PalpateError(
                 f"{what} has hints for {quote(name)}, which is not on the map; there are: "
-                + list_names(map(quote, world.movables))
+                + list_names(map(quote, world.movables), 8)
             )
         said = check_keys(item, f"movable {quote(name)} in {what}", {"hints"})
         hints = keys_of(said.get("hints") or {}, f"hints of {quote(name)} in {what}")

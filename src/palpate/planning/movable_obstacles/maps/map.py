@@ -199,7 +199,7 @@ class Map:
         if unknown:
             raise PalpateError(
                 f"map {quote(self.name)} has no movable {quote(unknown[0])}; there are: "
-                + list_names(map(quote, self.movables))
+                + list_names(map(quote, self.movables), 8)
             )
 
     @property

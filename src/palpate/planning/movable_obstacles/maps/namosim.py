@@ -28,8 +28,8 @@ from palpate.planning.movable_obstacles.maps.svg import (
     goals_of,
     movables_of,
     read_drawing,
-    read_robot,
-    read_walls,
+    robot_of,
+    walls_of,
 )
 
 
@@ -54,7 +54,7 @@ def read_namosim(path: str | Path) -> Map:
     besides = [shapely.Point(pose[:2]).buffer(other.radius) for other, pose in others]
     world = map_of(
         grid.stem,
-        walls=shapely.union_all([walls, *besides, *(read_walls(drawing) if drawing else [])]),
+        walls=shapely.union_all([walls, *besides, *(walls_of(drawing) if drawing else [])]),
         movables=movables_of(drawing) if drawing else [],
         robot=robot,
         start=start,
@@ -93,7 +93,7 @@ def _agent(content: Any, drawing: Drawing | None, what: str) -> tuple[Robot, Pos
     )
     pose = agent.get("initial_pose")
     if pose is None:
-        drawn = None if drawing is None else read_robot(drawing, str(agent["id"]))
+        drawn = None if drawing is None else robot_of(drawing, str(agent["id"]))
         if drawn is None:
             raise PalpateError(
                 f"{what} has the agent {quote(agent['id'])} without an initial_pose: expected "

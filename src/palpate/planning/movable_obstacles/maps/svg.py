@@ -181,7 +181,7 @@ def read_svg(path: str | Path) -> Map:
     standing = [check_polygon(one.points, f"agent {quote(one.name)}") for one in others]
     return map_of(
         path.stem,
-        walls=shapely.union_all([*read_walls(drawing), *standing]),
+        walls=shapely.union_all([*walls_of(drawing), *standing]),
         movables=movables_of(drawing),
         robot=Robot(
             circumscribed_radius(outline),
@@ -198,7 +198,7 @@ def read_svg(path: str | Path) -> Map:
     )
 
 
-def read_walls(drawing: Drawing) -> list[BaseGeometry]:
+def walls_of(drawing: Drawing) -> list[BaseGeometry]:
     """What each path of type wall covers."""
     return [_wall(drawn) for drawn in drawing.paths if drawn.type == "wall"]
 
@@ -219,7 +219,7 @@ def goals_of(drawing: Drawing, agent: str) -> list[tuple[float, float, float]]:
     return goals
 
 
-def read_robot(drawing: Drawing, agent: str) -> tuple[np.ndarray, Pose] | None:
+def robot_of(drawing: Drawing, agent: str) -> tuple[np.ndarray, Pose] | None:
     """Outline about its middle, and pose, of the path in the layer of robots with that `agent_id`.
 
     None where there is no such path.

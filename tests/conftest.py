@@ -10,6 +10,7 @@ import pytest
 
 from palpate import family
 from palpate.numerics.devices import cores
+from palpate.trials.rope import baselines
 
 if cores() == 1:  # what is divided over devices has to be divided here too
     jax.config.update("jax_num_cpu_devices", 2)
@@ -44,6 +45,13 @@ def room_for_compiled_functions():
         if count > int(MOST.read_text()) // 8:
             jax.clear_caches()
             gc.collect()
+
+
+@pytest.fixture
+def short_tuning(monkeypatch):
+    """The damper beside a rope's controller is tuned for a moment, and not kept for other tests."""
+    monkeypatch.setattr(baselines, "TUNING", 0.2)
+    monkeypatch.setattr(baselines, "tune_gains", baselines.tune_gains.__wrapped__)
 
 
 @pytest.fixture

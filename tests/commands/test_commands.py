@@ -449,7 +449,7 @@ def test_a_stopped_identification_goes_on_to_the_same_result(tmp_path, monkeypat
 # --- the rope, once, through everything --------------------------------------------------------
 
 
-def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys):
+def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys, short_tuning):
     def blind(world, width, height):
         raise PalpateError("no OpenGL here; install libegl1")
 

@@ -68,7 +68,7 @@ def test_no_rope_to_evaluate(refused):
 
 
 @pytest.fixture
-def tried(tmp_path, monkeypatch, capsys):
+def tried(tmp_path, monkeypatch, capsys, short_tuning):
     """Evaluate an untrained policy of 12 markers at 60 Hz, for a moment; (lines, settings)."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.2)

@@ -248,7 +248,7 @@ def test_mass_and_stiffness_come_out_of_where_finger_and_drawer_were():
     guess = eqx.tree_at(lambda one: (one.inner.mass, one.stiffness), true,
                         (jnp.full(1, 3.0), jnp.asarray(1000.0)))  # fmt: skip
     aligned = Aligned(0.01, seen, actions, np.full(3, 81))
-    settings = Settings(iterations=(3, 3, 12))
+    settings = Settings(horizons=(0.8,), iterations=(10,))
     found = identify(guess, aligned, "levenberg-marquardt", settings=settings)
     for name, value in (("inner.mass", MASS), ("stiffness", 300.0)):
         assert np.asarray(value_of(found.model, name)).item() == pytest.approx(value, rel=0.05)

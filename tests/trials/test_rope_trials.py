@@ -12,12 +12,18 @@ from palpate.models.rope import RopeState
 from palpate.networks import Channel, CommandPolicy
 from palpate.tasks.rope import RopeStabilization
 from palpate.trials.controller import HeldStill, check_period
+from palpate.trials.rope import baselines
 from palpate.trials.rope import trials as rope_trials
 from palpate.trials.rope.baselines import TUNED, Gains, SwingDamper
 from palpate.trials.rope.learned import LearnedController
 from palpate.trials.rope.stabilization import StabilizationTrial, settling_time
 from palpate.trials.trial import run_trials, wilson_interval
-from palpate.worlds.rope.rope import RopeConfiguration, RopeWorld
+from palpate.worlds.rope.rope import (
+    START_POSES,
+    RopeConfiguration,
+    RopeWorld,
+    sample_configurations,
+)
 from palpate.worlds.world import DivergedError
 from small_rope import QUIET, SMALL, commands, seen
 
@@ -302,3 +308,24 @@ def test_swing_damper_commands_what_its_formula_says():
     _, command = damper(carry, seen(markers, gripper[1]), None, None)
     # offset (0.3, -0.2), away (0.1, 0): x'' = 0.5 * 0.3 - 0.25 * 0.1, y'' = -0.5 * 0.2
     np.testing.assert_allclose(command, [[0.125 * PERIOD, -0.1 * PERIOD, 0.0]], atol=1e-9)
+
+
+def test_a_damper_is_tuned_to_settle_ropes_sooner():
+    """From gains that are half of good ones; a trial that never settles counts with its length."""
+    base = baselines.coarse(RopeConfiguration(length=0.8))
+    weak = Gains(*(0.5 * np.array(dataclasses.astuple(TUNED))).tolist())
+    found = baselines.tune(base, weak, ropes=1, candidates=8)
+    lasting = baselines.TUNING * np.sqrt(base.length)
+
+    def settles(gains: Gains) -> float:
+        trials = [
+            StabilizationTrial(rope, pose, 7000)
+            for rope in sample_configurations(base, 1, 7000)
+            for pose in START_POSES
+        ]
+        steps = round(lasting / base.control_period)
+        episodes = run_trials(trials, SwingDamper(base, gains), steps)
+        time = settling_time(episodes.energy, episodes.gripper_speed, base.control_period)
+        return float(np.nan_to_num(time, nan=lasting).mean())
+
+    assert settles(found) < settles(weak)

@@ -74,8 +74,8 @@ class Articulated(TreeParameters):
     def period_stepper(self, face: Face | None = None) -> Callable[..., ArticulatedState]:
         """What moves a state over a control period, by torques, pushes and a `Tip`.
 
-        The latter with lanes last, as in `integration`, and None for no pushes and no tip; the tip
-        is where it is when the period begins, and touches `face`.
+        Torques, pushes and the tip have their lanes last, as in `integration`; pushes and the tip
+        may be None. The tip is where it is when the period begins, and may touch `face`.
         """
         system = self.system()
         time_step = self.control_period / self.substeps

@@ -97,8 +97,8 @@ def with_fingertip(
 ) -> Fingertip:
     """The tree with a finger at `place` (m) of a face whose outward normal is `normal`.
 
-    Both are in the frame of the link of that number.
-    `values` are `stiffness` (N/m), `damping` (N s/m) and `friction`, else their priors' medians.
+    Both are in the frame of the link of that number. `values` are `stiffness` (N/m), `damping`
+    (N s/m) and `friction`, else their priors' medians.
 
     Raises `PalpateError` for a link that is not there, a normal without a direction, values that
     are unknown, negative or not finite, and trees that differ in structure.

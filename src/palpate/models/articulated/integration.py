@@ -4,7 +4,8 @@ Semi-implicit Euler, of first order: the velocity at the end of a step moves the
 resists at a joint acts by the velocity and position at the end of the step, so that any damping,
 spring, friction or stop is stable, and none of them ever adds energy beyond the step's own error.
 Dry friction and stops depend on where the joint goes: the step is taken without them first, and
-what they do there is solved for again, each time with the friction of the velocity found before.
+what they do there is solved for again, each time with the friction of the velocity found before. So
+it is with a fingertip (`touch`).
 """
 
 from typing import NamedTuple
@@ -96,9 +97,8 @@ def advance(
     # a joint by itself would keep this much: the start of what all keep together
     speed = jnp.maximum(jnp.abs(following) - time_step * resistance.friction / mass, 0.0)
     ahead = position + time_step * following
-    finger_rub = jnp.zeros_like(
-        position[0]
-    )  # N s/m: none before it is known how much a stiff finger presses
+    # N s/m of the finger: none before it is known how much a stiff one presses
+    finger_rub = jnp.zeros_like(position[0])
     for number in range(PASSES if touch is None else TOUCHED):
         resisting, force = with_diagonal(inertia, time_step * yields), impulse
         if resisted:

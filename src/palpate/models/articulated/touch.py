@@ -1,7 +1,8 @@
 """A fingertip on a flat face of a link: a spring and a damper that only push, and dry friction.
 
-By the position and velocity at the end of a step, as all that resists in `integration`: stable for
-any stiffness, and never a source of energy by itself. Shapes as in `kinematics`.
+Kelvin's and Voigt's contact with Coulomb's friction, by the position and velocity at the end of a
+step, linearised about its beginning (Baraff and Witkin, "Large steps in cloth simulation", SIGGRAPH
+1998): stable for any stiffness, and never a source of energy by itself. Shapes as in `kinematics`.
 """
 
 from typing import NamedTuple

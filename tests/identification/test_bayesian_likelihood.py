@@ -345,7 +345,7 @@ def test_the_most_probable_error_of_a_start_is_found_where_the_model_is_not_line
 
 
 def test_a_rest_is_averaged_whole_and_not_seen_again():
-    """Forty frames at rest, then motion: one start of a fortieth of the noise's variance."""
+    """Forty frames at rest, then motion: one start from the mean of the first half of them."""
     rng = np.random.default_rng(0)
     still = np.zeros((1, 90, 1))
     still[0, 40:, 0] = 0.1 * np.arange(1, 51)
@@ -356,10 +356,10 @@ def test_a_rest_is_averaged_whole_and_not_seen_again():
     )
     (deviation,) = np.asarray(VAGUE * pieces.pose_deviation)[0]
     assert np.asarray(pieces.rate_deviation) == 0.0
-    assert deviation == pytest.approx(noise_scale(aligned, hinge.TRUE)[0] / np.sqrt(36))
+    assert deviation == pytest.approx(noise_scale(aligned, hinge.TRUE)[0] / np.sqrt(19))
     assert abs(float(pieces.pose[0, 0])) < 3.0 * deviation
     first = int(np.argmax(np.asarray(pieces.target)[0, :, 0] > 0.05))
-    assert first == 40 - 36  # the frames of the rest are not there again
+    assert first == 40 - 19  # the frames of the rest are not there again
     assert int(np.argmax(np.asarray(usual.target)[0, :, 0] > 0.05)) == 39
 
 

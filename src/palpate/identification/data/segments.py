@@ -6,6 +6,7 @@ Golay, Analytical Chemistry 36, 1964), with their standard deviations.
 """
 
 import dataclasses
+import math
 from functools import cached_property
 
 import equinox as eqx
@@ -22,6 +23,7 @@ from palpate.recordings import Aligned
 REACH = 0.2  # s before and after a frame that its smoothed pose is taken from, at most
 ORDER = 3  # of the polynomial: a velocity that changes within the reach
 STILL = 0.06  # s at the beginning of a trial at rest that its pose is averaged over
+RELAXATION = 0.15  # s that poses are averaged over where a model is relaxed, at least
 MOVED = 4.0  # deviations of a mean of frames at rest, from those of another rest, at most
 # A polynomial that misses the frames by more than noise does once in a thousand times is taken over
 # half the reach: there the motion is too fast for it.
@@ -38,7 +40,8 @@ class Segments(eqx.Module):
     `pose` and `rate` (per second) are the smoothed observation at the first frame and its time
     derivative, `pose_deviation` and `rate_deviation` their standard deviations, zero for what is
     known. `action` is one per control period after it; `target` what was observed after each
-    action, zero where `seen` is false.
+    action, zero where `seen` is false. Before a piece whose rate is known a model is relaxed by
+    its mean over `relaxation` control periods, if there are any (`prediction.start`).
     """
 
     pose: Float[Array, "segments ..."]
@@ -48,6 +51,7 @@ class Segments(eqx.Module):
     action: Float[Array, "segments time ..."]
     target: Float[Array, "segments time ..."]
     seen: Bool[Array, "segments time ..."]
+    relaxation: int = eqx.field(static=True, default=0)
 
     @property
     def count(self) -> int:
@@ -204,7 +208,9 @@ def cut(
     that is known to be zero. What remains of a trial is a padded piece, unless it is shorter than
     `REACH`, from which little is learnt but where it begins. `count` pads the pieces with ones in
     which nothing is seen, so that recordings of different lengths have the same shape and compile
-    once.
+    once. `ringing` says that a start that is off by noise makes a model ring: a rest is averaged
+    over as long as it lasts, and models are relaxed before it, unless forces are observed, which
+    tell what no pose does.
 
     Raises `PalpateError` when no piece can begin anywhere, or `count` is too small.
     """
@@ -212,6 +218,8 @@ def cut(
     horizon = max(1, round(seconds / period))
     shortest = min(horizon, max(1, round(REACH / period)))
     spread = noise_scale(aligned, model)
+    relaxed = at_rest and ringing and not np.any(model.observes_force)
+    relaxation = math.ceil(RELAXATION / period) if relaxed else 0
     pieces = []
     for trial, length in enumerate(aligned.length):
         observed = aligned.observation[trial, :length]
@@ -237,13 +245,14 @@ def cut(
         raise PalpateError(f"{len(pieces)} pieces do not fit into {count}: expected a larger count")
     # Copies of the first piece in which nothing is seen: they can be computed and say nothing.
     blind = (*pieces[0][:-1], np.zeros_like(pieces[0][-1]))
-    return _joined(pieces + [blind] * ((count or 0) - len(pieces)))
+    return _joined(pieces + [blind] * ((count or 0) - len(pieces)), relaxation)
 
 
-def _joined(pieces: list[tuple[np.ndarray, ...]]) -> Segments:
+def _joined(pieces: list[tuple[np.ndarray, ...]], relaxation: int = 0) -> Segments:
     columns = [np.stack(column) for column in zip(*pieces, strict=True)]
     return Segments(
-        *(jnp.asarray(c, bool if c.dtype == bool else jnp.zeros(()).dtype) for c in columns)
+        *(jnp.asarray(c, bool if c.dtype == bool else jnp.zeros(()).dtype) for c in columns),
+        relaxation,
     )
 
 
@@ -301,8 +310,8 @@ def stands_still(model: Model, early: np.ndarray, late: np.ndarray, noise: np.nd
 def _rest(observed: np.ndarray, model: Model, spread: np.ndarray, period: float) -> int:
     """For how many frames of a trial that begins at rest nothing moves beyond the noise; or one.
 
-    What moved too little to be seen may have moved in the last frames: they do not count. Nor does
-    the second half of a trial: one that rests to its end shows something, too.
+    Only half of them count: what began to move slowly moved for a while before it was seen to. Nor
+    does the second half of a trial: one that rests to its end shows something, too.
     """
     frames = max(2, round(STILL / period))
     first, rest = observed[:frames], frames
@@ -310,7 +319,7 @@ def _rest(observed: np.ndarray, model: Model, spread: np.ndarray, period: float)
         if not stands_still(model, first, observed[rest : rest + frames], spread):
             break
         rest += frames
-    return max(1, min(rest - frames, len(observed) // 2))
+    return max(1, min(rest, len(observed)) // 2)
 
 
 def _mean(

@@ -28,7 +28,10 @@ ROUNDING = 1e-14  # of an eigenvalue by the size of the greatest
 ROUNDS = 3  # in which the start's errors are propagated anew
 MENDING = 2  # rounds of Gauss and Newton, each time, that find the most probable errors
 MENDED = 6  # rounds in which they are propagated where those are found as well
+HOPS = 0.03, 0.06, 0.12, 0.25, 0.5  # prior standard deviations from the best mode, in each of them
 WIDE = 2.0  # prior standard deviations: scales while starts are screened
+NARROWING = 3.0, 2.0, 1.0, 0.0  # the same, one after the other, where starts may ring
+WIDEST, NARROWED = 4.0, 15  # the first of them, and the steps of each
 STARTS, SCREENING = 24, 25  # of a search, and the steps of each
 FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on for
 
@@ -183,16 +186,36 @@ def _screened(
     target: MotionPosterior,
     position: Float[np.ndarray, "starts free"],
     scale: float,
+    steps: int,
     watch: Watch,
-) -> Float[np.ndarray, "followed free"]:
-    """Where the best climbs of the parameters arrive in a few steps; `scale` is that of scales.
+) -> Float[np.ndarray, "starts free"]:
+    """Where climbs of the parameters arrive, best first; `scale` is that of the scales.
 
     Scales that are free as well would grow until all that happened is the model's discrepancy.
     """
     parameters = np.arange(target.dimension) < target.parameters
     begun = np.where(parameters, position, scale)
-    climbed = climb_each(functools.partial(_each, target), begun, SCREENING, parameters, watch)
-    return np.asarray(climbed.position[:FOLLOWED])
+    climbed = climb_each(functools.partial(_each, target), begun, steps, parameters, watch)
+    return np.asarray(climbed.position)
+
+
+def _narrowed(
+    target: MotionPosterior, position: Float[np.ndarray, "starts free"], watch: Watch
+) -> tuple[MotionPosterior, Float[np.ndarray, "followed free"]]:
+    """The best climbs as the scales become narrow, and the target linearised about the best.
+
+    A discrepancy that grows fast leaves only how a motion begins, which few parameters explain
+    wrongly; the narrower it is, the later the motion that counts, and the narrower the mode
+    (graduated non-convexity: Blake and Zisserman, Visual Reconstruction, 1987).
+    """
+    position = _screened(target, position, WIDEST, NARROWED, watch)
+    for scale in NARROWING:
+        position = _screened(target, position[: 2 * FOLLOWED], scale, NARROWED, watch)
+        if scale <= 1.0:
+            # Errors of the start that a far model propagates explain nothing, and discrepancy grows
+            # in their place: from the best so far they are propagated anew.
+            target = target.linearised(jnp.asarray(position[0]), MENDING)
+    return target, position[:FOLLOWED]
 
 
 def settle(
@@ -205,19 +228,36 @@ def settle(
     """
     noise = jax.random.normal(key, (STARTS, target.dimension))
     position = noise.at[0].set(initial_position(target)).at[1].set(0.0)
-    # Most starts of a body that may stick end where it sticks for ever, and climb no further: the
-    # best of them go on.
-    screened = _screened(target, np.asarray(position), WIDE, watch)
-    if target.error is not None:
-        # Errors of the start that a far model propagates explain nothing, and discrepancy grows in
-        # their place: from the best so far they are propagated anew.
-        target = target.linearised(jnp.asarray(screened[0]), MENDING)
-        screened = _screened(target, screened, 0.0, watch)
-    modes = climb_each(functools.partial(_each, target), screened, CLIMBING, None, watch)
+    if target.error is None:
+        # Most starts of a body that may stick end where it sticks for ever, and climb no further:
+        # the best of them go on.
+        followed = _screened(target, np.asarray(position), WIDE, SCREENING, watch)[:FOLLOWED]
+    else:
+        target, followed = _narrowed(target, np.asarray(position), watch)
+    modes = climb_each(functools.partial(_each, target), followed, CLIMBING, None, watch)
     modes = _found(target, modes)
     if target.sensitivity is None:
         return target, modes
-    for _ in range((ROUNDS if target.error is None else MENDED) - 1):
+    if target.error is None:
+        for _ in range(ROUNDS - 1):
+            target = target.linearised(modes.position[0])
+            modes = climb(target, modes.position, CLIMBING)
+        return target, modes
+    for left in reversed(range(MENDED - 1)):
         target = target.linearised(modes.position[0], MENDING)
-        modes = climb(target, modes.position, CLIMBING)
+        near = _near(target, modes, jax.random.fold_in(key, left)) if left else modes.position
+        modes = climb(target, near, CLIMBING)
     return target, modes
+
+
+def _near(target: MotionPosterior, modes: Modes, key: PRNGKeyArray) -> Array:
+    """The best mode, and places near it to climb from (basin hopping: Wales and Doye, J. Phys.
+    Chem. A 101, 1997).
+
+    What is stiff rings, and how often it has swung when something happens makes ridges beside the
+    best one.
+    """
+    best = modes.position[0]
+    off = jax.random.normal(key, (len(HOPS), target.dimension), best.dtype)
+    moves = jnp.arange(target.dimension) < target.parameters
+    return jnp.concatenate([best[None], best + jnp.asarray(HOPS)[:, None] * off * moves])

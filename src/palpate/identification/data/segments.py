@@ -252,7 +252,7 @@ def _joined(pieces: list[tuple[np.ndarray, ...]], relaxation: int = 0) -> Segmen
     columns = [np.stack(column) for column in zip(*pieces, strict=True)]
     return Segments(
         *(jnp.asarray(c, bool if c.dtype == bool else jnp.zeros(()).dtype) for c in columns),
-        relaxation,
+        relaxation=relaxation,
     )
 
 

@@ -344,7 +344,7 @@ def test_the_most_probable_error_of_a_start_is_found_where_the_model_is_not_line
     assert densities["linear"] < densities["good"] - 50.0
 
 
-def test_a_rest_is_averaged_whole_and_not_seen_again():
+def test_half_a_rest_is_averaged_and_not_seen_again():
     """Forty frames at rest, then motion: one start from the mean of the first half of them."""
     rng = np.random.default_rng(0)
     still = np.zeros((1, 90, 1))

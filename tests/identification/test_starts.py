@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.experiments.rope.posterior import hanging, nominal
-from palpate.identification.data.prediction import start
+from palpate.identification.data.prediction import initial_states
 from palpate.identification.data.segments import cut, known_start
 from palpate.parameters import with_values
 from palpate.recordings import Aligned
@@ -36,17 +36,17 @@ def pieces(pose, relaxation=8):
 def test_a_pose_that_is_off_by_noise_comes_to_its_balance_where_the_rope_is_stiff(rope):
     balance = hanging(rope)
     noise = NOISE * np.random.default_rng(0).standard_normal((20, *balance.shape))
-    state = start(rope, pieces(balance + noise))
+    state = initial_states(rope, pieces(balance + noise))
     along = np.asarray(state.position - balance)[..., 2]
     assert np.std(along) < 0.2 * NOISE
     assert not np.any(state.velocity)
-    untouched = start(rope, pieces(balance + noise, relaxation=0))
+    untouched = initial_states(rope, pieces(balance + noise, relaxation=0))
     np.testing.assert_array_equal(untouched.position, pieces(balance + noise).pose)
 
 
 def test_what_hangs_in_balance_stays(rope):
     balance = hanging(rope)
-    state = start(rope, pieces(balance[None]))
+    state = initial_states(rope, pieces(balance[None]))
     np.testing.assert_allclose(state.position[0], balance, atol=1e-6)
 
 
@@ -55,7 +55,7 @@ def test_no_error_of_a_pose_grows(rope):
     balance = jnp.asarray(hanging(rope), jnp.float32)
 
     def relaxed(pose):
-        return start(rope, pieces(pose.reshape(1, *balance.shape))).position.ravel()
+        return initial_states(rope, pieces(pose.reshape(1, *balance.shape))).position.ravel()
 
     gains = np.linalg.svd(np.asarray(jax.jacfwd(relaxed)(balance.ravel())))[1]
     assert gains.max() < 1.0
@@ -67,7 +67,7 @@ def test_what_is_in_motion_begins_as_it_was_seen(rope):
     both = pieces(np.stack([balance + NOISE] * 2))
     moving = jnp.zeros_like(both.pose).at[1].set(0.1)
     both = dataclasses.replace(both, rate_deviation=moving)
-    position = start(rope, both).position
+    position = initial_states(rope, both).position
     np.testing.assert_array_equal(position[1], both.pose[1])
     assert np.abs(np.asarray(position[0] - both.pose[0])).max() > 0.1 * NOISE
 

@@ -105,11 +105,9 @@ def draw_rope(seed: int) -> Rope:
     One that is too stiff for the time step is softened, node by node (`stability`), and drawn anew.
     """
     prior, key = nominal(), jax.random.key(seed)
-    for attempt in itertools.count():
-        rope = sample_prior(prior, jax.random.fold_in(key, attempt))
-        if all(np.ptp(value_of(rope, name)) == 0.0 for name in free_parameters(rope)):
-            return rope
-    raise AssertionError("counting does not end")
+    attempts = (sample_prior(prior, jax.random.fold_in(key, n)) for n in itertools.count())
+    names = free_parameters(prior)
+    return next(r for r in attempts if all(np.ptp(value_of(r, name)) == 0.0 for name in names))
 
 
 def free_parameters(rope: Rope) -> tuple[str, ...]:

@@ -19,17 +19,20 @@ ROUNDS = 2  # in which a start at rest is relaxed
 
 def motion(model: Model, segments: Segments) -> Any:
     """The states after each action, open loop from the start of each segment."""
-    return rollout(model, start(model, segments), segments.action)
+    return rollout(model, initial_states(model, segments), segments.action)
 
 
-def start(model: Model, segments: Segments) -> Any:
-    """The states that segments begin in, relaxed where they begin at rest (`relaxation`).
+def initial_states(model: Model, segments: Segments) -> Any:
+    """The states that segments begin in, whose leaves lead with the segments.
+
+    They are relaxed where segments begin at rest, if `Segments.relaxation` asks for it, under their
+    first action, which has to hold the model where it is: a pose, and no velocity with noise.
 
     What is at rest is in balance, and a pose that is off by noise is not: by a fraction of a
-    millimetre a stiff rope rings with more force than it weighs. So the model is let go, and its
-    mean pose over a while, in which what is stiff swings about its balance and what is slow hardly
-    moves, is where it is stopped, twice (dynamic relaxation, after Barnes, Int. J. Space Struct.
-    14, 1999). To stop it where it happens to be may add energy, step by step.
+    millimetre a stiff rope rings with more force than it weighs. So the model is let go for a
+    while, in which what is stiff swings about its balance and what is slow hardly moves, and is
+    stopped at its mean pose, twice (dynamic relaxation, after Barnes, Int. J. Space Struct. 14,
+    1999). To stop it where it happens to be may add energy, step by step.
     """
     before = segments.pose - model.control_period * segments.rate
     state = model.initial_state(jnp.stack([before, segments.pose], axis=1))

@@ -41,7 +41,7 @@ class Segments(eqx.Module):
     derivative, `pose_deviation` and `rate_deviation` their standard deviations, zero for what is
     known. `action` is one per control period after it; `target` what was observed after each
     action, zero where `seen` is false. Before a piece whose rate is known a model is relaxed by
-    its mean over `relaxation` control periods, if there are any (`prediction.start`).
+    its mean over `relaxation` control periods, if there are any (`prediction.initial_states`).
     """
 
     pose: Float[Array, "segments ..."]

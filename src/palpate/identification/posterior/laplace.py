@@ -30,8 +30,9 @@ MENDING = 2  # rounds of Gauss and Newton, each time, that find the most probabl
 MENDED = 6  # rounds in which they are propagated where those are found as well
 HOPS = 0.03, 0.06, 0.12, 0.25, 0.5  # prior standard deviations from the best mode, in each of them
 WIDE = 2.0  # prior standard deviations: scales while starts are screened
-NARROWING = 3.0, 2.0, 1.0, 0.0  # the same, one after the other, where starts may ring
-WIDEST, NARROWED = 4.0, 15  # the first of them, and the steps of each
+SCALES = 4.0, 3.0, 2.0, 1.0, 0.0  # the same, one after the other, where starts may ring
+SCALE_STEPS = 15  # of each climb at one of them
+NEAR = 1.0  # scales from which on errors of the starts are propagated anew
 STARTS, SCREENING = 24, 25  # of a search, and the steps of each
 FOLLOWED, CLIMBING = 6, 80  # the best of them, and the steps that these go on for
 
@@ -182,7 +183,7 @@ def _look(target: Target, position: Array) -> tuple[Array, Array, Array]:
     return over_devices(lambda target, part: target.curvatures(part))(target, position)
 
 
-def _screened(
+def _screen(
     target: MotionPosterior,
     position: Float[np.ndarray, "starts free"],
     scale: float,
@@ -199,7 +200,7 @@ def _screened(
     return np.asarray(climbed.position)
 
 
-def _narrowed(
+def _narrow(
     target: MotionPosterior, position: Float[np.ndarray, "starts free"], watch: Watch
 ) -> tuple[MotionPosterior, Float[np.ndarray, "followed free"]]:
     """The best climbs as the scales become narrow, and the target linearised about the best.
@@ -208,10 +209,9 @@ def _narrowed(
     wrongly; the narrower it is, the later the motion that counts, and the narrower the mode
     (graduated non-convexity: Blake and Zisserman, Visual Reconstruction, 1987).
     """
-    position = _screened(target, position, WIDEST, NARROWED, watch)
-    for scale in NARROWING:
-        position = _screened(target, position[: 2 * FOLLOWED], scale, NARROWED, watch)
-        if scale <= 1.0:
+    for scale in SCALES:
+        position = _screen(target, position, scale, SCALE_STEPS, watch)[: 2 * FOLLOWED]
+        if scale <= NEAR:
             # Errors of the start that a far model propagates explain nothing, and discrepancy grows
             # in their place: from the best so far they are propagated anew.
             target = target.linearised(jnp.asarray(position[0]), MENDING)
@@ -231,9 +231,9 @@ def settle(
     if target.error is None:
         # Most starts of a body that may stick end where it sticks for ever, and climb no further:
         # the best of them go on.
-        followed = _screened(target, np.asarray(position), WIDE, SCREENING, watch)[:FOLLOWED]
+        followed = _screen(target, np.asarray(position), WIDE, SCREENING, watch)[:FOLLOWED]
     else:
-        target, followed = _narrowed(target, np.asarray(position), watch)
+        target, followed = _narrow(target, np.asarray(position), watch)
     modes = climb_each(functools.partial(_each, target), followed, CLIMBING, None, watch)
     modes = _found(target, modes)
     if target.sensitivity is None:
@@ -251,11 +251,10 @@ def settle(
 
 
 def _near(target: MotionPosterior, modes: Modes, key: PRNGKeyArray) -> Array:
-    """The best mode, and places near it to climb from (basin hopping: Wales and Doye, J. Phys.
-    Chem. A 101, 1997).
+    """The best mode, and places near it to climb from.
 
-    What is stiff rings, and how often it has swung when something happens makes ridges beside the
-    best one.
+    How often a stiff rope has swung when something happens makes ridges beside the best one (basin
+    hopping: Wales and Doye, J. Phys. Chem. A 101, 1997).
     """
     best = modes.position[0]
     off = jax.random.normal(key, (len(HOPS), target.dimension), best.dtype)

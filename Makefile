@@ -8,8 +8,10 @@ INTERPRETERS := $(or $(PYTHON),python3.12 python3.11 python3 python3.13)
 INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -c constraints.txt
 PINS := pyproject.toml constraints.txt
-# A process grows to four or five gigabytes: more than two would fill a laptop.
-TESTS := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=2 --dist=loadfile
+# A process grows to four or five gigabytes: more than two would fill a laptop. In the order of the
+# files, as the commands take longest: by the number of tests, they would come last and alone.
+TESTS := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=2 --dist=loadfile \
+	--no-loadscope-reorder
 
 .NOTPARALLEL:
 .PHONY: help demo test test-all lint format docs clean

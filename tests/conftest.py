@@ -1,16 +1,44 @@
 """What every test may ask for: float64, and no implicit promotion of dtypes."""
 
+import atexit
 import gc
 import os
+import shutil
+import tempfile
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import jax
+import jaxtyping
 import pytest
 
 from palpate import family
 from palpate.numerics.devices import cores
 from palpate.trials.rope import baselines
+
+# The older code generator compiles twice as fast, in one piece as each core has a test of its own.
+# A flag that XLA does not know ends the process: only for the versions that it was measured with.
+if jax.__version__.startswith("0.10."):
+    os.environ["XLA_FLAGS"] = " ".join(
+        [
+            os.environ.get("XLA_FLAGS", ""),
+            "--xla_cpu_use_fusion_emitters=false",
+            "--xla_cpu_parallel_codegen_split_count=1",
+        ]
+    ).strip()
+
+# What was compiled once serves the other workers and child processes, until the tests end.
+CACHE = {
+    "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR"),
+    "jax_persistent_cache_min_compile_time_secs": 0,
+    "jax_persistent_cache_min_entry_size_bytes": 0,
+}
+if CACHE["jax_compilation_cache_dir"] is None:
+    CACHE["jax_compilation_cache_dir"] = tempfile.mkdtemp(prefix="palpate-tests-")
+    atexit.register(shutil.rmtree, CACHE["jax_compilation_cache_dir"], ignore_errors=True)
+for option, value in CACHE.items():
+    jax.config.update(option, value)
+    os.environ[option.upper()] = str(value)
 
 if cores() == 1:  # what is divided over devices has to be divided here too
     jax.config.update("jax_num_cpu_devices", 2)
@@ -29,6 +57,13 @@ def fast_compilation(request):
         jax.clear_caches()  # what was compiled the other way would be used on
         jax.config.update("jax_disable_most_optimizations", short)
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(short))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def shape_checks(request):
+    """Leave the checks of shapes out of a module that is marked `unchecked`."""
+    checked = request.node.get_closest_marker("unchecked") is None
+    jaxtyping.config.update("jaxtyping_disable", not checked)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -76,3 +111,8 @@ def toys(monkeypatch):
     family.families.cache_clear()
     yield
     family.families.cache_clear()
+
+
+def pytest_collection_finish():
+    """What is there when the tests begin stays to the end: not to be looked through each time."""
+    gc.freeze()

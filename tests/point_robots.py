@@ -24,7 +24,8 @@ class Robots:
 
     def over(self, position: np.ndarray) -> np.ndarray:
         """How deep in a wall, signed, m."""
-        return position - np.clip(position, -WALL, WALL)
+        within = np.minimum(np.maximum(position, -WALL), WALL)  # np.clip takes thrice as long
+        return position - within
 
     def wall_force(self, after: np.ndarray) -> np.ndarray:
         first, then = self.over(self.position), self.over(after)

@@ -16,6 +16,8 @@ from palpate.parameters import describe
 from palpate.runs.result import read_result
 from palpate.trials.rope import stabilization
 
+pytestmark = pytest.mark.unchecked  # control loops, period by period
+
 
 @pytest.fixture
 def refused(tmp_path, monkeypatch, capsys):

@@ -1,14 +1,12 @@
 """`palpate record contact` and `palpate identify contact`, the whole way on a short recording."""
 
 import numpy as np
-import pytest
 
 from palpate.cli import main
 from palpate.runs.result import read_result
 from palpate.runs.run import RESULT
 from palpate.worlds.contact.plates import PlatesWorld
 
-pytestmark = pytest.mark.optimised  # thousands of small steps one after the other
 SEED = 4
 
 

@@ -24,6 +24,8 @@ from palpate.tasks.maze.navigation import NavigationTask
 from palpate.worlds.maze.maze import BlindMaze
 from palpate.worlds.maze.mjcf import MjcfWorld
 
+pytestmark = pytest.mark.unchecked  # control loops, period by period
+
 
 @pytest.fixture
 def short(monkeypatch):

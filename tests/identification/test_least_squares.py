@@ -22,8 +22,6 @@ from palpate.parameters import FreeParameters, LogNormal, parameter
 from palpate.recordings import Aligned
 from toys import CartState
 
-pytestmark = pytest.mark.optimised
-
 PRIOR = LogNormal(1.0, 0.5)
 
 

@@ -30,8 +30,6 @@ from palpate.learning.off_policy.loop import Compiled
 from palpate.runs import Run
 from small_environments import Bandit, Leaving, Priced, Regulator, side_by_side
 
-pytestmark = pytest.mark.optimised
-
 SMALL = SoftActorCritic(width=32, learning_rate=3e-3, target_rate=0.02)
 TINY = SoftActorCritic(width=16, depth=1)
 RECOVERING = RecoveryAgent(TINY, SafetyCritic(width=16, depth=1), threshold=0.4)

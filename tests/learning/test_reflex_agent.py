@@ -31,8 +31,6 @@ from palpate.worlds.gymnasium import GymnasiumWorlds, features_of
 from runway import PERIODS, Run, Runway
 from small_environments import Bandit, side_by_side
 
-pytestmark = pytest.mark.optimised
-
 DISCOUNT, LENGTH = 0.7, 5
 CRITIC = SafetyCritic(DISCOUNT, learning_rate=3e-3, target_rate=0.05, width=32)
 AGENT = ReflexAgent(

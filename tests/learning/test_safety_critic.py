@@ -25,8 +25,6 @@ from palpate.learning.off_policy.recovery import RecoveryState
 from palpate.runs import Run
 from small_environments import Cliff, side_by_side
 
-pytestmark = pytest.mark.optimised
-
 DISCOUNT, LENGTH = 0.7, 5
 CRITIC = SafetyCritic(DISCOUNT, learning_rate=3e-3, target_rate=0.05, width=32)
 TASK = SoftActorCritic(width=32, learning_rate=3e-3)

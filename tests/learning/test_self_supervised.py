@@ -21,8 +21,6 @@ from palpate.runs import Run
 from palpate.runs.storage import plain
 from toys import Cart, CartToOrigin, Pendulum, PendulumDamping
 
-pytestmark = pytest.mark.optimised
-
 CART, PENDULUM = Cart(1.0, 0.5), Pendulum(1.0, 0.2)
 SMALL = {"batch": 32, "starts": 256, "width": 16, "learning_rate": 3e-3, "observation_noise": 0.0}
 ONE_STAGE = {**SMALL, "horizon_curriculum": False}  # one compilation

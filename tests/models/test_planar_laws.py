@@ -16,8 +16,6 @@ from palpate.models.planar.shapes import rectangle
 from palpate.models.planar.system import GRAVITY
 from palpate.models.planar.wheels import wheel_at_angle, wheel_axes
 
-pytestmark = pytest.mark.optimised
-
 run = jax.jit(rollout)
 BOX = rectangle(1.2, 0.6)
 SMOOTH = {"floor_friction": 0.0, "floor_damping": 0.0}

@@ -27,6 +27,8 @@ from palpate.worlds.rope.rope import (
 from palpate.worlds.world import DivergedError
 from small_rope import QUIET, SMALL, commands, seen
 
+pytestmark = pytest.mark.unchecked  # control loops, period by period
+
 SMALL_ROPE = RopeConfiguration(**SMALL, **QUIET)
 PERIOD = SMALL_ROPE.control_period
 

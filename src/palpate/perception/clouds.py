@@ -68,8 +68,8 @@ class Cloud:
         """How much each point and its neighbours are on one flat surface: 1, less at edges and
         steps."""
         near = self.neighbours
-        alike = np.sum(self.normals[:, None] * self.normals[near], axis=2)
-        step = np.sum(self.normals[:, None] * (self.points[near] - self.points[:, None]), axis=2)
+        alike = np.vecdot(self.normals[:, None], self.normals[near])
+        step = np.vecdot(self.normals[:, None], self.points[near] - self.points[:, None])
         step /= 3e-3 + 2.0 * self.deviation[:, None]
         weight = np.clip(alike, 0.0, 1.0) ** 4 * np.exp(-0.5 * step**2)
         count, each = near.shape
@@ -113,7 +113,7 @@ class Cloud:
         for image, blank in zip(self.images, self.blank, strict=True):
             inside, row, column, _ = _pixels(image, points)
             toward = np.asarray(image.pinhole.position) - points
-            facing = np.sum(normals * toward, axis=1) > FACING * np.linalg.norm(toward, axis=1)
+            facing = np.vecdot(normals, toward) > FACING * np.sqrt(np.vecdot(toward, toward))
             found |= inside & facing & blank[row, column]
         return found
 
@@ -139,9 +139,9 @@ def _across(
 ) -> Float[np.ndarray, "m 3"]:
     """Of the normals of chosen points what is across the way to the camera."""
     toward = np.asarray(image.pinhole.position) - points[chosen]
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     normals = normals[chosen]
-    return normals - np.sum(normals * toward, axis=1, keepdims=True) * toward
+    along = np.vecdot(normals, toward) / np.vecdot(toward, toward)
+    return normals - along[:, None] * toward
 
 
 def noise_at(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -274,7 +274,7 @@ def _normals(
     spread = np.einsum("nki,nkj->nij", around, around) / neighbours.shape[1]
     values, vectors = np.linalg.eigh(spread)
     normals = vectors[:, :, 0]
-    toward = np.sum(normals * (viewpoints - points), axis=1)
+    toward = np.vecdot(normals, viewpoints - points)
     normals = normals * np.where(toward < 0.0, -1.0, 1.0)[:, None]
     reach = distance[:, -1]
     flat = values[:, 0] < 0.35 * values[:, 1]

@@ -52,7 +52,7 @@ def evidence(
     distance, index = cloud.tree.query(points[candidates], distance_upper_bound=reach)
     near = np.isfinite(distance)
     met, index = candidates[near], index[near]
-    alike = np.sum(cloud.normals[index] * normals[met], axis=1) > AGREES
+    alike = np.vecdot(cloud.normals[index], normals[met]) > AGREES
     if others is not None:
         alike &= ~others[index]
     found = np.full(len(points), HIDDEN)
@@ -166,7 +166,8 @@ def smooth_labels(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels poin
     """
     chance = _softmax(given)
     for _ in range(ROUNDS):
-        chance = _softmax(given + SMOOTH * (cloud.surface_graph @ chance.T).T)
+        # label by label: the product of all at once lies the other way in memory, slow to reduce
+        chance = _softmax(given + SMOOTH * np.stack([cloud.surface_graph @ one for one in chance]))
     return chance
 
 

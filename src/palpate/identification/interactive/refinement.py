@@ -188,7 +188,7 @@ def _add_pair(
     distance, index = other.tree.query(source, distance_upper_bound=reach)
     met = np.isfinite(distance)
     index = np.where(met, index, 0)
-    met &= np.sum(other.normals[index] * turned, axis=1) > ALIKE
+    met &= np.vecdot(other.normals[index], turned) > ALIKE
     if met.sum() < FEWEST:
         return
     start, source, index = one.points[own][met], source[met], index[met]
@@ -196,12 +196,12 @@ def _add_pair(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     deviation = one.deviation[own][met] ** 2 + other.deviation[index] ** 2 + MODEL_ERROR**2
     scale = np.sqrt(deviation)
-    standard = np.sum(normal * (source - other.points[index]), axis=1) / scale
+    standard = np.vecdot(normal, source - other.points[index]) / scale
     rows = np.zeros((len(source), len(sums.slope)))
     for axis in range(AXES):
         varied = screw.varied(STEP * np.eye(AXES)[axis])
-        rows[:, axis] = np.sum(normal * (varied.pose(turn).at(start) - source), axis=1) / STEP
-    along = np.sum(normal * screw.velocity(source), axis=1)
+        rows[:, axis] = np.vecdot(normal, varied.pose(turn).at(start) - source) / STEP
+    along = np.vecdot(normal, screw.velocity(source))
     for look, sign in ((second, 1.0), (first, -1.0)):
         if look in column:
             rows[:, column[look]] = sign * along

@@ -67,12 +67,12 @@ def register(cloud: Cloud, onto: Cloud) -> tuple[Pose, int]:
         distance, index = onto.tree.query(there, distance_upper_bound=REACH)
         met = np.flatnonzero(np.isfinite(distance))
         planes = onto.normals[index[met]]
-        alike = np.sum(planes * facing[met], axis=1) > AGREES
+        alike = np.vecdot(planes, facing[met]) > AGREES
         met, planes = met[alike], planes[alike]
         count = len(met)
         if count < FEWEST:
             return NOWHERE, count
-        missed = np.sum((there[met] - onto.points[index[met]]) * planes, axis=1)
+        missed = np.vecdot(there[met] - onto.points[index[met]], planes)
         noise = np.hypot(deviation[met], onto.deviation[index[met]])
         spread = max(1.0, 1.48 * float(np.median(np.abs(missed) / noise)))
         standard = missed / (noise * spread)

@@ -1,6 +1,7 @@
 """What every test may ask for: float64, and no implicit promotion of dtypes."""
 
 import atexit
+import functools
 import gc
 import os
 import shutil
@@ -86,6 +87,8 @@ def room_for_compiled_functions():
 def short_tuning(monkeypatch):
     """The damper beside a rope's controller is tuned for a moment, and not kept for other tests."""
     monkeypatch.setattr(baselines, "TUNING", 0.2)
+    few = functools.partial(baselines.tune, ropes=1, candidates=4)
+    monkeypatch.setattr(baselines, "tune", lambda base, start, **_: few(base, start))
     monkeypatch.setattr(baselines, "tune_gains", baselines.tune_gains.__wrapped__)
 
 
@@ -114,5 +117,9 @@ def toys(monkeypatch):
 
 
 def pytest_collection_finish():
-    """What is there when the tests begin stays to the end: not to be looked through each time."""
+    """What is there when the tests begin stays to the end: not to be looked through each time.
+
+    What is compiled makes more objects than the collector expects: it looks more seldom.
+    """
     gc.freeze()
+    gc.set_threshold(50_000, 20, 20)

@@ -22,6 +22,8 @@ from palpate.perception.clouds import Cloud, cloud_of
 from palpate.trials.appliance.score import difference
 from palpate.worlds.depth import DepthSensor, depth_image
 
+pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
+
 SCENE = """
 <mujoco>
   <worldbody>

@@ -78,7 +78,7 @@ def room_for_compiled_functions():
     if MAPS.exists() and MOST.exists():
         with MAPS.open() as maps:
             count = sum(1 for _ in maps)
-        if count > int(MOST.read_text()) // 8:
+        if count > int(MOST.read_text()) // 16:
             jax.clear_caches()
             gc.collect()
 
@@ -122,4 +122,4 @@ def pytest_collection_finish():
     What is compiled makes more objects than the collector expects: it looks more seldom.
     """
     gc.freeze()
-    gc.set_threshold(50_000, 20, 20)
+    gc.set_threshold(10_000, 10, 10)

@@ -1,4 +1,4 @@
-"""What every test may ask for: float64, and no implicit promotion of dtypes."""
+"""How tests are compiled, checked and collected, and what each may ask for, such as float64."""
 
 import atexit
 import functools
@@ -20,13 +20,13 @@ from palpate.trials.rope import baselines
 # The older code generator compiles twice as fast, in one piece as each core has a test of its own.
 # A flag that XLA does not know ends the process: only for the versions that it was measured with.
 if jax.__version__.startswith("0.10."):
-    os.environ["XLA_FLAGS"] = " ".join(
-        [
-            os.environ.get("XLA_FLAGS", ""),
-            "--xla_cpu_use_fusion_emitters=false",
-            "--xla_cpu_parallel_codegen_split_count=1",
-        ]
-    ).strip()
+    for flag in (
+        "--xla_cpu_use_fusion_emitters=false",
+        "--xla_cpu_parallel_codegen_split_count=1",
+    ):
+        given = os.environ.get("XLA_FLAGS", "")
+        if flag.partition("=")[0] not in given:
+            os.environ["XLA_FLAGS"] = f"{given} {flag}".strip()
 
 # What was compiled once serves the other workers and child processes, until the tests end.
 CACHE = {

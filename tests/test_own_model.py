@@ -102,8 +102,8 @@ def test_the_page_shows_what_was_observed_beside_what_is_predicted(workshop):
 
 
 def test_draws_of_it_are_shown_as_a_fan_and_come_back(workshop, capsys):
-    few = "--method local-global --chains 2 --draws 20 --fixed inertia --init model"
-    do(f"identify door.py:Door R.csv {CHANNELS} {few} --out drawn")
+    drawn = "--method local-global --chains 2 --draws 100 --fixed inertia --init model"
+    do(f"identify door.py:Door R.csv {CHANNELS} {drawn} --out drawn")
     assert "inertia" not in capsys.readouterr().out
     curves = read_evidence("drawn").prediction
     assert curves is not None
@@ -111,10 +111,10 @@ def test_draws_of_it_are_shown_as_a_fan_and_come_back(workshop, capsys):
     assert draws.shape == (100, 1, 40)
     assert np.abs(draws - observed).max() < 0.5
     models = read_models("drawn/posterior.npz")
-    assert models.damping.shape == (40,)
+    assert models.damping.shape == (200,)
     spread = np.std(models.friction)
-    assert spread < 0.2 * TRUE["friction"]
-    assert abs(np.median(models.friction) - TRUE["friction"]) < 2 * spread
+    assert spread < 0.1 * TRUE["friction"]
+    assert abs(np.median(models.friction) - TRUE["friction"]) < spread
 
 
 def test_the_file_says_which_class_of_which_file_it_holds(workshop):

@@ -1,5 +1,7 @@
 """Scenes of MuJoCo before a depth camera, for the tests."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -7,8 +9,11 @@ from palpate.numerics.pinhole import DepthImage, Pinhole
 from palpate.worlds.depth import DepthSensor, depth_image
 
 
-def depth_of(scene: str, positions: float, pinhole: Pinhole, seed: int) -> DepthImage:
-    """What a camera sees of a scene (MJCF) with all its joints at a position, with noise."""
+def depth_of(
+    scene: str, positions: float | Sequence[float], pinhole: Pinhole, seed: int
+) -> DepthImage:
+    """What a camera sees of a scene (MJCF) with its joints at positions, or all at one, with
+    noise."""
     model = mujoco.MjModel.from_xml_string(scene)
     data = mujoco.MjData(model)
     data.qpos[:] = positions

@@ -117,3 +117,13 @@ def test_what_stopped_at_once_is_held_rather_than_at_its_end():
     assert chance(soon, LEFT_EDGE, OUT) > 3.0 * chance(late, LEFT_EDGE, OUT)
     assert chance(soon, middle, IN) < chance(late, middle, IN)
     assert chance(soon, middle, OUT) < 0.05  # it has withstood that
+
+
+def test_what_takes_half_of_a_force_moves_half_as_easily_and_withstands_half():
+    """Of a surface on a part that goes at a half of the hand's force."""
+    half = moves(certain(1), FRONT, LEFT_EDGE[None], OUT[None], np.array([0.5]))[0]
+    assert half == pytest.approx(chance(certain(1), np.array([0.0, -0.01, 0.0]), OUT), abs=0.02)
+    assert half < chance(certain(1), LEFT_EDGE, OUT)
+    whole = posterior(certain(1), FRONT, [Pull(LEFT_EDGE, OUT, False, 0.0, True)])
+    carried = posterior(certain(1), FRONT, [Pull(LEFT_EDGE, OUT, False, 0.0, True, 0.5)])
+    assert chance(whole, LEFT_EDGE, OUT) == 0.0 < chance(carried, LEFT_EDGE, OUT)

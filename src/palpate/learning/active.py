@@ -10,12 +10,13 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
 
-from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.handling import Push
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import way_information
 from palpate.identification.interactive.screws import Screw
@@ -37,7 +38,14 @@ REACH = 0.3  # m that a hand goes
 UNKNOWN = 0.3  # of its reach that a hand is expected to take a part beyond where it was seen
 GRIPS = 0.12, 0.38, 0.5, 0.62, 0.88  # shares of a surface's sides at which a hand takes hold
 ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an end
+GIVES = 0.17  # share of a hand's force at which a part goes where its lever is longest, as a rule
+BLOCKED = 0.05  # rad or m: with no more room a part stays where it is
+TURNED = 0.3  # rad or m that a part has to go to hide what is on it
+LATER = 0.5  # what a try is worth that has to wait for another pull
 ASIDE = 0.3  # how much to the side of the normal a hand also pulls, which tries two joints at once
+
+Guessed = tuple[Cloud, list[Surface], Float[np.ndarray, " surfaces"]]
+_GUESSED: WeakKeyDictionary[Cloud, tuple[MovableGuess, np.ndarray, Guessed]] = WeakKeyDictionary()
 
 Choice = Callable[[Twin, np.random.Generator], Push]
 Points = Float[np.ndarray, "n 3"]
@@ -85,7 +93,9 @@ def choose_best(
     comes with palpate."""
     look = len(twin.looks) - 1
     guess = load_guess() if guess is None else guess
-    options = [*_tries(twin, look, random, guess, worth), *_repeats(twin, look, random, worth)]
+    tries = _tries(twin, look, random, guess, worth)
+    hidden = _hidden_tries(twin, look, random, guess, worth)
+    options = [*tries, *_repeats(twin, look, random, worth, hidden)]
     if not options:  # nothing flat is large enough
         return at_random(twin, random)
     return max(options, key=lambda one: one[0])[1]
@@ -101,33 +111,31 @@ def at_random(twin: Twin, random: np.random.Generator) -> Push:
 
 
 def _tries(
-    twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess, worth: Worth
+    twin: Twin,
+    look: int,
+    random: np.random.Generator,
+    guess: MovableGuess,
+    worth: Worth,
+    part: int | None = None,
 ) -> list[tuple[float, Push]]:
-    """Of every surface, the pull that would show best whether it moves."""
-    cloud, found = twin.looks[look], []
-    every = surfaces(cloud, twin.labels[look], random)
-    before = guess(features_of(cloud, every))
-    tried = [_handled_at(twin, surface, cloud) for surface in every]
+    """Of every surface of a look, or those of a part, the pull that would show best whether it
+    moves."""
+    found: list[tuple[float, Push]] = []
+    cloud, every, before = _guessed(twin, look, random, guess)
+    tried = [_handled_at(twin, surface, cloud, look) for surface in every]
     # a guess that was wrong of this appliance is trusted less in the rest of it
-    failed = before * [len(there) > 0 for there in tried]
+    failed = before * [len(pulls) + len(missed) > 0 for pulls, missed in tried]
     known = 1.0 + len(twin.parts)
     trust = known / (known + failed.sum() - failed)
-    for surface, chance, there in zip(every, trust * before, tried, strict=True):
-        pulls = [
-            movable.Pull(
-                one.push.point,
-                one.push.direction,
-                moved=one.moved,
-                travel=one.travel,
-                ended=one.travel < ENDED * one.push.travel,
-            )
-            for one in there
-            if one.held
-        ]
+    for surface, chance, (pulls, missed) in zip(every, trust * before, tried, strict=True):
+        if part not in (None, surface.part):
+            continue
         belief = movable.posterior(movable.prior(float(chance)), surface, pulls)
         points, directions = _grips(cloud, surface)
-        goes = movable.moves(belief, surface, points, directions)
-        missed = [one.push.point for one in there if not one.held]
+        # where they were seen, not where the mean of all looks has them
+        points = twin.looks[look].points[cloud.tree.query(points)[1]]
+        force = _force_before_carrier(twin, surface.part, look, points, directions)
+        goes = movable.moves(belief, surface, points, directions, force)
         near = np.zeros(len(points))
         for point in missed:
             near += np.linalg.norm(points - point, axis=1) < BESIDE
@@ -135,6 +143,60 @@ def _tries(
         best = int(np.argmax(value))
         found.append((float(value[best]), Push(points[best], directions[best])))
     return found
+
+
+def _guessed(twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess) -> Guessed:
+    """A look in the mean of all, its surfaces, and how likely each is to move before it is tried.
+
+    They are kept until what is known of the look changes.
+    """
+    labels, known = twin.labels[look], _GUESSED.get(twin.looks[look])
+    if known is None or known[0] is not guess or not np.array_equal(known[1], labels):
+        cloud = twin.averaged(look)
+        every = surfaces(cloud, labels, random)
+        known = guess, labels, (cloud, every, guess(features_of(cloud, every)))
+        _GUESSED[twin.looks[look]] = known
+    return known[2]
+
+
+def _hidden_tries(
+    twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess, worth: Worth
+) -> dict[tuple[int, float], float]:
+    """What it is worth to take a part (its number) one way (1 or -1), back to where it was seen
+    first: what is on it may be hidden now."""
+    found: dict[tuple[int, float], float] = {}
+    for number, part in enumerate(twin.parts):
+        way = part.positions[part.shown] - part.positions[look]
+        if abs(way) > TURNED:
+            tries = _tries(twin, part.shown, random, guess, worth, number)
+            found[number, math.copysign(1.0, way)] = LATER * max([0.0, *(one for one, _ in tries)])
+    return found
+
+
+def _force_before_carrier(
+    twin: Twin, part: int, look: int, points: Points, directions: Points
+) -> Float[np.ndarray, " n"]:
+    """Share of a hand's force at which the part that it is put to goes itself, at each point.
+
+    All of it where that has no room to go.
+    """
+    force = np.ones(len(points))
+    if part < 0:
+        return force
+    screw = twin.screw(part, look)
+    lever = _lever(screw, twin.pose(part, look).at(twin.parts[part].support[0]))
+    along = np.sum(screw.velocity(points) * directions, axis=1) / lever
+    for sign in (-1.0, 1.0):
+        ahead = sign * along > GIVES
+        if _room(twin, part, look, sign, REACH / lever) > BLOCKED:
+            force[ahead] = GIVES / np.abs(along[ahead])
+    return force
+
+
+def _lever(screw: Screw, points: Points) -> float:
+    """How far a point of some goes at most for each rad or m of a joint, m or 1."""
+    velocity = np.broadcast_to(screw.velocity(points), points.shape)
+    return max(float(np.linalg.norm(velocity, axis=1).max()), 0.1)
 
 
 def _grips(
@@ -155,34 +217,67 @@ def _grips(
     return np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1))
 
 
-def _handled_at(twin: Twin, surface: Surface, cloud: Cloud) -> list[Handling]:
-    """What hands did at a surface, but for what moved a part that is known: it says nothing of a
-    surface beside it."""
-    return [
-        one
-        for one, (held, _) in zip(twin.handled, twin.held, strict=True)
-        if _at(one, surface, cloud) and not (one.moved and (surface.part >= 0 or held >= 0))
-    ]
+def _handled_at(
+    twin: Twin, surface: Surface, cloud: Cloud, look: int
+) -> tuple[list[movable.Pull], list[Float[np.ndarray, "3"]]]:
+    """Pulls of hands at a surface, which may have been elsewhere then, and where others got no
+    hold.
+
+    What moved a part that is known says nothing of a surface beside it, and of one that it carries
+    only that it did not go before its carrier.
+    """
+    pulls: list[movable.Pull] = []
+    missed: list[np.ndarray] = []
+    for one, (held, before) in zip(twin.handled, twin.held, strict=True):
+        motion = twin.motion(surface.part, before, look)
+        point = motion.at(one.push.point[None])[0]
+        carried = one.moved and held == surface.part >= 0
+        if not _at(point, surface, cloud) or (
+            one.moved and not carried and (surface.part >= 0 or held >= 0)
+        ):
+            continue
+        if not one.held:
+            missed.append(point)
+            continue
+        pull = movable.Pull(
+            point,
+            motion.turned(one.push.direction[None])[0],
+            moved=one.moved,
+            travel=one.travel,
+            ended=one.travel < ENDED * one.push.travel,
+        )
+        if carried:
+            force = _force_before_carrier(
+                twin, held, before, one.push.point[None], one.push.direction[None]
+            )
+            pull = pull._replace(moved=False, travel=0.0, ended=True, force=float(force[0]))
+        pulls.append(pull)
+    return pulls, missed
 
 
-def _at(one: Handling, surface: Surface, cloud: Cloud) -> bool:
-    """Whether a handling was at a surface, or at what stands off it there.
+def _at(point: Float[np.ndarray, "3"], surface: Surface, cloud: Cloud) -> bool:
+    """Whether a point is on a surface, or on what stands off it there.
 
     Of a cloud that is noisy or sparse some points of a surface may make another one.
     """
-    height = float((one.push.point - surface.centre) @ surface.normal)
+    height = float((point - surface.centre) @ surface.normal)
     if not -max(BEHIND, 2.0 * cloud.error) < height < max(STANDS_OFF[1], 2.0 * cloud.error):
         return False
-    below = one.push.point - height * surface.normal
+    below = point - height * surface.normal
     spacing = math.sqrt(surface.area / len(surface.members))
     away = np.linalg.norm(cloud.points[surface.members] - below, axis=1).min()
-    return bool(away < max(BESIDE, 2.0 * spacing))
+    return bool(away < max(BESIDE, 1.55 * spacing))
 
 
 def _repeats(
-    twin: Twin, look: int, random: np.random.Generator, worth: Worth
+    twin: Twin,
+    look: int,
+    random: np.random.Generator,
+    worth: Worth,
+    hidden: Mapping[tuple[int, float], float],
 ) -> list[tuple[float, Push]]:
-    """Of every part that is known, the pulls either way that would tell of its joint and forces."""
+    """Of every part that is known, the pulls either way that would tell of its joint and forces,
+    and bring back what is hidden."""
     cloud, found = twin.looks[look], []
     for number, part in enumerate(twin.parts):
         members = np.flatnonzero(twin.labels[look] == number)
@@ -206,6 +301,7 @@ def _repeats(
             go = sign * min(reach, _room(twin, number, look, sign, reach))
             felt = sum(one * sign > 0.0 for one in gone)
             value = worth.of_repeat(Repeat(part, screw, go, point, felt, options, share))
+            value += hidden.get((number, sign), 0.0)
             found.append((value, Push(point, sign * along / np.linalg.norm(along))))
     return found
 

@@ -57,13 +57,14 @@ class Belief(NamedTuple):
 
 class Pull(NamedTuple):
     """Where a hand pulled and which way, and what came of it: how far it got, and whether something
-    moved."""
+    moved. Of its `force` no more than this share got there, as something else gave way."""
 
     point: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
     moved: bool
     travel: float  # m
     ended: bool  # before the hand had gone as far as it would
+    force: float = 1.0
 
 
 def prior(chance: float) -> Belief:
@@ -131,9 +132,11 @@ def moves(
     surface: Surface,
     points: Float[np.ndarray, "n 3"],
     directions: Float[np.ndarray, "n 3"],
+    force: Float[np.ndarray, " n"] | float = 1.0,
 ) -> Float[np.ndarray, " n"]:
-    """Probability that each pull moves the surface."""
-    goes = _goes(_shares(surface, points, directions), belief.withstood)
+    """Probability that each pull moves the surface, with a share of a hand's `force`."""
+    shares = np.reshape(force, (-1, 1)) * _shares(surface, points, directions)
+    goes = _goes(shares, belief.withstood)
     return (_held(surface, points) * goes) @ belief.chances
 
 
@@ -143,6 +146,7 @@ def posterior(belief: Belief, surface: Surface, pulls: Sequence[Pull]) -> Belief
     for pull in pulls:
         point, direction = pull.point[None], pull.direction[None]
         shares, held = _shares(surface, point, direction)[0], _held(surface, point)[0]
+        shares = pull.force * shares
         goes = held * _goes(shares, withstood)
         if pull.moved:
             goes[0] = STRAYED

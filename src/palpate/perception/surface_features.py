@@ -5,12 +5,21 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from palpate.perception.clouds import Cloud, extent_of
-from palpate.perception.surfaces import OUTLINE, Surface
+from palpate.perception.surfaces import (
+    FLAT,
+    NEIGHBOURS,
+    OUTLINE,
+    STANDS_OFF,
+    STEP,
+    Surface,
+)
 
 BEHIND, BEFORE = 0.08, 0.3  # m from a surface, at which it is asked whether space is free
 TOLERANCE = 3.0  # standard deviations of depth
+BESIDE = 3.0  # of the distance between points, or `OUTLINE`: what is so near is around a surface
 TURNS = np.radians(np.arange(0.0, 90.0, 1.5))  # of a scene about the vertical
 SHARP = 8  # power of cosines by which the surfaces that are along its axes decide how it is turned
 LEAST = 1e-3  # m and m^2: of what has no size
@@ -35,6 +44,7 @@ FEATURES = (
     "out of the middle",  # along its normal
     "on a part",  # that is known
     "largest of its part",
+    "stands off what is around it",  # from -1 to 1
 )
 
 
@@ -67,6 +77,7 @@ def features_of(cloud: Cloud, every: Sequence[Surface]) -> Float[np.ndarray, "su
             away @ one.normal / extent,
             float(one.part >= 0),
             float(largest),
+            _step_around(cloud, one),
         ])  # fmt: skip
     return np.array(found)
 
@@ -82,6 +93,25 @@ def _surroundings(cloud: Cloud, surface: Surface) -> list[float]:
     goes_on, _ = cloud.surfaces(furthest + OUTLINE * ways, TOLERANCE)
     ahead = (cloud.points - surface.centre) @ surface.normal > OUTLINE
     return [float(each.mean()) for each in (before, behind, goes_on, ahead)]
+
+
+def _step_around(cloud: Cloud, surface: Surface) -> float:
+    """How far a surface stands off what is beside it and faces as it does; 0 for flush, and where
+    nothing is.
+
+    Near 1 or -1 is what is further than a surface may be from its plane.
+    """
+    own = cloud.points[surface.members]
+    reach = max(OUTLINE, BESIDE * math.sqrt(surface.area / len(own)))
+    distance = cKDTree(own[::2]).query(cloud.points, distance_upper_bound=reach)[0]
+    beside = np.isfinite(distance)
+    beside[surface.members] = False
+    height = (cloud.points[beside] - surface.centre) @ surface.normal
+    height = height[cloud.normals[beside] @ surface.normal > FLAT]
+    height = height[np.abs(height) < STANDS_OFF[1]]
+    if len(height) < NEIGHBOURS:
+        return 0.0
+    return math.tanh(-float(np.median(height)) / (STEP + 2.0 * cloud.error))
 
 
 def _axes(every: Sequence[Surface]) -> Float[np.ndarray, "3 3"]:

@@ -15,7 +15,10 @@ from scipy.spatial import cKDTree
 
 from palpate.perception.clouds import Cloud, extent_of
 
-SMALLEST = 0.004, 0.01  # m^2, and of the square of the scene's extent: less is no surface of a part
+SMALLEST = (
+    0.007,
+    0.017,
+)  # m^2, and of the square of the scene's extent: less is no surface of a part
 NEIGHBOURS = 8
 SEEDS, AROUND = 250, 60  # that planes grow from, and the points that are the first of each
 FLAT = 0.8  # cosine between a normal and that of its surface
@@ -23,8 +26,8 @@ STEP = 0.004  # m from a surface, beside noise
 STANDS_OFF = 0.01, 0.08  # m: what is so far before a surface may be a handle on it
 OUTLINE = 0.03  # m beside a surface's points: what stands off there stands on it
 TOGETHER = 0.05  # m between points of one handle
-BAR = 3.0  # of the side of the smallest surface: how long a bar is at least
-TOUCHING = 3.0  # of the distance between points of the cloud: points of one bar
+BAR = 2.4  # of the side of the smallest surface: how long a bar is at least
+TOUCHING = 2.4  # of the distance between points of the cloud: points of one bar
 
 Vector = Float[np.ndarray, "3"]
 
@@ -52,8 +55,9 @@ def surfaces(
     cloud: Cloud, labels: Int[np.ndarray, " points"], random: np.random.Generator
 ) -> list[Surface]:
     """The flat pieces of a cloud that are large enough to be a part's, each of one label."""
-    neighbours = cloud.tree.query(cloud.points, NEIGHBOURS + 1)[1]
-    size = float(np.median(cloud.tree.query(cloud.points[::50], 2)[0][:, 1])) ** 2
+    distance, neighbours = cloud.tree.query(cloud.points, NEIGHBOURS + 1)
+    # of a point: the circle through the last of its neighbours holds these and itself
+    size = math.pi * float(np.median(distance[:, NEIGHBOURS])) ** 2 / (NEIGHBOURS + 1)
     room = STEP + 2.0 * cloud.deviation
     smallest = min(SMALLEST[0], SMALLEST[1] * extent_of(cloud.points) ** 2)
     taken, pieces = np.zeros(len(cloud.points), bool), []

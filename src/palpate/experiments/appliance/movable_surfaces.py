@@ -28,7 +28,7 @@ NAME = "movable-surfaces"
 GUESS = "guess.safetensors"
 TRAINED, JUDGED = 720_000, 740_000  # seeds of the first appliances of each category
 CHUNK = 10  # seeds of a stage
-MINUTES = {"looks": 8, "training": 1}
+MINUTES = {"looks": 16, "training": 1}
 
 Probabilities = Float[np.ndarray, " surfaces"]
 

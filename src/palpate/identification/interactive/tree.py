@@ -8,6 +8,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from palpate.identification.interactive.averaging import average
 from palpate.identification.interactive.labels import (
     ON,
     distinguishing_looks,
@@ -178,6 +179,14 @@ class PartTree:
         if np.linalg.norm(ended - end) < TAKEN:
             return back.at(way)
         return back.at(np.repeat([way[:3].mean(axis=0), ended], 3, axis=0))
+
+    def averaged(self, look: int) -> Cloud:
+        """A look made less noisy by all others, as how its parts have moved is known."""
+        motions = {
+            part: [self.motion(part, other, look) for other in range(len(self.looks))]
+            for part in range(-1, len(self.parts))
+        }
+        return average(self.looks, self.labels, look, motions)
 
     # --- labels -------------------------------------------------------------------------------
 

@@ -1,0 +1,121 @@
+"""Where a hand pulls at what hangs on a door that goes as well."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from depth_scenes import depth_of
+from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.part import Part
+from palpate.identification.interactive.refinement import Estimate
+from palpate.identification.interactive.screws import Screw
+from palpate.identification.interactive.twin import Twin
+from palpate.learning import active
+from palpate.learning.active import WORTHS
+from palpate.learning.movable_guess import load_guess
+from palpate.numerics.pinhole import Pinhole
+from palpate.perception.clouds import cloud_of
+from palpate.perception.surfaces import surfaces
+
+OUT = np.array([1.0, 0.0, 0.0])
+DOOR = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.0, -0.3, 1.0]))
+SCENE = """
+<mujoco><worldbody>
+  <geom type="box" size=".02 .9 .7" pos="-.3 0 1"/>
+  <body pos="0 -.3 1"><joint axis="0 0 1"/>
+    <geom type="box" size=".01 .3 .4" pos="-.01 .3 0"/></body>
+</worldbody></mujoco>
+"""
+CAMERA = Pinhole.looking_at((0.0, 0.0, 1.0), (2.0, -0.6, 1.2), 160, 120, 1.0)
+
+
+def twin_at(turns: list[float]) -> Twin:
+    """One that knows the door, and where it was in each look."""
+    twin = Twin()
+    twin.looks = [cloud_of([depth_of(SCENE, turn, CAMERA, 0)]) for turn in turns]
+    outline = DOOR.point + np.array([[0.0, y, z] for y in (0.02, 0.6) for z in (-0.4, 0.4)])
+    estimate = Estimate(DOOR, np.array(turns), 1e-6 * np.eye(4), 0.0, 100.0)
+    support = outline, np.tile(OUT, (4, 1))
+    part = Part(-1, estimate, list(turns), {0: np.arange(50)}, [], support)
+    twin.parts.append(part)
+    twin.labels = [
+        np.where(DOOR.pose(-turn).at(cloud.points)[:, 0] > -0.1, 0, -1)
+        for turn, cloud in zip(turns, twin.looks, strict=True)
+    ]
+    return twin
+
+
+def door_of(twin: Twin, look: int):
+    every = surfaces(twin.looks[look], twin.labels[look], np.random.default_rng(0))
+    return max((one for one in every if one.part == 0), key=lambda one: one.area)
+
+
+def pulled(twin: Twin, point: np.ndarray, *, moved: bool) -> Handling:
+    way = np.linspace(0.0, 0.3 if moved else 0.0, 10)[:, None] * OUT
+    push = Push(point, OUT)
+    return Handling(push, twin.looks[0], twin.looks[-1], np.arange(10.0), point + way, 0.0 * way)
+
+
+def test_of_what_hangs_on_a_door_a_hand_moves_more_where_the_door_has_no_lever():
+    twin = twin_at([0.0])
+    points = DOOR.point + np.array([[0.0, 0.03, 0.1], [0.0, 0.3, 0.1], [0.0, 0.6, 0.1]])
+    ways = np.tile(OUT, (3, 1))
+    force = active._force_before_carrier(twin, 0, 0, points, ways)
+    assert force == pytest.approx([1.0, active.GIVES / 0.5, active.GIVES], abs=0.01)
+    # along the door nothing turns it, and what stands still does not go
+    sideways = np.tile([0.0, 0.0, 1.0], (3, 1))
+    assert active._force_before_carrier(twin, 0, 0, points, sideways) == pytest.approx(1.0)
+    assert active._force_before_carrier(twin, -1, 0, points, ways) == pytest.approx(1.0)
+
+
+def test_a_door_at_its_end_holds_what_hangs_on_it():
+    twin = twin_at([0.0, -0.5])
+    point = DOOR.pose(-0.5).at(DOOR.point + np.array([[0.0, 0.6, 0.1]]))
+    opens = -DOOR.velocity(point[0])[None] / np.linalg.norm(DOOR.velocity(point[0]))
+    assert active._force_before_carrier(twin, 0, 1, point, opens)[0] < 0.2
+    stopped = dataclasses.replace(
+        pulled(twin, point[0], moved=False), push=Push(point[0], opens[0])
+    )
+    twin.handled, twin.held = [stopped], [(0, 1)]
+    assert active._force_before_carrier(twin, 0, 1, point, opens)[0] == 1.0
+    assert active._force_before_carrier(twin, 0, 1, point, -opens)[0] < 0.2
+
+
+def test_a_pull_that_moved_the_door_says_where_it_is_now_that_its_flap_held_till_then():
+    twin = twin_at([0.0, -0.5])
+    point = DOOR.point + np.array([0.0, 0.3, 0.1])
+    twin.handled, twin.held = [pulled(twin, point, moved=True)], [(0, 0)]
+    door = door_of(twin, 1)
+    pulls, missed = active._handled_at(twin, door, twin.looks[1], 1)
+    assert not missed
+    assert [one.moved for one in pulls] == [False]
+    assert pulls[0].force == pytest.approx(active.GIVES / 0.5, abs=0.01)
+    assert pulls[0].point == pytest.approx(DOOR.pose(-0.5).at(point[None])[0])
+    assert pulls[0].direction == pytest.approx(DOOR.pose(-0.5).turned(OUT[None])[0])
+    # of something else that moved, the surface of the door learns nothing
+    twin.held = [(-1, 0)]
+    assert active._handled_at(twin, door, twin.looks[1], 1) == ([], [])
+
+
+def test_a_hand_that_got_no_hold_is_kept_apart():
+    twin = twin_at([0.0])
+    point = DOOR.point + np.array([0.0, 0.3, 0.1])
+    nothing = dataclasses.replace(
+        pulled(twin, point, moved=False),
+        times=np.zeros(1), points=point[None], forces=np.zeros((1, 3)),
+    )  # fmt: skip
+    twin.handled, twin.held = [nothing], [(0, 0)]
+    pulls, missed = active._handled_at(twin, door_of(twin, 0), twin.looks[0], 0)
+    assert not pulls
+    assert missed[0] == pytest.approx(point)
+
+
+def test_a_part_is_worth_bringing_back_to_where_it_showed_what_may_move_on_it():
+    twin, random = twin_at([0.0, -1.2]), np.random.default_rng(0)
+    found = active._hidden_tries(twin, 1, random, load_guess(), WORTHS["information"])
+    assert set(found) == {(0, 1.0)}
+    tries = active._tries(twin, 0, random, load_guess(), WORTHS["information"], 0)
+    assert found[0, 1.0] == pytest.approx(active.LATER * max(value for value, _ in tries))
+    assert found[0, 1.0] > 0.0
+    assert not active._hidden_tries(twin, 0, random, load_guess(), WORTHS["information"])

@@ -29,6 +29,10 @@ INSIDE, CONNECTED = 0.6, 0.5  # weights of neighbours: all of a point's inside a
 HINGE, LEAST_TURN = 0.07, 0.1  # m from an axis; rad that tell where an axis is
 MOST_EVIDENCE = 6.0  # of all looks together: their errors are not independent
 
+DISTINCT = 0.05  # m between two places
+JOINT_ERROR = 4e-3  # m, of where a joint takes a point
+MOST_OF_HEIGHT = 1.5  # of evidence, of each look: what the height of its surface tells at most
+
 OTHERS = 6  # looks that a look is held against
 LEAST_MOTION = 0.02  # rad or m: less is none
 TELLING = 0.3  # rad or m of a part: to be further away tells no more
@@ -87,6 +91,45 @@ def scores(
                 known.append((pose, same))
             found[label] += same
     return np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
+
+
+def height_evidence(
+    cloud: Cloud,
+    others: Sequence[Cloud],
+    motions: Sequence[Sequence[Pose]],
+    given: Scores,
+    part: int,
+    carrier: int,
+) -> Float[np.ndarray, " points"]:
+    """How much likelier each point is of the label of a part than of its carrier's (logarithm), by
+    how high the surface is where either label takes it.
+
+    A flap stands off its door by less than a point may be off its surface, where a joint is not
+    known well. But the carrier's joint takes points of both labels as far off: their difference
+    tells. Nothing is told of points that other labels explain better, or one of these two for sure.
+    """
+    found = np.zeros(len(cloud.points))
+    best = given[[part, carrier]].max(axis=0)
+    unsure = np.abs(given[part] - given[carrier]) < SURE
+    chosen = np.flatnonzero((best >= given.max(axis=0)) & unsure)
+    for number, other in enumerate(others):
+        poses = motions[part][number], motions[carrier][number]
+        if not len(chosen) or _same(*poses):
+            continue
+        # near a hinge both are the same place, but for what is not known of the hinge
+        ends = [pose.at(cloud.points[chosen]) for pose in poses]
+        known = np.linalg.norm(ends[0] - ends[1], axis=1) > DISTINCT
+        squares = []
+        for pose, points in zip(poses, ends, strict=True):
+            normals = pose.turned(cloud.normals[chosen])
+            known &= evidence(other, points, normals) == ON
+            index = other.tree.query(points, NEAREST)[1]
+            away = np.vecdot(points[:, None] - other.points[index], other.normals[index])
+            squares.append(np.median(away, axis=1) ** 2)
+        noise = cloud.deviation[chosen] ** 2 + other.error**2 / NEAREST + JOINT_ERROR**2
+        gain = 0.5 * (squares[1] - squares[0]) / noise
+        found[chosen] += np.where(known, np.clip(gain, -MOST_OF_HEIGHT, MOST_OF_HEIGHT), 0.0)
+    return np.clip(found, -MOST_EVIDENCE, MOST_EVIDENCE)
 
 
 def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) -> list[int]:

@@ -29,7 +29,7 @@ GAIN = 1.0  # of evidence, for each point: how much better a joint on a carrier 
 POINTS = 120  # of a piece, by which it is tried
 TURNS = np.arange(-2.2, 2.21, 0.1)  # rad
 TRIED = 3  # of the options, the best
-LEAST_EVIDENCE = 200.0  # of evidence, of all points and looks
+LEAST_EVIDENCE = 500.0  # of evidence, of all points and looks
 SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enough
 UNSURE = 45.0  # deg: a part whose axis is less known than so is shown by no two looks
 LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
@@ -278,17 +278,37 @@ def _insert(tree: PartTree, option: Option) -> bool:
         tree.remove(number, part.parent)
         return False
     part.settle(estimate)
-    _replace_same(tree, number)
+    merge_same(tree)
     return True
 
 
-def _replace_same(tree: PartTree, number: int) -> None:
-    """Take out parts that turn about the same hinge on the same carrier, as one that has gone
-    further than it was sought."""
-    part = tree.parts[number]
-    for old in reversed(range(number)):
-        one = tree.parts[old]
-        if one.parent == part.parent and _is_same(part.screw, one.screw):
-            part.ways = one.ways + part.ways
-            tree.remove(old, number)
-            number -= 1
+def merge_same(tree: PartTree) -> None:
+    """Of parts that turn about one hinge on the same carrier keep the one that is known best.
+
+    They are one part, which went further than it was sought, or showed its other side. What stands
+    still may have two doors above each other on one hinge.
+    """
+    for number in reversed(range(len(tree.parts))):
+        part = tree.parts[number]
+        for other, one in enumerate(tree.parts[:number]):
+            if 0 <= part.parent == one.parent and _may_be_same(part, one):
+                known = min(part, one, key=lambda each: each.estimate.intervals[0])
+                known.ways = one.ways + part.ways
+                shown = {look for each in (part, one) for look in each.seen}
+                tree.remove(*((other, number) if known is part else (number, other)))
+                for look in shown:
+                    tree.find(tree.parts.index(known), look, beyond=FURTHER)
+                    tree.relabel(look)
+                known.settle(tree.estimate(known))
+                break
+
+
+def _may_be_same(part: Part, other: Part) -> bool:
+    """Whether two hinges are the same one, as well as both are known."""
+    turned, aside = np.add(part.estimate.intervals, other.estimate.intervals)
+    one, line = part.screw, other.screw
+    if one.joint != "revolute" or line.joint != "revolute":
+        return False
+    angle = np.degrees(np.arccos(min(abs(float(one.axis @ line.axis)), 1.0)))
+    away = np.linalg.norm(np.cross(one.point - line.point, line.axis))
+    return bool(angle < min(np.degrees(np.arccos(LIKE)) + turned, UNSURE) and away < HINGE + aside)

@@ -13,6 +13,7 @@ from palpate.identification.interactive.labels import (
     ON,
     distinguishing_looks,
     evidence,
+    height_evidence,
     prior,
     scores,
     smooth_labels,
@@ -212,7 +213,16 @@ class PartTree:
             return np.ones((1, len(self.looks[look].points)))
         others, motions = self._telling(look, candidate)
         cloud = self.looks[look]
-        given = scores(cloud, [self.looks[other] for other in others], motions)
+        seen = [self.looks[other] for other in others]
+        given = scores(cloud, seen, motions)
+        parts = [] if candidate else enumerate(self.parts)
+        carried = [(part, one) for part, one in parts if one.parent >= 0]
+        heights = [
+            height_evidence(cloud, seen, motions, given, part + 1, one.parent + 1)
+            for part, one in carried
+        ]
+        for (part, _), height in zip(carried, heights, strict=True):
+            given[part + 1] += height
         given += prior(cloud, given, motions)
         given[0] = np.maximum(given[0], UNKNOWN * len(others))
         return smooth_labels(cloud, given)

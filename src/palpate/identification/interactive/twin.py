@@ -11,7 +11,7 @@ from palpate.identification.interactive.discovery import CARRIED, TELLS, discove
 from palpate.identification.interactive.explanation import FURTHER, find_moved_part, may_have_moved
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import HIDDEN, evidence
-from palpate.identification.interactive.splitting import split
+from palpate.identification.interactive.splitting import merge_same, split
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
 
@@ -50,6 +50,7 @@ class Twin(PartTree):
         if split(self, [before, after]):
             self._explain_earlier()
             self.refit(-1)
+        merge_same(self)
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""

@@ -15,10 +15,8 @@ from scipy.spatial import cKDTree
 
 from palpate.perception.clouds import Cloud, extent_of
 
-SMALLEST = (
-    0.007,
-    0.017,
-)  # m^2, and of the square of the scene's extent: less is no surface of a part
+# m^2, and of the square of the scene's extent: less is no surface of a part
+SMALLEST = 0.007, 0.017
 NEIGHBOURS = 8
 SEEDS, AROUND = 250, 60  # that planes grow from, and the points that are the first of each
 FLAT = 0.8  # cosine between a normal and that of its surface

@@ -182,11 +182,13 @@ def _edges(surface: Surface) -> list[Screw]:
     return found
 
 
-def _is_same(hinge: Screw, other: Screw) -> bool:
-    """Whether another joint turns about the same line as a hinge, as well as edges are known."""
-    aside = np.linalg.norm(np.cross(hinge.point - other.point, other.axis))
-    alike = abs(hinge.axis @ other.axis) > LIKE
-    return other.joint == "revolute" and bool(alike and aside < HINGE)
+def _is_same(hinge: Screw, other: Screw, turned: float = 0.0, aside: float = 0.0) -> bool:
+    """Whether another joint turns about the same line as a hinge, as well as edges are known, or
+    less well by as much as the other is `turned` (deg) and `aside` (m)."""
+    away = np.linalg.norm(np.cross(hinge.point - other.point, other.axis))
+    angle = np.degrees(np.arccos(min(abs(float(hinge.axis @ other.axis)), 1.0)))
+    alike = angle < min(np.degrees(np.arccos(LIKE)) + turned, UNSURE)
+    return other.joint == "revolute" and bool(alike and away < HINGE + aside)
 
 
 def _explained(tree: PartTree, look: int, other: int) -> Bool[np.ndarray, " points"]:
@@ -304,11 +306,7 @@ def merge_same(tree: PartTree) -> None:
 
 
 def _may_be_same(part: Part, other: Part) -> bool:
-    """Whether two hinges are the same one, as well as both are known."""
+    """Whether two parts turn about one hinge, as well as both are known."""
     turned, aside = np.add(part.estimate.intervals, other.estimate.intervals)
-    one, line = part.screw, other.screw
-    if one.joint != "revolute" or line.joint != "revolute":
-        return False
-    angle = np.degrees(np.arccos(min(abs(float(one.axis @ line.axis)), 1.0)))
-    away = np.linalg.norm(np.cross(one.point - line.point, line.axis))
-    return bool(angle < min(np.degrees(np.arccos(LIKE)) + turned, UNSURE) and away < HINGE + aside)
+    hinge = part.screw
+    return hinge.joint == "revolute" and _is_same(hinge, other.screw, float(turned), float(aside))

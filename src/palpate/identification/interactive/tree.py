@@ -215,14 +215,13 @@ class PartTree:
         cloud = self.looks[look]
         seen = [self.looks[other] for other in others]
         given = scores(cloud, seen, motions)
-        parts = [] if candidate else enumerate(self.parts)
-        carried = [(part, one) for part, one in parts if one.parent >= 0]
-        heights = [
-            height_evidence(cloud, seen, motions, given, part + 1, one.parent + 1)
-            for part, one in carried
-        ]
-        for (part, _), height in zip(carried, heights, strict=True):
-            given[part + 1] += height
+        if candidate is None:
+            alone = given.copy()
+            for label, one in enumerate(self.parts, 1):
+                if one.parent >= 0:
+                    given[label] += height_evidence(
+                        cloud, seen, motions, alone, label, one.parent + 1
+                    )
         given += prior(cloud, given, motions)
         given[0] = np.maximum(given[0], UNKNOWN * len(others))
         return smooth_labels(cloud, given)

@@ -21,7 +21,7 @@ from palpate.errors import PalpateError
 from palpate.networks.actor import Perceptron
 from palpate.networks.in_numpy import layers_of, values_of
 from palpate.perception.surface_features import FEATURES
-from palpate.runs.storage import load_arrays, save_arrays
+from palpate.runs.storage import load_arrays, read_manifest, save_arrays
 
 SHIPPED = "assets/movable-surfaces.safetensors"
 LAYERS, MEMBERS = (24, 24), 4
@@ -57,10 +57,12 @@ def load_guess(path: Path | None = None) -> MovableGuess:
     """
     if path is None:
         return _shipped()
-    guess, manifest = load_arrays(path, _empty())
-    if manifest.get("features") != list(FEATURES):
-        raise PalpateError(f"{path} was trained on other features: train it anew")
-    return guess
+    if read_manifest(path).get("features") != list(FEATURES):
+        raise PalpateError(
+            f"{path} was trained on other features: train it anew (palpate reproduce "
+            "movable-surfaces)"
+        )
+    return load_arrays(path, _empty())[0]
 
 
 @functools.cache

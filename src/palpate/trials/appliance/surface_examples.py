@@ -13,6 +13,7 @@ from palpate.worlds.appliance.appliance import ApplianceWorld
 
 SHARE = 0.4  # of a surface's points that move: a lid may fold in the middle
 LOOKS = 1, 3, 8  # that are averaged as no part is known yet, and twice as some are
+KNOWN = 0.6  # of the parts that hang on what stands still, by then
 
 Examples = tuple[Float[np.ndarray, "surfaces features"], Float[np.ndarray, " surfaces"]]
 
@@ -20,9 +21,10 @@ Examples = tuple[Float[np.ndarray, "surfaces features"], Float[np.ndarray, " sur
 def examples_of(category: str, seed: int) -> Examples:
     """Features of the surfaces of an appliance at rest, and whether each moves, 1.0 or 0.0.
 
-    As nobody knows any part yet, in a first look; and as those are known that hang on what stands
-    still, in the mean of a few looks and of some more: then whether what is on them moves on them.
-    None where too little is seen.
+    As nobody knows any part yet, in a first look; and as some are known that hang on what stands
+    still, in the mean of a few looks and of some more, which shows other surfaces than one look
+    does: then of those of the known parts whether what is on them moves on them. None where too
+    little is seen.
     """
     world = ApplianceWorld(category, seed)
     world.reset(seed)
@@ -41,13 +43,14 @@ def examples_of(category: str, seed: int) -> Examples:
     ]
     random, found = np.random.default_rng([seed, 13]), []
     for count in LOOKS:
-        labels = [carrier[one] if count > 1 else np.full(len(one), -1) for one in real[:count]]
+        known = random.random(len(carrier)) < (KNOWN if count > 1 else 0.0)
+        held = np.where((carrier >= 0) & known[carrier], carrier, -1)
+        labels = [held[one] for one in real[:count]]
         still = [NOWHERE] * count
-        cloud = average(looks[:count], labels, 0, dict.fromkeys(carrier.tolist(), still))
+        cloud = average(looks[:count], labels, 0, dict.fromkeys(held.tolist(), still))
         every = surfaces(cloud, labels[0], random)
         moves = [_moves(one, real[0]) for one in every]
-        kept = [index for index, one in enumerate(every) if one.part >= 0 or count == 1]
-        found.append((features_of(cloud, every)[kept], np.array(moves, float)[kept]))
+        found.append((features_of(cloud, every), np.array(moves, float)))
     return np.concatenate([one[0] for one in found]), np.concatenate([one[1] for one in found])
 
 

@@ -1,5 +1,8 @@
 """What all experiments share: stages that resume, seeds that are noted, figures with intervals."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -108,3 +111,25 @@ def test_work_on_every_core_is_logged_and_its_errors_are_raised(tmp_path):
     with pytest.raises(TypeError, match="integer"):
         experiment.on_every_core(int, [("broken",)], "breaking")
     experiment.on_every_core(print, [], "nothing")
+
+
+KILLED = """
+import os, pathlib, sys, time
+from palpate.experiments.experiment import Experiment
+
+def work(experiment, seconds):
+    os.write(1, b"begun")
+    time.sleep(seconds)
+
+if __name__ == "__main__":
+    Experiment("e", pathlib.Path(sys.argv[1]), True, 4).on_every_core(work, [(90,)], "sleeping")
+"""
+
+
+def test_workers_end_with_an_experiment_that_is_killed(tmp_path):
+    (tmp_path / "script.py").write_text(KILLED)
+    command = [sys.executable, tmp_path / "script.py", tmp_path]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout.read(5) == b"begun"
+        process.kill()
+        process.communicate(timeout=30)  # to the end of what the worker might write

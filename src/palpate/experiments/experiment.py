@@ -16,8 +16,10 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -150,7 +152,7 @@ class Experiment:
         spawn = multiprocessing.get_context("spawn")
         processes = max(1, min(cores or 1, len(grid)))
         alone = Experiment(self.name, self.out, self.quick, self.seed)
-        with concurrent.futures.ProcessPoolExecutor(processes, spawn, _take_one_core) as pool:
+        with concurrent.futures.ProcessPoolExecutor(processes, spawn, _start_worker) as pool:
             futures = []
             for arguments in grid:
                 log = self.out / f"{'-'.join(map(str, arguments))}.log"
@@ -186,12 +188,23 @@ class Experiment:
 # --- processes beside each other --------------------------------------------------------------
 
 
-def _take_one_core() -> None:
-    """Before JAX starts: two processes whose threads compete are slower than one."""
+def _start_worker() -> None:
+    """Take one core, and end with the process that started this one, which may be killed.
+
+    Before JAX starts: two processes whose threads compete are slower than one.
+    """
+    threading.Thread(target=_end_with, args=[multiprocessing.parent_process()], daemon=True).start()
     flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
+
+
+def _end_with(parent: BaseProcess) -> None:
+    """At once: a stage that is cut off resumes, while one that goes on alone would be in the way of
+    the next attempt."""
+    parent.join()
+    os._exit(1)
 
 
 def _into(log: Path, work: Callable[..., Any], *arguments: Any) -> None:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
-from palpate.identification.interactive.explanation import FURTHER, labels_near
+from palpate.identification.interactive.explanation import FURTHER, joint_of_ways, labels_near
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import LEAST_MOTION, distinguishing_looks, evidence
 from palpate.identification.interactive.part import Part, support_of
@@ -27,6 +27,7 @@ AROUND = 0.3  # m from a hand to the points by which a joint on a carrier is sou
 TURNS, ARMS = 12, (0.0, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7)  # directions, and m
 TRIED = 3  # of those joints, the best, which are refined
 ROUNDS = 4  # of a joint and of what has moved with it, each from the other
+SETTLED = 2  # ways of a hand that agree: the joint of a part is what they say
 SEEN = 0.2  # of evidence, for each point: less is no difference
 CARRIED = 0.15  # rad or m that a part has to go to show what it carries
 STILLER = 0.05  # rad or m
@@ -50,6 +51,11 @@ def discover(tree: PartTree, before: int, after: int, handling: Handling) -> boo
     """
     way = handling.points
     found = _best(tree, before, after, -1, way, screws_of_way(way))
+    if found is not None and (known := _contradicted(tree, before, after, found, way)):
+        if len(known) > 1 or not _is_hinged_on(tree, known[0], before, found.estimate.screw):
+            return False  # both have moved, and their way looks like a circle
+        tree.parts[known[0]].positions[after] = tree.parts[known[0]].positions[before]
+        found = dataclasses.replace(found, carrier=known[0])
     if found is None:
         near = [one for one in labels_near(tree, before, handling.push.point) if one >= 0]
         options = (_on_carrier(tree, before, after, carrier, way) for carrier in near)
@@ -148,25 +154,7 @@ def insert(
     way: Float[np.ndarray, "times 3"] | None = None,
 ) -> None:
     """Put a new part where it belongs in the tree, with the way of the hand that took it."""
-    labels, mask = tree.labels[before], np.zeros(len(tree.labels[before]), bool)
-    mask[new.masks[0]] = True
-    parent, carried, same = new.carrier, [], []
-    for number, part in enumerate(tree.parts):
-        own = labels == number
-        if own.sum() < FEWEST or number == new.carrier:
-            continue
-        shared = (mask & own).sum()
-        little = part.longest_way < LITTLE or shared > WITHIN * mask.sum()
-        if shared > WITHIN * own.sum() and little:
-            same.append(number)
-        elif shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
-            carried.append(number)  # all of it has moved, and more
-        elif (
-            new.carrier < 0
-            and shared > WITHIN * mask.sum()
-            and _carries(tree, number, before, after, new.masks[0])
-        ):
-            parent = number
+    parent, carried, same = _relatives(tree, before, after, new)
     number = len(tree.parts)
     back = tree.pose(parent, before).inverse
     screw = new.estimate.screw.moved(back)
@@ -200,6 +188,56 @@ def insert(
             tree.parts[number].positions[:before] = (again[:before] - again[before]).tolist()
         tree.remove(old, number)
         number -= 1
+
+
+def _relatives(
+    tree: PartTree, before: int, after: int, new: Discovery
+) -> tuple[int, list[int], list[int]]:
+    """What carries a new part, the parts that it carries, and those that are a piece of it."""
+    labels, mask = tree.labels[before], np.zeros(len(tree.labels[before]), bool)
+    mask[new.masks[0]] = True
+    parent, carried, same = new.carrier, [], []
+    for number, part in enumerate(tree.parts):
+        own = labels == number
+        if own.sum() < FEWEST or number == new.carrier:
+            continue
+        shared = (mask & own).sum()
+        little = part.longest_way < LITTLE or shared > WITHIN * mask.sum()
+        if shared > WITHIN * own.sum() and little:
+            same.append(number)
+        elif shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
+            carried.append(number)  # all of it has moved, and more
+        elif (
+            new.carrier < 0
+            and shared > WITHIN * mask.sum()
+            and _carries(tree, number, before, after, new.masks[0])
+        ):
+            parent = number
+    return parent, carried, same
+
+
+def _contradicted(
+    tree: PartTree,
+    before: int,
+    after: int,
+    new: Discovery,
+    way: Float[np.ndarray, "times 3"],
+) -> list[int]:
+    """Parts that look like a piece of a new one, and are known by ways that no joint has which goes
+    the new way as well: a lid and a leaf on it are one surface."""
+    return [
+        number
+        for number in _relatives(tree, before, after, new)[2]
+        if len(ways := tree.parts[number].ways) >= SETTLED
+        and joint_of_ways(tree, tree.parts[number], [*ways, (before, way)]) is None
+    ]
+
+
+def _is_hinged_on(tree: PartTree, part: int, look: int, screw: Screw) -> bool:
+    """Whether what a joint carries turns about a line on a part."""
+    away = tree.looks[look].points[tree.labels[look] == part] - screw.point
+    nearest = np.linalg.norm(np.cross(away, screw.axis), axis=1).min()
+    return screw.joint == "revolute" and bool(nearest < TOUCHES)
 
 
 def _carries(

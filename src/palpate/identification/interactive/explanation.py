@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import LEAST_MOTION
+from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Estimate, Way, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
 from palpate.identification.interactive.tree import NOT_MOVED, Candidate, PartTree
@@ -115,8 +116,7 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
             continue
         one = tree.parts[part]
         ways = [*one.ways, (before, handling.points)]
-        local = [(look, tree.way_from(one.parent, look, way)) for look, way in ways]
-        joint = _joint_of(local, len(tree.looks))
+        joint = joint_of_ways(tree, one, ways)
         # two joints that move at once may do as one, elsewhere
         if joint is None or one.estimate.refutes(joint.screw):
             continue
@@ -129,8 +129,11 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
     return -1
 
 
-def _joint_of(ways: list[Way], looks: int) -> Estimate | None:
-    """The joint that all ways of a hand are of; None if they are of no one joint."""
+def joint_of_ways(tree: PartTree, part: Part, ways: list[Way]) -> Estimate | None:
+    """The joint that all of some ways of a hand are of, on what carries a part; None if they are
+    of no one joint."""
+    looks = len(tree.looks)
+    ways = [(look, tree.way_from(part.parent, look, way)) for look, way in ways]
     longest = max(ways, key=lambda way: float(np.linalg.norm(way[1][-1] - way[1][0])))[1]
     found = [
         refine(screw, np.zeros(looks), [None] * looks, ways) for screw in screws_of_way(longest)
@@ -140,7 +143,10 @@ def _joint_of(ways: list[Way], looks: int) -> Estimate | None:
 
 
 def _by_clouds(tree: PartTree, before: int, after: int, handling: Handling) -> int:
-    """The part that the clouds show to have moved as the hand has, which has one way more."""
+    """The part that the clouds show to have moved as the hand has, which has one way more.
+
+    Its joint allows that way: else what moved is something on it, or under it, as well.
+    """
     start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
     misses = {
         number: float(np.linalg.norm(tree.motion(number, before, after).at(start[None])[0] - end))
@@ -150,5 +156,8 @@ def _by_clouds(tree: PartTree, before: int, after: int, handling: Handling) -> i
     if not misses or min(misses.values()) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
         return -1
     part = min(misses, key=lambda number: misses[number])
+    way = tree.way_from(tree.parts[part].parent, before, handling.points)
+    if surprise(tree.parts[part].estimate, way) > SURPRISE:
+        return -1
     tree.parts[part].ways.append((before, handling.points))
     return part

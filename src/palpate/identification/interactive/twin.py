@@ -15,6 +15,8 @@ from palpate.identification.interactive.splitting import merge_same, split
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
 
+ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known
+
 
 class Twin(PartTree):
     """Takes one handling after the other with `observe`.
@@ -39,6 +41,7 @@ class Twin(PartTree):
         self._keep(new, before, after)
         if new and len(self.parts) == count:
             self._put_back(before, after)
+            self._take_from_carrier(before)
         self._hang(before, after)
         if new:
             self._drop_guesses()
@@ -51,6 +54,7 @@ class Twin(PartTree):
             self._explain_earlier()
             self.refit(-1)
         merge_same(self)
+        self._drop_unknown()
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""
@@ -81,6 +85,17 @@ class Twin(PartTree):
             for look in (before, after):
                 self.relabel(look)
 
+    def _take_from_carrier(self, before: int) -> None:
+        """What the last part turned out to own no longer shows where its carrier is."""
+        carrier = self.parts[-1].parent
+        if carrier < 0:
+            return
+        one, cloud = self.parts[carrier], self.looks[before]
+        nearest = cloud.tree.query(self.pose(carrier, before).at(one.support[0]))[1]
+        kept = self.labels[before][nearest] != len(self.parts) - 1
+        if kept.sum() >= FEWEST:
+            one.support = one.support[0][kept], one.support[1][kept]
+
     def _hang(self, before: int, after: int) -> None:
         """Hang on each part that has moved what it carries."""
         for number, one in enumerate(self.parts):
@@ -99,10 +114,22 @@ class Twin(PartTree):
         for number in reversed(range(len(self.parts) - 1)):
             part = self.parts[number]
             if part.provisional and len(part.ways) == 1:
-                held = [index for index, (one, _) in enumerate(self.held) if one == number]
-                self.remove(number, part.parent)
-                for index in held:
-                    self.held[index] = -1, self.held[index][1]
+                self._forget(number)
+
+    def _drop_unknown(self) -> None:
+        """Take out parts whose joint may be anywhere by all that was seen and felt of them."""
+        for number in reversed(range(len(self.parts))):
+            part = self.parts[number]
+            turned, aside = part.estimate.intervals
+            if turned > ANYWHERE[0] or (aside > ANYWHERE[1] and part.screw.joint == "revolute"):
+                self._forget(number)
+
+    def _forget(self, number: int) -> None:
+        """Take a part out as if no hand had ever held it."""
+        held = [index for index, (one, _) in enumerate(self.held) if one == number]
+        self.remove(number, self.parts[number].parent)
+        for index in held:
+            self.held[index] = -1, self.held[index][1]
 
     def _keep(self, new: bool, before: int, after: int) -> None:
         """Say anew what two looks show; a new part that explains nothing vanishes (III-B d)."""

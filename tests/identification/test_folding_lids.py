@@ -1,0 +1,91 @@
+"""A lid that folds: both leaves are one surface, and most pulls move both joints."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from palpate.identification.interactive.twin import ANYWHERE, Twin
+from rooms import Room
+
+pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
+
+LID = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".35 .6 .02" pos="0 0 .4"/>
+    <geom type="box" size=".02 .6 .2" pos=".35 0 .6"/>
+    <body name="lid" pos=".33 0 .8">
+      <joint axis="0 1 0"/>
+      <geom type="box" size=".16 .55 .01" pos="-.17 0 0"/>
+      <body name="leaf" pos="-.34 0 0">
+        <joint axis="0 1 0"/>
+        <geom type="box" size=".16 .55 .01" pos="-.165 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+LEAF = 2
+
+
+class Chest(Room):
+    """A chest with a folding lid, and a hand at the far edge of its leaf."""
+
+    def place(self, body: int) -> np.ndarray:
+        return np.array([-0.3, 0.1, 0.01])
+
+
+@pytest.fixture
+def chest() -> Chest:
+    return Chest(LID)
+
+
+def opened(chest: Chest) -> Twin:
+    """A twin that has seen the lid open and close, with its leaf straight on."""
+    twin = Twin()
+    chest.at(0.0, 0.0)
+    twin.look(chest.look())
+    chest.pull(twin, LEAF, (0.0, 0.0), (0.7, 0.0))
+    chest.pull(twin, LEAF, (0.7, 0.0), (0.05, 0.0))
+    assert [len(part.ways) for part in twin.parts] == [2]
+    return twin
+
+
+@pytest.mark.parametrize("turn", [0.6, 1.0])
+def test_a_leaf_is_found_on_its_lid_though_both_look_like_one(chest, turn) -> None:
+    twin = opened(chest)
+    chest.pull(twin, LEAF, (0.05, 0.0), (0.05, turn))
+    assert [part.parent for part in twin.parts] == [-1, 0]
+    assert [held for held, _ in twin.held] == [0, 0, 1]
+    for part in (0, 1):
+        turned, aside = chest.error(twin, part, part)
+        assert turned < 3.0
+        assert aside < 1.0
+    lid, leaf = np.array([part.positions for part in twin.parts])
+    np.testing.assert_allclose(lid[2:] - lid[0], [lid[1], 0.05, 0.05, 0.05, 0.05], atol=0.05)
+    assert np.diff(leaf)[-2] == pytest.approx(turn, abs=0.05)
+
+
+def test_a_pull_that_folds_a_known_lid_does_not_mistake_its_joint(chest) -> None:
+    twin = opened(chest)
+    chest.pull(twin, LEAF, (0.05, 0.0), (0.3, -0.5))
+    assert [held for held, _ in twin.held] == [0, 0, -1]
+    turned, aside = chest.error(twin, 0, 0)
+    assert turned < 2.0
+    assert aside < 1.0
+
+
+def test_a_joint_of_which_nothing_is_known_is_not_kept(chest) -> None:
+    twin = opened(chest)
+    part = twin.parts[0]
+    sure = part.estimate.covariance
+    for number, limit in ((0, np.radians(ANYWHERE[0])), (2, ANYWHERE[1])):
+        covariance = sure.copy()
+        covariance[number, number] = (limit / 1.645) ** 2
+        for factor, kept in ((0.9, True), (1.2, False)):
+            estimate = dataclasses.replace(part.estimate, covariance=factor * covariance)
+            twin.parts, twin.held = [dataclasses.replace(part, estimate=estimate)], [(0, 0), (0, 2)]
+            twin._drop_unknown()
+            assert bool(twin.parts) == kept
+            assert [held for held, _ in twin.held] == ([0, 0] if kept else [-1, -1])

@@ -76,7 +76,7 @@ def test_a_pull_that_folds_a_known_lid_does_not_mistake_its_joint(chest) -> None
     assert aside < 1.0
 
 
-def test_a_joint_of_which_nothing_is_known_is_not_kept(chest) -> None:
+def test_a_joint_of_which_nothing_is_known_is_not_kept_unless_a_hand_has_held_it(chest) -> None:
     twin = opened(chest)
     part = twin.parts[0]
     sure = part.estimate.covariance
@@ -85,7 +85,8 @@ def test_a_joint_of_which_nothing_is_known_is_not_kept(chest) -> None:
         covariance[number, number] = (limit / 1.645) ** 2
         for factor, kept in ((0.9, True), (1.2, False)):
             estimate = dataclasses.replace(part.estimate, covariance=factor * covariance)
-            twin.parts, twin.held = [dataclasses.replace(part, estimate=estimate)], [(0, 0), (0, 2)]
-            twin._drop_unknown()
-            assert bool(twin.parts) == kept
-            assert [held for held, _ in twin.held] == ([0, 0] if kept else [-1, -1])
+            for ways in ([], part.ways):  # a hand that held it tells that it is there
+                changed = dataclasses.replace(part, estimate=estimate, ways=ways)
+                twin.parts = [changed]
+                twin._drop_unknown()
+                assert bool(twin.parts) == (kept or bool(ways))

@@ -114,22 +114,21 @@ class Twin(PartTree):
         for number in reversed(range(len(self.parts) - 1)):
             part = self.parts[number]
             if part.provisional and len(part.ways) == 1:
-                self._forget(number)
+                held = [index for index, (one, _) in enumerate(self.held) if one == number]
+                self.remove(number, part.parent)
+                for index in held:
+                    self.held[index] = -1, self.held[index][1]
 
     def _drop_unknown(self) -> None:
-        """Take out parts whose joint may be anywhere by all that was seen and felt of them."""
+        """Take out parts that no hand has held and whose joint may be anywhere by what was seen."""
         for number in reversed(range(len(self.parts))):
             part = self.parts[number]
             turned, aside = part.estimate.intervals
-            if turned > ANYWHERE[0] or (aside > ANYWHERE[1] and part.screw.joint == "revolute"):
-                self._forget(number)
-
-    def _forget(self, number: int) -> None:
-        """Take a part out as if no hand had ever held it."""
-        held = [index for index, (one, _) in enumerate(self.held) if one == number]
-        self.remove(number, self.parts[number].parent)
-        for index in held:
-            self.held[index] = -1, self.held[index][1]
+            anywhere = turned > ANYWHERE[0] or (
+                aside > ANYWHERE[1] and part.screw.joint == "revolute"
+            )
+            if anywhere and not part.ways:
+                self.remove(number, part.parent)
 
     def _keep(self, new: bool, before: int, after: int) -> None:
         """Say anew what two looks show; a new part that explains nothing vanishes (III-B d)."""

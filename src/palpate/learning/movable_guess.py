@@ -24,9 +24,9 @@ from palpate.perception.surface_features import FEATURES
 from palpate.runs.storage import load_arrays, read_manifest, save_arrays
 
 SHIPPED = "assets/movable-surfaces.safetensors"
-LAYERS, MEMBERS = (24, 24), 4
+LAYERS, MEMBERS = (64, 64), 4
 FURTHEST = 3.0  # standard deviations: what is further out is taken to be there
-STEPS, BATCH, RATE, DECAY, BLUR = 2000, 512, 3e-3, 0.3, 0.1  # BLUR: noise on standardised features
+STEPS, BATCH, RATE, DECAY, BLUR = 8000, 512, 3e-3, 0.3, 0.1  # BLUR: noise on standardised features
 
 
 class MovableGuess(eqx.Module):

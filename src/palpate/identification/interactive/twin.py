@@ -50,7 +50,8 @@ class Twin(PartTree):
             self._hang(before, after)
         self.refit(self.held[-1][0] if handling.moved else -1)
         self._merge()
-        if split(self, [before, after]):
+        # where nothing has moved, another look only has other noise
+        if any(one.moved for one in self.handled[-2:]) and split(self, [before, after]):
             self._explain_earlier()
             self.refit(-1)
         merge_same(self)

@@ -12,8 +12,9 @@ from palpate.perception.surfaces import Surface, surfaces
 from palpate.worlds.appliance.appliance import ApplianceWorld
 
 SHARE = 0.4  # of a surface's points that move: a lid may fold in the middle
-LOOKS = 1, 3, 8  # that are averaged as no part is known yet, and twice as some are
-KNOWN = 0.6  # of the parts that hang on what stands still, by then
+# Looks that are averaged, and the share of the parts that hang on what stands still which are known
+# by then.
+STAGES = (1, 0.0), (3, 0.6), (3, 1.0), (8, 0.6), (8, 1.0)
 
 Examples = tuple[Float[np.ndarray, "surfaces features"], Float[np.ndarray, " surfaces"]]
 
@@ -21,15 +22,15 @@ Examples = tuple[Float[np.ndarray, "surfaces features"], Float[np.ndarray, " sur
 def examples_of(category: str, seed: int) -> Examples:
     """Features of the surfaces of an appliance at rest, and whether each moves, 1.0 or 0.0.
 
-    As nobody knows any part yet, in a first look; and as some are known that hang on what stands
-    still, in the mean of a few looks and of some more, which shows other surfaces than one look
-    does: then of those of the known parts whether what is on them moves on them. None where too
-    little is seen.
+    As nobody knows any part yet, in a first look; and as some or all are known that hang on what
+    stands still, in the mean of a few looks and of some more, which shows other surfaces than one
+    look does: then of those of the known parts whether what is on them moves on them. None where
+    too little is seen.
     """
     world = ApplianceWorld(category, seed)
     world.reset(seed)
     try:
-        looks = [cloud_of(world.look()) for _ in range(max(LOOKS))]
+        looks = [cloud_of(world.look()) for _ in range(max(count for count, _ in STAGES))]
     except PalpateError:
         return np.empty((0, len(FEATURES))), np.empty(0)
     truth = world.truth()
@@ -42,8 +43,8 @@ def examples_of(category: str, seed: int) -> Examples:
         for look in looks
     ]
     random, found = np.random.default_rng([seed, 13]), []
-    for count in LOOKS:
-        known = random.random(len(carrier)) < (KNOWN if count > 1 else 0.0)
+    for count, share in STAGES:
+        known = random.random(len(carrier)) < share
         held = np.where((carrier >= 0) & known[carrier], carrier, -1)
         labels = [held[one] for one in real[:count]]
         still = [NOWHERE] * count

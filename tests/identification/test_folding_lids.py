@@ -5,6 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from palpate.identification.interactive import twin as twin_module
+from palpate.identification.interactive.explanation import find_moved_part
+from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.twin import ANYWHERE, Twin
 from rooms import Room
 
@@ -90,3 +93,35 @@ def test_a_joint_of_which_nothing_is_known_is_not_kept_unless_a_hand_has_held_it
                 twin.parts = [changed]
                 twin._drop_unknown()
                 assert bool(twin.parts) == (kept or bool(ways))
+
+
+class Notes(Twin):
+    """A twin that only writes down what a hand has done."""
+
+    def observe(self, handling: Handling) -> None:
+        self.handled.append(handling)
+
+
+def test_a_way_that_a_joint_does_not_allow_is_not_explained_by_clouds(chest) -> None:
+    twin, notes = opened(chest), Notes()
+    notes.look(twin.looks[-1])
+    chest.pull(notes, LEAF, (0.05, 0.0), (0.6, 0.0))
+    (right,) = notes.handled
+    aside = 0.06 * np.sin(np.linspace(0.0, np.pi, len(right.points)))  # m, and back
+    strange = dataclasses.replace(right, points=right.points + aside[:, None] * [0.0, 1.0, 0.0])
+    looks = twin.add_look(right.before), twin.add_look(right.after)
+    assert find_moved_part(twin, *looks, strange) == -1
+    assert find_moved_part(twin, *looks, right) == 0
+
+
+def test_parts_are_split_off_only_after_something_has_moved(chest, monkeypatch) -> None:
+    twin, calls = opened(chest), []
+    monkeypatch.setattr(twin_module, "split", lambda _, looks: calls.append(looks))
+    look = twin.looks[-1]
+    moved = twin.handled[-1]
+    still = dataclasses.replace(
+        moved, before=look, after=look, points=np.repeat(moved.points[:1], 60, axis=0)
+    )
+    for _ in range(3):
+        twin.observe(still)
+    assert len(calls) == 1  # what the pull before had moved may show only now

@@ -22,13 +22,13 @@ MODEL = MODEL.constrain()
 
 
 def test_only_what_a_row_is_about_differs_from_the_nominal_rope():
-    assert study._changed(ROWS["nominal"]) == {}
-    assert study._changed(ROWS["long and heavy"]) == {"length": 1.25, "mass": 0.2}
-    assert study._changed(ROWS["10 Hz"]) == {
+    assert study._changes_of(ROWS["nominal"]) == {}
+    assert study._changes_of(ROWS["long and heavy"]) == {"length": 1.25, "mass": 0.2}
+    assert study._changes_of(ROWS["10 Hz"]) == {
         "observation_rate": 10.0,
         "observation_delay": 0.05,
     }
-    assert study._changed(ROWS["pushed at rest"]) == {"pushed_at_s": study.SETTLED}
+    assert study._changes_of(ROWS["pushed at rest"]) == {"pushed_at_s": study.SETTLED}
     weighted = ROWS["weighted"].base
     masses = weighted.body_masses()
     assert masses.sum() == pytest.approx(BASE.mass)

@@ -107,7 +107,7 @@ def test_a_state_that_was_not_known_is_no_small_error():
     true[0, 2] = np.nan  # the simulation has diverged: nobody is blamed
     squared = np.array([[[1e-4, np.nan, np.nan]]], np.float32)
     arrays = {"tracked": tracked, "true": true, "squared_error": squared}
-    assert rope_markerless._rmse(rope_markerless._missed(arrays)) is None
+    assert rope_markerless._rmse(rope_markerless._squared_errors(arrays)) is None
     tracked[0, 1] = 0.0
     squared[0, 0, 1] = 1e-4
-    assert rope_markerless._rmse(rope_markerless._missed(arrays)) == pytest.approx(1.0)
+    assert rope_markerless._rmse(rope_markerless._squared_errors(arrays)) == pytest.approx(1.0)

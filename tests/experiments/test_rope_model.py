@@ -92,7 +92,7 @@ def test_a_folder_without_captures_is_refused(small, tmp_path, monkeypatch):
 
 def test_the_baseline_has_no_damping_and_cannot_find_any(small, tmp_path):
     world = small["sim1"]
-    fitted, _ = rope_model._simulated(Experiment("rope-model", tmp_path, True, 0), world)
+    fitted, _ = rope_model._simulate(Experiment("rope-model", tmp_path, True, 0), world)
     rope = rope_model.remove_damping(rope_model.starting_rope(fitted, mass=world.mass))
     damping = [row for row in describe(rope) if row["name"] in rope_model.DAMPING]
     assert len(damping) == len(rope_model.DAMPING)

@@ -47,7 +47,7 @@ def calls(monkeypatch):
     monkeypatch.setattr(nominal, "RECORDED_DURATION", 0.2)
     monkeypatch.setattr(nominal, "identify", identify)
     monkeypatch.setattr("palpate.commands.train.train", train)
-    monkeypatch.setattr(rope_stabilization, "_left_when_still", lambda *_: figure())
+    monkeypatch.setattr(rope_stabilization, "_energy_left_when_still", lambda *_: figure())
     monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.05)
     return made
 
@@ -145,4 +145,4 @@ def test_rope_held_still_is_looked_at_after_three_periods():
     energy[2, after] = 0.05
     energy[3, after + 1] = 0.01
     episodes = stabilization.Episodes(energy, energy, np.zeros((4, 1, 11, 3)), {})
-    assert rope_stabilization._left_when_still(trials, episodes).value == pytest.approx(0.1)
+    assert rope_stabilization._energy_left_when_still(trials, episodes).value == pytest.approx(0.1)

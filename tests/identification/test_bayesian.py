@@ -23,7 +23,7 @@ TRUE = Sled(mass=14.0, friction=[6.0, 40.0])
 MODEL = Sled(mass=10.0, friction=[15.0, 15.0])
 
 
-COMPILED = {"_look", "_sensitivity", "_walked"}
+COMPILED = {"_look", "_sensitivity", "_walk_chains"}
 
 
 @contextlib.contextmanager
@@ -110,7 +110,7 @@ def test_a_sampler_that_was_compiled_during_the_search_is_not_compiled_again():
     target = motion_posterior(MODEL, cut(pushes(TRUE, 3), MODEL, 1.0, at_rest=True), scales)
     with compiled() as names, prepare_sampler(target, 6):
         settled = settle_each(target, jax.random.key(0))
-    assert "_walked" in names
+    assert "_walk_chains" in names
     with compiled() as names:
         sample(settled, chains=6, draws=4)
     assert not names
@@ -150,7 +150,7 @@ def test_a_posterior_of_too_many_coordinates_is_for_the_no_u_turn_sampler(poster
     monkeypatch.setattr(
         "palpate.identification.posterior.posterior.WIDEST", posterior.target.dimension - 1
     )
-    with compiled({"_block", "_walked"}) as names:
+    with compiled({"_block", "_walk_chains"}) as names:
         found = sample(posterior.settled, chains=4, draws=150)
     assert names == {"_block"}
     assert found.draws.position.shape == (4, 150, posterior.target.dimension)

@@ -174,7 +174,7 @@ def test_few_trials_rather_judge_than_teach(count, judges):
     the motion of an oven worse."""
     ones = np.ones((count, 1, 1))
     aligned = Aligned(0.1, ones, ones, np.ones(count, int))
-    fitted, held_out = residual._split(aligned, ResidualSettings())
+    fitted, held_out = residual._split_trials(aligned, ResidualSettings())
     assert len(held_out) == judges
     assert sorted([*fitted, *held_out]) == list(range(count))
 

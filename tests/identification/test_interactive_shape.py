@@ -12,7 +12,7 @@ from depth_scenes import depth_of
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.screws import Screw
-from palpate.identification.interactive.shape import FILLED, MOST_BOXES, _filled, boxes_of
+from palpate.identification.interactive.shape import FILLED, MOST_BOXES, _fill, boxes_of
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.mjcf import write_mjcf
 from palpate.numerics.pinhole import Pinhole
@@ -67,7 +67,7 @@ def test_boxes_fill_what_is_taken_and_nothing_else(seed, share):
     random = np.random.default_rng(seed)
     taken = random.random(tuple(random.integers(1, 8, size=3))) < share
     covered = np.zeros(taken.shape, int)
-    boxes = _filled(taken)
+    boxes = _fill(taken)
     for first, last in boxes:
         assert (last > first).all()
         covered[tuple(map(slice, first, last))] += 1
@@ -79,7 +79,7 @@ def test_boxes_fill_what_is_taken_and_nothing_else(seed, share):
 def test_a_solid_room_is_one_box():
     taken = np.zeros((9, 8, 7), bool)
     taken[2:7, 1:8, 3:5] = True
-    ((first, last),) = _filled(taken)
+    ((first, last),) = _fill(taken)
     assert first.tolist() == [2, 1, 3]
     assert last.tolist() == [7, 8, 5]
 

@@ -87,7 +87,7 @@ def test_a_pull_that_moved_the_door_says_where_it_is_now_that_its_flap_held_till
     point = DOOR.point + np.array([0.0, 0.3, 0.1])
     twin.handled, twin.held = [pulled(twin, point, moved=True)], [(0, 0)]
     door = door_of(twin, 1)
-    pulls, missed = active._handled_at(twin, door, twin.looks[1], 1)
+    pulls, missed = active._pulls_at(twin, door, twin.looks[1], 1)
     assert not missed
     assert [one.moved for one in pulls] == [False]
     assert pulls[0].force == pytest.approx(active.GIVES / 0.5, abs=0.01)
@@ -95,7 +95,7 @@ def test_a_pull_that_moved_the_door_says_where_it_is_now_that_its_flap_held_till
     assert pulls[0].direction == pytest.approx(DOOR.pose(-0.5).turned(OUT[None])[0])
     # of something else that moved, the surface of the door learns nothing
     twin.held = [(-1, 0)]
-    assert active._handled_at(twin, door, twin.looks[1], 1) == ([], [])
+    assert active._pulls_at(twin, door, twin.looks[1], 1) == ([], [])
 
 
 def test_a_hand_that_got_no_hold_is_kept_apart():
@@ -106,7 +106,7 @@ def test_a_hand_that_got_no_hold_is_kept_apart():
         times=np.zeros(1), points=point[None], forces=np.zeros((1, 3)),
     )  # fmt: skip
     twin.handled, twin.held = [nothing], [(0, 0)]
-    pulls, missed = active._handled_at(twin, door_of(twin, 0), twin.looks[0], 0)
+    pulls, missed = active._pulls_at(twin, door_of(twin, 0), twin.looks[0], 0)
     assert not pulls
     assert missed[0] == pytest.approx(point)
 

@@ -185,8 +185,8 @@ def test_bodies_turned_and_moved_are_corrected_the_same_turned_and_moved():
     turn = jnp.asarray([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], jnp.float32)
     away = jnp.asarray([0.3, -0.2, 2.1], jnp.float32)
     turned = PlanarState(state.pose @ turn.T + away, state.velocity @ turn.T)
-    here = corrected._kicked(state, action).velocity - state.velocity
-    there = corrected._kicked(turned, action @ turn.T).velocity - turned.velocity
+    here = corrected._kick(state, action).velocity - state.velocity
+    there = corrected._kick(turned, action @ turn.T).velocity - turned.velocity
     np.testing.assert_allclose(there, here @ turn.T, atol=1e-5)
     assert np.min(np.max(np.abs(here), axis=(0, 2))) > 0.1 * BOUND
 

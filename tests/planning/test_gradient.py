@@ -135,7 +135,7 @@ def test_no_iteration_makes_a_plan_worse() -> None:
     for iterations in range(4):
         planner = pendulum_planner(iterations=max(1, iterations))
         plan = first_plan(planner)
-        knots = planner._improved(plan, state, None, plan.key) if iterations else plan.knots
+        knots = planner._improve(plan, state, None, plan.key) if iterations else plan.knots
         losses.append(float(planner._losses(knots[None], plan.command, state, None)[0]))
     assert losses[1] < 0.95 * losses[0]
     for earlier, later in itertools.pairwise(losses):

@@ -79,7 +79,7 @@ def _audit_recording(options: Audit) -> Path:
                 for one in found
             ]
             _finish(run, figures, lines)
-        return _said(options, run, "What energy a recording drew")
+        return _write_report(options, run, "What energy a recording drew")
 
 
 # --- of a policy ------------------------------------------------------------------------------
@@ -109,14 +109,14 @@ def _audit_policy(options: Audit) -> Path:
         if not run.finished:
             environments = evaluation.make(WORLDS, manifest, policy)
             try:
-                figures, lines = _tried(environments, at_its_best(policy), options)
+                figures, lines = _try_adversaries(environments, at_its_best(policy), options)
             finally:
                 environments.close()
             _finish(run, figures, [evaluation.about(manifest), *lines])
-        return _said(options, run, "What energy a policy could be made to draw")
+        return _write_report(options, run, "What energy a policy could be made to draw")
 
 
-def _tried(
+def _try_adversaries(
     environments: GymnasiumWorlds, act: Callable[[np.ndarray], np.ndarray], options: Audit
 ) -> tuple[list[Figure], list[str]]:
     """Every adversary in turn: figures, and a line for each."""
@@ -184,7 +184,7 @@ def _finish(run: Run, figures: list[Figure], lines: list[str]) -> None:
     folders.finish(run, figures, {folders.SUMMARY: summary})
 
 
-def _said(options: Audit, run: Run, title: str) -> Path:
+def _write_report(options: Audit, run: Run, title: str) -> Path:
     print((run.path / folders.TABLE).read_text(encoding="utf-8"), end="")
     print("\n".join(lines_of(read_result(run.path / RESULT).figures)))
     return folders.hand_over(options, run, title)

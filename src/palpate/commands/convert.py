@@ -18,7 +18,7 @@ def run(options: Convert) -> Path:
     Raises `PalpateError` for what cannot be read or written, and rather than overwrite anything
     without `--fresh`.
     """
-    out = _checked(options)
+    out = _check(options)
     recording = read_recording(
         options.recording,
         rate=options.rate,
@@ -41,7 +41,7 @@ def run(options: Convert) -> Path:
     return out
 
 
-def _checked(options: Convert) -> Path:
+def _check(options: Convert) -> Path:
     """Where to write, after a look at whether the options fit together."""
     out = options.out
     if out is None:

@@ -82,7 +82,7 @@ def open_run(
         return run
     if options.out is not None:
         check_writable(options.out)
-    numbered = sorted(_numbered(name))
+    numbered = sorted(_numbers_of(name))
     if not options.fresh:
         asked = plain(configuration, "configuration")
         for _, path in reversed(numbered):
@@ -236,7 +236,7 @@ def _remove(folder: Path, names: Iterable[str]) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _numbered(name: str) -> Iterator[tuple[int, Path]]:
+def _numbers_of(name: str) -> Iterator[tuple[int, Path]]:
     for path in RUNS.glob(f"{name}-*"):
         match = re.fullmatch(r"\d+", path.name.removeprefix(f"{name}-"))
         if match and path.is_dir():

@@ -59,8 +59,8 @@ def run(options: Identify) -> Path:
     if options.residual:  # now, and not after the physics was fitted
         check_correctable(reference, data.fitted_aligned)
     if not options.fits:
-        cut_pieces(data.fitted_aligned, reference, *_cut(options))
-        check_seen(cut_pieces(data.validation_aligned, reference, *_cut(options)))
+        cut_pieces(data.fitted_aligned, reference, *_lengths_of_segments(options))
+        check_seen(cut_pieces(data.validation_aligned, reference, *_lengths_of_segments(options)))
     product = folders.MODEL if options.fits else DRAWS
     inputs: dict[str, Path | Sequence[Path]] = {
         "recordings": options.recordings,
@@ -136,7 +136,7 @@ def _model_file(path: Path) -> Path:
     return folders.product_of(path, folders.MODEL, "identify")
 
 
-def _cut(options: Identify) -> tuple[float, bool]:
+def _lengths_of_segments(options: Identify) -> tuple[float, bool]:
     """How trials are cut into pieces for draws."""
     return options.piece, options.one_object
 
@@ -232,7 +232,7 @@ def _write_draws(
     if options.arviz is not None:
         write_netcdf(run.path / NETCDF, posterior)
     model = posterior.target.coordinates.reference
-    pieces = cut_pieces(data.validation_aligned, model, *_cut(options))
+    pieces = cut_pieces(data.validation_aligned, model, *_lengths_of_segments(options))
     predicted, score = posterior.predict(pieces), posterior.score(pieces)
     evidence = draws.expected_errors(predicted, pieces, model)
     evidence |= draws.posterior_motion(posterior, predicted, pieces)

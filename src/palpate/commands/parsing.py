@@ -77,7 +77,10 @@ def sentence(box: str, program: str, words: list[str]) -> str:
     for pattern, answer in (
         (r"Error parsing (--\S+): .* Argument helptext: \1 (.*?) [A-Z][a-z]", _wrong_value),
         (r"Error parsing [A-Z]\w+: (.*?) For full helptext", "{0}"),
-        (r"Unrecognized options: ([^ ,]+)(?:.*? Perhaps you meant.*?: (--\S+))?", _unknown),
+        (
+            r"Unrecognized options: ([^ ,]+)(?:.*? Perhaps you meant.*?: (--\S+))?",
+            _sentence_of_unknown,
+        ),
         (r"invalid choice '(.*)' for argument '(--\S+)'. Expected one of \((.*?)\)", _no_choice),
         (r"Missing value for argument '(--\S+)'", "{0} needs a value"),
         (r"Missing from .*?: (--\S+ \S+)", "{0} is missing"),
@@ -98,7 +101,7 @@ def _wrong_value(match: re.Match[str], words: list[str]) -> str:
     return f"{option} takes {_TAKES.get(takes, takes)}, not '{' '.join(given)}'"
 
 
-def _unknown(match: re.Match[str], words: list[str]) -> str:
+def _sentence_of_unknown(match: re.Match[str], words: list[str]) -> str:
     what = "option" if match[1].startswith("-") else "word"
     return f"unknown {what} '{match[1]}'" + (f", did you mean '{match[2]}'?" if match[2] else "")
 

@@ -34,7 +34,7 @@ def run(options: Reproduce, name: str) -> Path:
     Raises `PalpateError` for an option that this experiment does not have.
     """
     reproduce = find("experiments", name)
-    given = _given(name, reproduce, options)
+    given = _arguments_of(name, reproduce, options)
     out = options.out or folders.RUNS / (f"{name}-quick" if options.quick else name)
     if options.fresh and out.is_dir():
         folders.start_over(out, f"reproduce {name}")
@@ -83,7 +83,7 @@ def _difference(value: float | None, kept: float | None) -> str:
     return f"{value:.4g}, kept {kept:.4g}{change}"
 
 
-def _given(name: str, function: Callable[..., Result], options: Reproduce) -> dict[str, Any]:
+def _arguments_of(name: str, function: Callable[..., Result], options: Reproduce) -> dict[str, Any]:
     given = {"quick": options.quick, "seed": options.seed}
     for option in ("weights", "mocap", "maps"):
         value = getattr(options, option)

@@ -70,8 +70,8 @@ def run(options: Serve) -> Path:
                 print(f"note: {ORDINARY}")
             print(f"listening at {listen}; Ctrl-C brakes and ends", flush=True)
             served = supervisor, link, limits.period, options.seconds, robot, levels
-            record, asked = _served(*served)
-            printed, status = ([], 0) if robot is None else _ended(robot)
+            record, asked = _serve(*served)
+            printed, status = ([], 0) if robot is None else _end(robot)
         write_json(run.path / LATENCY, record.to_dict())
         figures = figures_of(record) + (deployment.outcome(printed[-1]) if printed else [])
         if levels is not None and deployment.filter is not None:
@@ -178,7 +178,7 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def _served(
+def _serve(
     supervisor: Supervisor,
     link: ZenohLink,
     period: float,
@@ -205,7 +205,7 @@ def _served(
     return record, True
 
 
-def _ended(robot: subprocess.Popen) -> tuple[list[str], int]:
+def _end(robot: subprocess.Popen) -> tuple[list[str], int]:
     """What the robot's process printed, and its status if it had failed by itself, else 0.
 
     It is asked to end, and not waited for in vain.

@@ -59,7 +59,7 @@ def write_contract(
         "outputs": {
             "command": {
                 **action,
-                "order": _ordered(policy.actions),
+                "order": _order(policy.actions),
                 "limits": "of the Euclidean norm along a channel's last axis, in its unit; "
                 "rate_limit of its change, per second",
                 "about": "to be held for one period",
@@ -70,7 +70,7 @@ def write_contract(
             "method": "sum of weight x position over the last frames, oldest first, one a period",
             "weights_per_s": VelocityEstimator(policy.period).weights,
         },
-        "trained": _trained(manifest),
+        "trained": _training_of(manifest),
     }
     write_json(path, content | _filter_of(robot_filter))
 
@@ -91,7 +91,7 @@ def write_actor_contract(
         "command": {
             "shape": ["batch", *shape],
             "dtype": "float32",
-            "order": _ordered(scaling.actions),
+            "order": _order(scaling.actions),
             "limits": "of the Euclidean distance from rest along a channel's last axis, in its "
             "unit; rate_limit of its change, per second",
             "low": scaling.low,
@@ -108,7 +108,7 @@ def write_actor_contract(
         "outputs": outputs,
         "fails_closed": "where any number of features is not finite, or one that the networks "
         "give, the command is that of rest and the action zeros",
-        "trained": _trained(manifest),
+        "trained": _training_of(manifest),
     }
     if isinstance(policy, GuardedPolicy):
         outputs["risk"] = risk
@@ -161,7 +161,7 @@ def _features(channels: Sequence[Channel], mean: Any, scale: Any) -> dict[str, A
     return {
         "shape": ["batch", count_of(channels)],
         "dtype": "float32",
-        "order": _ordered(channels),
+        "order": _order(channels),
         "normalisation": {
             "done_by": "the policy: give features in their units",
             "mean": mean,
@@ -170,7 +170,7 @@ def _features(channels: Sequence[Channel], mean: Any, scale: Any) -> dict[str, A
     }
 
 
-def _trained(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def _training_of(manifest: Mapping[str, Any]) -> dict[str, Any]:
     return {name: manifest[name] for name in _TRAINED if name in manifest}
 
 
@@ -181,7 +181,7 @@ def check_contract(path: str | Path) -> None:
         raise PalpateError(f"{path} is no contract: expected the JSON that `palpate export` wrote")
 
 
-def _ordered(channels: Sequence[Channel]) -> list[dict[str, Any]]:
+def _order(channels: Sequence[Channel]) -> list[dict[str, Any]]:
     """The channels as they lie one after the other: "first" is the first index of each."""
     rows, first = [], 0
     for channel in channels:

@@ -56,7 +56,7 @@ def encode_state(message: StateMessage) -> bytes:
     rows = len(values[-1])
     head = _HEAD.pack(_MAGIC, _VERSION, _STATE, rows, message.session, message.sequence)
     whole = b"".join(value.tobytes() for value in values)
-    return _checked(head + _TIME.pack(message.time) + whole)
+    return _check(head + _TIME.pack(message.time) + whole)
 
 
 def decode_state(data: bytes, sensors: Sequence[Channel]) -> StateMessage:
@@ -64,7 +64,7 @@ def decode_state(data: bytes, sensors: Sequence[Channel]) -> StateMessage:
 
     Raises `PalpateError` for anything else.
     """
-    rows, session, sequence = _opened(data, _STATE, "state")
+    rows, session, sequence = _open(data, _STATE, "state")
     last = sensors[-1]
     if rows != last.shape[0]:
         raise PalpateError(f"{rows} {last.name} where {last.shape[0]} were agreed")
@@ -86,7 +86,7 @@ def encode_command(message: CommandMessage) -> bytes:
         _MAGIC, _VERSION, _COMMAND, message.mode, message.session, message.sequence
     )  # fmt: skip
     action = np.asarray(message.action, "<f4").tobytes()
-    return _checked(head + _NEWEST.pack(message.state) + action)
+    return _check(head + _NEWEST.pack(message.state) + action)
 
 
 def decode_command(data: bytes, count: int) -> CommandMessage:
@@ -94,7 +94,7 @@ def decode_command(data: bytes, count: int) -> CommandMessage:
 
     Raises `PalpateError` for anything else, or if not finite.
     """
-    mode, session, sequence = _opened(data, _COMMAND, "command")
+    mode, session, sequence = _open(data, _COMMAND, "command")
     start = _HEAD.size + _NEWEST.size
     _length(data, start + 4 * count + _CHECK.size, "command")
     (state,) = _NEWEST.unpack_from(data, _HEAD.size)
@@ -104,11 +104,11 @@ def decode_command(data: bytes, count: int) -> CommandMessage:
     return CommandMessage(session, sequence, mode, state, action)
 
 
-def _checked(data: bytes) -> bytes:
+def _check(data: bytes) -> bytes:
     return data + _CHECK.pack(zlib.crc32(data))
 
 
-def _opened(data: bytes, kind: int, what: str) -> tuple[int, int, int]:
+def _open(data: bytes, kind: int, what: str) -> tuple[int, int, int]:
     """What the 16-bit field of the head holds, the session and the sequence number."""
     if len(data) < _HEAD.size + _CHECK.size or data[:4] != _MAGIC:
         raise PalpateError(f"{len(data)} bytes that are no message of palpate: expected a {what}")

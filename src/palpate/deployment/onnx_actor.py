@@ -40,7 +40,7 @@ def actor_model(policy: ActorPolicy, scaling: Scaling) -> Any:
     proposed = _action(graph, policy.actor.network, seen, count_of(policy.actions))
     outputs: dict[str, Any] = {}
     if isinstance(policy, GuardedPolicy):
-        proposed = _overruled(graph, policy.guard, policy.threshold, seen, proposed)
+        proposed = _overrule(graph, policy.guard, policy.threshold, seen, proposed)
         outputs["risk"] = [1]
     return _model(graph, scaling, seen, proposed, {}, outputs)
 
@@ -54,7 +54,7 @@ def guard_model(policy: GuardedPolicy, scaling: Scaling) -> Any:
     """
     graph = Graph()
     seen = graph.add("Div", "features", graph.constant(scaling.scale))
-    executed = _overruled(graph, policy.guard, policy.threshold, seen, "action")
+    executed = _overrule(graph, policy.guard, policy.threshold, seen, "action")
     inputs = {"action": [count_of(policy.actions)]}
     return _model(graph, scaling, seen, executed, inputs, {"risk": [1]})
 
@@ -129,7 +129,7 @@ def _model(
     return graph.model(inputs, {"command": shape, name: [first], **outputs})
 
 
-def _overruled(graph: Graph, guard: Guard, threshold: float, seen: str, action: str) -> str:
+def _overrule(graph: Graph, guard: Guard, threshold: float, seen: str, action: str) -> str:
     """The action, or the recovery's where it is risky; the risk is the output `risk`."""
     part = seen
     if guard.seen is not None:

@@ -36,7 +36,7 @@ def onnx_model(policy: CommandPolicy) -> Any:
     moved, first = [], 0
     for channel in policy.actions:
         own = [graph.part(whole, first, channel) for whole in (output, flat)]
-        moved.append(graph.flat(_moved(graph, channel, policy.period, *own), channel.count))
+        moved.append(graph.flat(_move(graph, channel, policy.period, *own), channel.count))
         first += channel.count
     command = graph.add("Concat", *moved, axis=1)
     command = graph.add("Reshape", command, graph.constant([-1, *shape], np.int64))
@@ -46,7 +46,7 @@ def onnx_model(policy: CommandPolicy) -> Any:
     return graph.model(inputs, {"command": shape, "carry_out": shape})
 
 
-def _moved(graph: Graph, channel: Channel, period: float, output: str, before: str) -> str:
+def _move(graph: Graph, channel: Channel, period: float, output: str, before: str) -> str:
     """The next command of one channel, from the network's output and the command before."""
     limit, one = graph.constant(channel.bound), graph.constant(1.0)
     length = graph.add("Sqrt", graph.add("Add", graph.square(output), one))

@@ -121,8 +121,8 @@ def _tries(
     """Of every surface of a look, or those of a part, the pull that would show best whether it
     moves."""
     found: list[tuple[float, Push]] = []
-    cloud, every, before = _guessed(twin, look, random, guess)
-    tried = [_handled_at(twin, surface, cloud, look) for surface in every]
+    cloud, every, before = _guess_surfaces(twin, look, random, guess)
+    tried = [_pulls_at(twin, surface, cloud, look) for surface in every]
     # a guess that was wrong of this appliance is trusted less in the rest of it
     failed = before * [len(pulls) + len(missed) > 0 for pulls, missed in tried]
     known = 1.0 + len(twin.parts)
@@ -145,7 +145,9 @@ def _tries(
     return found
 
 
-def _guessed(twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess) -> Guessed:
+def _guess_surfaces(
+    twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess
+) -> Guessed:
     """A look in the mean of all, its surfaces, and how likely each is to move before it is tried.
 
     They are kept until what is known of the look changes.
@@ -217,7 +219,7 @@ def _grips(
     return np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1))
 
 
-def _handled_at(
+def _pulls_at(
     twin: Twin, surface: Surface, cloud: Cloud, look: int
 ) -> tuple[list[movable.Pull], list[Float[np.ndarray, "3"]]]:
     """Pulls of hands at a surface, which may have been elsewhere then, and where others got no

@@ -95,7 +95,7 @@ def _places(surface: Surface, points: np.ndarray) -> Float[np.ndarray, "n 1 2"]:
     return np.clip((place - surface.low) / extent, 0.0, 1.0)[:, None]
 
 
-def _held(surface: Surface, points: np.ndarray) -> Float[np.ndarray, "n hypotheses"]:
+def _chance_of_hold(surface: Surface, points: np.ndarray) -> Float[np.ndarray, "n hypotheses"]:
     """Probability that a hand at each point has hold of the piece of each hypothesis."""
     place, low, high = _places(surface, points), PIECES[..., 0], PIECES[..., 1]
     within = np.minimum(
@@ -137,7 +137,7 @@ def moves(
     """Probability that each pull moves the surface, with a share of a hand's `force`."""
     shares = np.reshape(force, (-1, 1)) * _shares(surface, points, directions)
     goes = _goes(shares, belief.withstood)
-    return (_held(surface, points) * goes) @ belief.chances
+    return (_chance_of_hold(surface, points) * goes) @ belief.chances
 
 
 def posterior(belief: Belief, surface: Surface, pulls: Sequence[Pull]) -> Belief:
@@ -145,7 +145,7 @@ def posterior(belief: Belief, surface: Surface, pulls: Sequence[Pull]) -> Belief
     chances, withstood = belief
     for pull in pulls:
         point, direction = pull.point[None], pull.direction[None]
-        shares, held = _shares(surface, point, direction)[0], _held(surface, point)[0]
+        shares, held = _shares(surface, point, direction)[0], _chance_of_hold(surface, point)[0]
         shares = pull.force * shares
         goes = held * _goes(shares, withstood)
         if pull.moved:

@@ -56,7 +56,7 @@ def load_guess(path: Path | None = None) -> MovableGuess:
     Raises `PalpateError` for a file of other features or sizes, and as `load_arrays`.
     """
     if path is None:
-        return _shipped()
+        return _load_shipped()
     if read_manifest(path).get("features") != list(FEATURES):
         raise PalpateError(
             f"{path} was trained on other features: train it anew (palpate reproduce "
@@ -66,7 +66,7 @@ def load_guess(path: Path | None = None) -> MovableGuess:
 
 
 @functools.cache
-def _shipped() -> MovableGuess:
+def _load_shipped() -> MovableGuess:
     with resources.as_file(resources.files("palpate") / SHIPPED) as path:
         return load_guess(path)
 

@@ -47,15 +47,15 @@ def check_model(model: Model) -> None:
     ):
         frames = jnp.zeros((*lead, 2, *model.observation_shape))
         action = jnp.zeros((*lead, *model.action_shape))
-        state = _traced(of, "initial_state", what, frames)
-        following = _traced(of, "step", what, state, action)
+        state = _trace(of, "initial_state", what, frames)
+        following = _trace(of, "step", what, state, action)
         if _shapes(following) != _shapes(state):
             raise PalpateError(
                 f"{kind.__name__}.step of {what} gives {_form(following)} and takes {_form(state)}:"
                 " expected the same, as `initial_state` gives it"
             )
-        seen = _traced(of, "observe", what, state)
-        difference = _traced(of, "difference", what, seen, seen)
+        seen = _trace(of, "observe", what, state)
+        difference = _trace(of, "difference", what, seen, seen)
         for name, came in (("observe", seen), ("difference", difference)):
             if _form(came) != _form(frames[..., 0, *(slice(None),) * len(model.observation_shape)]):
                 raise PalpateError(
@@ -65,7 +65,7 @@ def check_model(model: Model) -> None:
                 )
 
 
-def _traced(model: Model, name: str, what: str, *arguments: Any) -> Any:
+def _trace(model: Model, name: str, what: str, *arguments: Any) -> Any:
     method: Callable[..., Any] = getattr(model, name)
     try:
         return jax.eval_shape(method, *arguments)

@@ -108,7 +108,7 @@ def load_model(path: str | Path, kind: type[Model] | None = None) -> tuple[Model
     settings = {name: value for name, value in structure.items() if name not in arrays}
     model = build(path, kind, arrays, settings)
     if _VERSIONS[version]:
-        model = _corrected(path, model, content.get("correction"))
+        model = _correct(path, model, content.get("correction"))
     return model, about
 
 
@@ -204,7 +204,7 @@ def build(
         raise PalpateError(f"{path} is damaged: {error}") from error
 
 
-def _corrected(path: str | Path, physics: Model, content: Any) -> Residual:
+def _correct(path: str | Path, physics: Model, content: Any) -> Residual:
     """The physics with the network of a file on top of it, every array of which is checked."""
     if not isinstance(content, dict):
         raise PalpateError(f"{path} is damaged: its correction is missing")

@@ -231,13 +231,13 @@ class Residual(Wrapper):
 
     def step(self, state: Any, action: Array) -> Any:
         """The state one control period later: a kick, then the physics."""
-        return self.physics.step(self._kicked(state, action), action)
+        return self.physics.step(self._kick(state, action), action)
 
     def stepper(self) -> Callable[[Any, Array], Any]:
         step = self.physics.stepper()
-        return lambda state, action: step(self._kicked(state, action), action)
+        return lambda state, action: step(self._kick(state, action), action)
 
-    def _kicked(self, state: Any, action: Array) -> Any:
+    def _kick(self, state: Any, action: Array) -> Any:
         return correctable(self.physics).corrected(state, self.correction(state, action))
 
     def constrain(self) -> "Residual":

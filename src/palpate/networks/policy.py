@@ -108,7 +108,7 @@ class CommandPolicy(DeclaredController):
         key: Key[Array, "*batch"] | None = None,
     ) -> tuple[Array, Array]:
         """The command, as the next carry and as the action: (*batch, *action_shape)."""
-        command = self._moved(carry, self._direction(carry, observation))
+        command = self._move(carry, self._direction(carry, observation))
         return command, command
 
     def similar(
@@ -132,7 +132,7 @@ class CommandPolicy(DeclaredController):
                 "the command of this one has no rate limit"
             )
         root = jnp.sqrt(size).reshape(*size.shape, *(1,) * (carry.ndim - size.ndim))
-        command = self._moved(carry, self._direction(carry / root, observation))
+        command = self._move(carry, self._direction(carry / root, observation))
         return command, command
 
     def shares(
@@ -153,7 +153,7 @@ class CommandPolicy(DeclaredController):
             output.reshape(carry.shape),
         )
 
-    def _moved(self, carry: Array, direction: Array) -> Array:
+    def _move(self, carry: Array, direction: Array) -> Array:
         def move(channel: Channel, carry: Array, direction: Array) -> Array:
             if channel.rate_limit is None:
                 return channel.bound * direction

@@ -81,7 +81,7 @@ def compile_sooner(function: Callable[..., Any]) -> Callable[..., Any]:
 
     A posterior compiles in two thirds of the time and runs as fast, a single rope half as fast.
     """
-    return _compiled(function, {"xla_cpu_use_fusion_emitters": False})
+    return _compile(function, {"xla_cpu_use_fusion_emitters": False})
 
 
 def compile_at_once(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -91,10 +91,10 @@ def compile_at_once(function: Callable[..., Any]) -> Callable[..., Any]:
     `compile_sooner` and run up to a tenth slower; densities alone run at half the speed.
     """
     options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
-    return _compiled(function, options)
+    return _compile(function, options)
 
 
-def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
+def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
     import equinox as eqx
 
     keywords: dict[str, Any] = {"compiler_options": options} if _needs_flags() else {}

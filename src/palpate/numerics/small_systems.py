@@ -27,14 +27,14 @@ def solve_lower(
     root: Float[Array, "*batch size size"], right: Float[Array, "*batch size columns"]
 ) -> Float[Array, "*batch size columns"]:
     """L^-1 `right` for a lower triangular L."""
-    return _substituted(root, right, backwards=False)
+    return _substitute(root, right, backwards=False)
 
 
 def solve_upper(
     root: Float[Array, "*batch size size"], right: Float[Array, "*batch size columns"]
 ) -> Float[Array, "*batch size columns"]:
     """L'^-1 `right` for a lower triangular L."""
-    return _substituted(jnp.swapaxes(root, -1, -2), right, backwards=True)
+    return _substitute(jnp.swapaxes(root, -1, -2), right, backwards=True)
 
 
 def solve(
@@ -44,7 +44,7 @@ def solve(
     return solve_upper(root, solve_lower(root, right[..., None]))[..., 0]
 
 
-def _substituted(triangle: Array, right: Array, backwards: bool) -> Array:
+def _substitute(triangle: Array, right: Array, backwards: bool) -> Array:
     """Solve for one unknown after another, the last one first if `backwards`."""
 
     def substitute(rest: Array, index: Array) -> tuple[Array, Array]:

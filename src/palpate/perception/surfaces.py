@@ -70,7 +70,7 @@ def surfaces(
             centre, normal = _plane(cloud.points[members], cloud.normals[members])
             near = np.abs((cloud.points - centre) @ normal) < room
             near &= (cloud.normals @ normal > FLAT) & ~taken & (labels == labels[seed])
-            members = _connected(near, neighbours, seed)
+            members = _connected_to(near, neighbours, seed)
         if len(members) * size >= smallest:
             taken[members] = True
             pieces.append(members)
@@ -139,7 +139,7 @@ def smallest_rectangle(
     return best
 
 
-def _connected(near: np.ndarray, neighbours: np.ndarray, seed: int | np.integer) -> np.ndarray:
+def _connected_to(near: np.ndarray, neighbours: np.ndarray, seed: int | np.integer) -> np.ndarray:
     """Which of these points hang together with the seed, or with most of them without it."""
     chosen = np.flatnonzero(near)
     place = np.full(len(near), -1)

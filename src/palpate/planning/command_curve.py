@@ -62,12 +62,12 @@ class CurvePlanner(eqx.Module):
         of `horizon` instants, the first of which is one control period from now (None: no goal).
         """
         key, following = jax.random.split(plan.key)
-        knots = self._improved(plan, state, goals, key)
+        knots = self._improve(plan, state, goals, key)
         command = self._command(knots[0], plan.command)
         return Plan(self._curve(knots, 1.0), command, following), command
 
     @abstractmethod
-    def _improved(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
+    def _improve(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
         """Better knots than those of the plan."""
 
     def _losses(self, tried: Array, command: Array, state: Any, goals: Any) -> Array:
@@ -76,7 +76,7 @@ class CurvePlanner(eqx.Module):
         def advance(motion: tuple[Any, Array, Array], goal: tuple[Array, Any]):
             states, commands, total = motion
             place, asked = goal
-            states, commands = self._moved(states, commands, tried, place)
+            states, commands = self._move(states, commands, tried, place)
             return (states, commands, total + self.stage_loss(states, commands, asked)), None
 
         count = tried.shape[0]
@@ -84,7 +84,7 @@ class CurvePlanner(eqx.Module):
         (_, _, total), _ = jax.lax.scan(advance, start, (self._places(), goals))
         return total
 
-    def _moved(self, states: Any, commands: Array, tried: Array, place: Array) -> tuple[Any, Array]:
+    def _move(self, states: Any, commands: Array, tried: Array, place: Array) -> tuple[Any, Array]:
         """States and commands one control period later, at a `place` on each curve."""
         commands = self._command(_between(tried, place, axis=1), commands)
         return self.model.step(states, commands), commands

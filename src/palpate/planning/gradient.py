@@ -53,7 +53,7 @@ class GradientPlanner(CurvePlanner):
                 f"between them, got {', '.join(map(str, counts))}"
             )
 
-    def _improved(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
+    def _improve(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
         """The best plan along the way."""
 
         def iterate(_, knots: Array) -> Array:
@@ -80,7 +80,7 @@ class GradientPlanner(CurvePlanner):
             reached, tangents, slope, curvature = motion
             place, asked = goal
             reached, tangents = jax.jvp(
-                lambda states, commands, tried: self._moved(states, commands, tried, place),
+                lambda states, commands, tried: self._move(states, commands, tried, place),
                 (*reached, copies),
                 (*tangents, towards),
             )

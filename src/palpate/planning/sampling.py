@@ -89,7 +89,7 @@ class SamplingPlanner(CurvePlanner):
         if self.shares[:1] != (1.0,):
             raise PalpateError(f"the first of the shares of a plan is 1, not {self.shares}")
 
-    def _improved(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
+    def _improve(self, plan: Plan, state: Any, goals: Any, key: PRNGKeyArray) -> Array:
         """The samples' weighted mean."""
         knots = plan.knots
         deviation = jnp.full_like(knots, self.deviation)

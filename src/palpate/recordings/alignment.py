@@ -66,14 +66,14 @@ def align(
             f"trial '{longest.name}' is {longest.duration:.6g} s long, so check its time "
             "stamps or take a longer period"
         )
-    observations = {of[0].name: _filled(of, frames, np.nan) for of in observed}
-    actions = {of[0].name: _filled(of, frames - 1, 0.0) for of in acting}
+    observations = {of[0].name: _fill(of, frames, np.nan) for of in observed}
+    actions = {of[0].name: _fill(of, frames - 1, 0.0) for of in acting}
     newest = {name: np.full((count, frames), -1) for name in events}
     slack = ON_STAMP * period
     for i, (trial, (start, length)) in enumerate(zip(trials, spans, strict=True)):
         grid = start + period * np.arange(length)
         for of, values in zip(observed, observations.values(), strict=True):
-            values[i, :length] = _interpolated(of[i], grid, OBSERVATION_GAP, slack)
+            values[i, :length] = _interpolate(of[i], grid, OBSERVATION_GAP, slack)
         for of, values in zip(acting, actions.values(), strict=True):
             values[i, : length - 1] = _actions(of[i], grid, trial, slack)
             values[i, length - 1 :] = values[i, length - 2]
@@ -156,7 +156,7 @@ def _actions(channel: Channel, grid: np.ndarray, trial: Trial, slack: float) -> 
     """What acts from each frame of `grid` to the next, (len(grid) - 1, *shape)."""
     if channel.role is Role.COMMAND:
         return _mean_in_force(channel, grid, slack)
-    actions = _interpolated(channel, grid[1:], DRIVEN_GAP, slack)
+    actions = _interpolate(channel, grid[1:], DRIVEN_GAP, slack)
     unknown = np.isnan(actions).reshape(len(actions), -1).any(axis=1)
     if unknown.any():
         raise PalpateError(
@@ -167,7 +167,7 @@ def _actions(channel: Channel, grid: np.ndarray, trial: Trial, slack: float) -> 
     return actions
 
 
-def _filled(channels: list[Channel], frames: int, value: float) -> np.ndarray:
+def _fill(channels: list[Channel], frames: int, value: float) -> np.ndarray:
     """(trials, frames, *shape) of `value`, for the values of one channel in each trial."""
     dtype = np.result_type(*(channel.values for channel in channels))
     return np.full((len(channels), frames, *channels[0].values.shape[1:]), value, dtype)
@@ -181,7 +181,7 @@ def _side_by_side(arrays: Mapping[str, np.ndarray], none: np.ndarray) -> np.ndar
     return np.concatenate(flat, axis=2) if flat else none
 
 
-def _interpolated(channel: Channel, grid: np.ndarray, gap: int, slack: float) -> np.ndarray:
+def _interpolate(channel: Channel, grid: np.ndarray, gap: int, slack: float) -> np.ndarray:
     """Values (frames, *shape) at `grid`; NaN by a neighbour unseen or over `gap` periods away.
 
     A frame within `slack` seconds of a stamp stands on it and needs no other neighbour.

@@ -143,7 +143,7 @@ def _motive(first: list[str], lines: Lines) -> MarkerTable:
     clock = next((i for i, name in enumerate(axes) if name.lower().startswith("time (")), None)
     if clock is None:
         raise PalpateError(f"line {lines.number} has no column 'Time (Seconds)'")
-    triples = _named(
+    triples = _columns_of_markers(
         names,
         [
             column
@@ -178,7 +178,7 @@ def _vicon(first: list[str], lines: Lines) -> MarkerTable:
     units = lines.header("the units")
     width = len(axes)
     names, units = names + [""] * (width - len(names)), units + [""] * (width - len(units))
-    triples = _named(names, _xyz(axes))
+    triples = _columns_of_markers(names, _xyz(axes))
     if not triples:
         raise PalpateError(f"line {lines.number - 1} has no columns X, Y, Z")
     unit = {_unit(units[column], lines.number) for column in chain(*triples.values())}
@@ -224,7 +224,7 @@ def _xyz(axes: list[str]) -> list[int]:
     return [i for i in range(len(axes) - 2) if [a.upper() for a in axes[i : i + 3]] == [*"XYZ"]]
 
 
-def _named(names: list[str], columns: list[int]) -> dict[str, list[int]]:
+def _columns_of_markers(names: list[str], columns: list[int]) -> dict[str, list[int]]:
     """The three columns of each marker by its name, which stands above the first."""
     triples = {names[column]: list(range(column, column + 3)) for column in columns}
     if len(triples) < len(columns) or "" in triples:

@@ -136,7 +136,7 @@ def fact_from_json(name: str, content: Any) -> Fact:
         raise DamagedFileError(
             f"fact '{name}' is of the kind {quote(kind)}; known are: {', '.join(KINDS)}"
         )
-    return _made(name, KINDS[kind], **fields)
+    return _make(name, KINDS[kind], **fields)
 
 
 def facts_in_provenance(provenance: Mapping[str, Any]) -> dict[str, Fact]:
@@ -151,13 +151,13 @@ def facts_in_provenance(provenance: Mapping[str, Any]) -> dict[str, Fact]:
     }
     texts = {name: str(provenance.get(name, "")) for name in makers}
     return {
-        name: _made(name, lambda text, of=makers[name]: of(parse_json(text)), text=text)
+        name: _make(name, lambda text, of=makers[name]: of(parse_json(text)), text=text)
         for name, text in texts.items()
         if text.startswith(("[", "{"))
     }
 
 
-def _made(name: str, make: Callable[..., Fact], **fields: Any) -> Fact:
+def _make(name: str, make: Callable[..., Fact], **fields: Any) -> Fact:
     try:
         return make(**fields)
     except (TypeError, ValueError, AttributeError) as error:

@@ -91,7 +91,7 @@ def _features(recording: Recording, aligned: Aligned, fps: int) -> dict[str, Fea
     trial, frame = np.nonzero(np.arange(aligned.length.max()) < aligned.length[:, None])
     names, observed = _columns(aligned.observations, trial, frame)
     state = np.concatenate([
-        _filled(observed[trial == number], each.name, names)
+        _fill(observed[trial == number], each.name, names)
         for number, each in enumerate(recording.trials)
     ])  # fmt: skip
     features = {STATE: Feature(names, state.astype(np.float32))}
@@ -134,7 +134,7 @@ def _names(channel: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     return tuple("_".join([channel, *map(str, index)]) for index in np.ndindex(shape))
 
 
-def _filled(values: np.ndarray, trial: str, names: tuple[str, ...]) -> np.ndarray:
+def _fill(values: np.ndarray, trial: str, names: tuple[str, ...]) -> np.ndarray:
     """`values` (frames, numbers) without NaN: linear in between, and as seen next at the ends."""
     frames = np.arange(len(values))
     filled = np.array(values, np.float64)

@@ -45,7 +45,7 @@ def with_driven(
     for trial in recording.trials:
         if name in trial.channels:
             raise PalpateError(f"trial '{trial.name}' already has a channel '{name}'")
-        parts = _driven(trial, markers, channel, name)
+        parts = _driven_channels(trial, markers, channel, name)
         count = trial[channel].values.shape[1]
         fact = Driven(channel, resolve_indices(markers, count, "marker"))
         for number, driven in enumerate(parts, 1):
@@ -76,12 +76,14 @@ def repair_markers(recording: Recording, channel: str = "markers") -> Recording:
     """
     trials = []
     for trial in recording.trials:
-        repaired = _repaired(trial[channel], trial)
+        repaired = _repair(trial[channel], trial)
         trials.append(replace(trial, channels={**trial.channels, channel: repaired}))
     return replace(recording, trials=tuple(trials))
 
 
-def _driven(trial: Trial, markers: Sequence[int], channel: str, name: str) -> list[Channel]:
+def _driven_channels(
+    trial: Trial, markers: Sequence[int], channel: str, name: str
+) -> list[Channel]:
     """The driven channel, in parts between gaps that are too long to be filled."""
     source = trial[channel]
     if source.values.ndim < 2:
@@ -133,7 +135,7 @@ def _driven(trial: Trial, markers: Sequence[int], channel: str, name: str) -> li
     return parts
 
 
-def _repaired(source: Channel, trial: Trial) -> Channel:
+def _repair(source: Channel, trial: Trial) -> Channel:
     if source.values.ndim != 3:
         raise PalpateError(
             f"channel '{source.name}' of trial '{trial.name}' has values of shape "
@@ -157,13 +159,13 @@ def _undo_exchanges(values: np.ndarray, frames: np.ndarray, time: np.ndarray) ->
     original = np.array(values)
     markers = np.arange(values.shape[1])
     order = np.tile(markers, (len(values), 1))  # the column each marker was found in
-    jumps = np.linalg.norm(_predicted(values, frames) - values, axis=2)
+    jumps = np.linalg.norm(_predict(values, frames) - values, axis=2)
     # Only a sieve for speed: where fewer than two markers jump, no two can have been exchanged.
     known = jumps[np.isfinite(jumps)]
     large = jumps > 5 * (np.median(known) if known.size else np.inf)
     for row in np.flatnonzero(large.sum(axis=1) >= 2):
         past = slice(max(row - 2, 0), row + 1)
-        expected = _predicted(values[past], frames[past.start : row])[-1]
+        expected = _predict(values[past], frames[past.start : row])[-1]
         found = np.flatnonzero(np.isfinite(expected + values[row]).all(axis=-1))
         squared = ((expected[found, None] - values[row, found]) ** 2).sum(axis=2)
         _, assigned = linear_sum_assignment(squared)
@@ -188,7 +190,7 @@ def _undo_exchanges(values: np.ndarray, frames: np.ndarray, time: np.ndarray) ->
     ]
 
 
-def _predicted(values: np.ndarray, frames: np.ndarray) -> np.ndarray:
+def _predict(values: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """Positions from the two rows before at constant velocity; at rest where one is missing."""
     predicted = np.full_like(values, np.nan)
     predicted[1:] = values[:-1]

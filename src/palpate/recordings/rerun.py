@@ -45,7 +45,7 @@ def write_rerun(path: str | Path, recording: Recording) -> None:
         for events in trial.events.values():
             for time, array in zip(events.time - trial.start + begin, events.values, strict=True):
                 stream.set_time(TIMELINE, duration=time)
-                stream.log(_entity(events), _drawn(events, array))
+                stream.log(_entity(events), _draw(events, array))
         begin += trial.duration + PAUSE
         if trial is not recording.trials[-1]:  # the last stays in view
             stream.set_time(TIMELINE, duration=begin - PAUSE)
@@ -64,7 +64,7 @@ def _is_points(part: Channel | Events) -> bool:
     return part.unit == "m" and part.values[0].shape[-1:] == (3,)
 
 
-def _drawn(events: Events, array: np.ndarray) -> Any:
+def _draw(events: Events, array: np.ndarray) -> Any:
     import rerun
 
     if _is_points(events):

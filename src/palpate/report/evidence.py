@@ -164,7 +164,7 @@ def write_evidence(run: str | Path, arrays: Mapping[str, ArrayLike]) -> Path:
             kept[key] = np.asarray(values, dtype=kind)
         except (TypeError, ValueError) as error:
             raise PalpateError(f"'{key}' is not an array of numbers: {error}") from error
-    _sorted_out(kept)
+    _sort(kept)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **kept)  # type: ignore[arg-type]  # its stub wants bool keywords
     write_bytes(path, buffer.getvalue())
@@ -234,12 +234,12 @@ def _arrays(path: Path) -> _Sections:
         reason = str(error).partition("\n")[0]
         raise DamagedFileError(f"{path} is damaged or not NPZ ({reason})") from error
     try:
-        return _sorted_out(arrays)
+        return _sort(arrays)
     except PalpateError as error:
         raise DamagedFileError(f"{path}: {error}") from error
 
 
-def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
+def _sort(arrays: Mapping[str, np.ndarray]) -> _Sections:
     """The arrays by section, once each was found to fit its name."""
     known = pieces()
     sections: dict[tuple[str, str], dict[str, np.ndarray]] = {}
@@ -269,7 +269,7 @@ def _sorted_out(arrays: Mapping[str, np.ndarray]) -> _Sections:
         if kind == "motion":
             motions.append(Motion(group, time, values))
         elif kind == "horizon":
-            horizon = _banded(time, values)
+            horizon = _bands_of(time, values)
         elif kind == "prediction":
             prediction = Curves(time, values)
         else:
@@ -290,7 +290,7 @@ def _check_shapes(
             )
 
 
-def _banded(time: np.ndarray, values: dict[str, np.ndarray]) -> Curves:
+def _bands_of(time: np.ndarray, values: dict[str, np.ndarray]) -> Curves:
     edges = {label for label in values if label.endswith((".low", ".high"))}
     labels = [label for label in values if label not in edges]
     bands = {}

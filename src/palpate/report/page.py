@@ -184,7 +184,7 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
         caption = f"The motion: {', '.join(labels)}"
         if _OBSERVED in labels and len(labels) > 1:
             caption += "; where the lines part, the prediction is wrong"
-        caption += "; the trail is the path of its tip" * any(map(_tipped, evidence.motions))
+        caption += "; the trail is the path of its tip" * any(map(_tips_of, evidence.motions))
         caption += ". Drag to look from another side."
         content = _caption(caption)
         content += f'<div class="player">{_data(scene(evidence.motions, looks))}</div>'
@@ -194,7 +194,7 @@ def _motion(evidence: Evidence, looks: dict[str, int]) -> str:
     return content
 
 
-def _tipped(motion: Motion) -> Motion | None:
+def _tips_of(motion: Motion) -> Motion | None:
     """The chains of a motion whose last point is their tip; lines that a gap ends have none."""
     chains = {of: p for of, p in motion.chains.items() if np.isfinite(p[:, -1]).any()}
     return dataclasses.replace(motion, chains=chains) if chains else None
@@ -202,7 +202,7 @@ def _tipped(motion: Motion) -> Motion | None:
 
 def _tips(evidence: Evidence, looks: dict[str, int]) -> str:
     content = ""
-    for motion in filter(None, map(_tipped, evidence.motions)):
+    for motion in filter(None, map(_tips_of, evidence.motions)):
         caption = "where the object's last point is over time"
         observed, distances = motion.chains.get(_OBSERVED), []
         for label, points in motion.chains.items():

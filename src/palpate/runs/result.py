@@ -201,11 +201,11 @@ def read_result(path: str | Path) -> Result:
     Raises `PalpateError` naming the file, the key and what was expected there.
     """
     try:
-        document = _checked(read_json(path), "the result", _RESULT)
+        document = _check(read_json(path), "the result", _RESULT)
         figures = []
         for index, item in enumerate(document["figures"]):
             where = f"figures[{index}]"
-            entry = dict(_checked(item, where, _FIGURE))
+            entry = dict(_check(item, where, _FIGURE))
             met = entry.pop("met")
             figure = Figure(**entry)
             if met != figure.met:
@@ -238,7 +238,7 @@ _RESULT = _kinds(Result.__annotations__)
 _OPTIONAL = {"parameters", "warnings"}
 
 
-def _checked(document: Any, where: str, schema: dict[str, tuple[type, ...]]) -> dict[str, Any]:
+def _check(document: Any, where: str, schema: dict[str, tuple[type, ...]]) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise PalpateError(f"{where} is a {type(document).__name__}: expected a JSON object")
     for problem, names in (

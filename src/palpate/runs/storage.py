@@ -195,7 +195,7 @@ def load_arrays(path: str | Path, like: Any) -> tuple[Any, dict[str, Any]]:
     """
     import jax
 
-    with _opened(path) as file:
+    with _open(path) as file:
         entry = _entry(path, file)
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     if entry["crc32"] != _checksum(arrays, entry):
@@ -226,7 +226,7 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
 
     Raises `PalpateError` when there is none, `DamagedFileError` when the file is damaged.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         return _entry(path, file)["manifest"]
 
 
@@ -266,7 +266,7 @@ def _as_like(path: str | Path, name: str, stored: Any, key: str | None, like: An
     return jax.numpy.asarray(found)
 
 
-def _opened(path: str | Path) -> Any:
+def _open(path: str | Path) -> Any:
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -89,10 +89,10 @@ class Camera:
         sensor = self.sensor
         picture = 255 * colour.mean(0)
         picture = picture + sensor.colour_noise * random.standard_normal(picture.shape)
-        seen = self._measured(depth, random) if sensor.has_depth else None
+        seen = self._measure(depth, random) if sensor.has_depth else None
         return Frame(time, np.clip(np.round(picture), 0, 255).astype(np.uint8), seen)
 
-    def _measured(self, depth: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    def _measure(self, depth: np.ndarray, random: np.random.Generator) -> np.ndarray:
         chosen = random.integers(len(depth), size=depth.shape[1:])
         seen = np.take_along_axis(depth, chosen[None], axis=0)[0]
         noise = self.sensor.depth_noise * random.standard_normal(seen.shape)

@@ -122,7 +122,7 @@ class Lockstep:
         self._first: list[Any] = [None] * count  # of the episodes under way
         self.fresh = np.ones(count, bool)
         self.decisions = np.zeros(count, int)
-        self._ended: dict[int, dict[str, np.ndarray]] = {}  # in the decision: see `_drawn`
+        self._ended: dict[int, dict[str, np.ndarray]] = {}  # in the decision: see `_draws_of`
         self.motions: Motions | None = None
         if isinstance(law, InterruptingLaw):
             self.motions = Motions(law, self.features, self.every)
@@ -148,7 +148,7 @@ class Lockstep:
         if energy is None:
             return seen
         metered = isinstance(self.law, MeteredLaw) and not self.fresh.all()
-        level = self._drawn(self.law).get("level") if metered else None  # type: ignore[arg-type]
+        level = self._draws_of(self.law).get("level") if metered else None  # type: ignore[arg-type]
         full = np.where(self.fresh, energy.full, energy.full if level is None else level)
         share = np.clip(full / energy.full, -FEATURE_LIMIT, FEATURE_LIMIT)
         return np.concatenate([seen, share[:, None].astype(np.float32)], axis=1)
@@ -164,7 +164,7 @@ class Lockstep:
         before, truths, self._ended = list(self._truths), self._truths, {}
         if law is not None:
             law.begin(side_by_side(observations), actions, self.fresh.copy())
-        force, end = self._held() or self._stepped(actions)
+        force, end = self._hold() or self._step(actions)
         running = np.flatnonzero(end == "").tolist()
         self.fresh[:] = False
         self.decisions += 1
@@ -182,13 +182,13 @@ class Lockstep:
         info["force"] = force
         info["progress"] = np.array([*map(task.progress, self._first, truths)])
         if isinstance(law, MeteredLaw):
-            info |= self._drawn(law)
+            info |= self._draws_of(law)
             if self.energy is not None:
                 info["cost"] = self.energy.of(info).astype(np.float32)
         return reward, (end != "") & ~cut, cut, info
 
-    def _held(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """As `_stepped`, by a rollout; None where that cannot be."""
+    def _hold(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """As `_step`, by a rollout; None where that cannot be."""
         law = self.law
         spring = law.spring() if self._rollout is not None and isinstance(law, SpringLaw) else None
         if spring is None or self._rollout is None:
@@ -201,7 +201,7 @@ class Lockstep:
         end[held.violated], end[held.diverged] = VIOLATION, DIVERGED
         return held.force, end
 
-    def _drawn(self, law: MeteredLaw) -> dict[str, np.ndarray]:
+    def _draws_of(self, law: MeteredLaw) -> dict[str, np.ndarray]:
         """What the decision has drawn so far, and what is left, each (worlds,).
 
         Of a world that has ended within it, what was so then: the law goes on for the others.
@@ -213,7 +213,7 @@ class Lockstep:
                 values[number] = then[name][number]
         return now
 
-    def _stepped(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The greatest force in each world in a decision, N, and how it ended ("": it did not)."""
         worlds, task, law, observations = self.worlds, self.task, self.law, self.observations
         motions, truths, metered = self.motions, self._truths, isinstance(law, MeteredLaw)
@@ -239,7 +239,7 @@ class Lockstep:
             if metered and len(running) < len(worlds):
                 for number in np.flatnonzero(end != "").tolist():
                     if number not in self._ended:
-                        self._ended[number] = self._drawn(law)  # type: ignore[arg-type]
+                        self._ended[number] = self._draws_of(law)  # type: ignore[arg-type]
         return np.array(force), end
 
 
@@ -313,7 +313,7 @@ class GymnasiumWorlds(VectorEnv):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One decision of every world, `actions` (worlds, actions) in [-1, 1]."""
         lockstep = self.lockstep
-        actions = _checked(actions, (self.num_envs, *(self.single_action_space.shape or ())))
+        actions = _check(actions, (self.num_envs, *(self.single_action_space.shape or ())))
         reward, terminated, truncated, infos = lockstep.decide(actions)
         features, ended = lockstep.features(), terminated | truncated
         if lockstep.motions is not None:
@@ -363,7 +363,7 @@ class GymnasiumWorld(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One decision, (actions,) in [-1, 1]."""
-        action = _checked(action, self.action_space.shape or ())
+        action = _check(action, self.action_space.shape or ())
         reward, terminated, truncated, info = self.lockstep.decide(action[None])
         info = {name: values.tolist()[0] for name, values in info.items()}
         features = self.lockstep.features()[0]
@@ -374,7 +374,7 @@ class GymnasiumWorld(gymnasium.Env):
         return None if self.render_mode is None else self.lockstep.worlds[0].render()
 
 
-def _checked(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _check(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The action as it came: what is not finite is for the law, which fails closed."""
     action = np.asarray(action, float)
     if action.shape != shape:

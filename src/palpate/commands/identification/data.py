@@ -47,7 +47,7 @@ def read(options: Identify) -> Data:
         fitted, validation = raw.split(options.held_out, options.seed)
     else:
         fitted, validation = raw, None
-    fitted = _prepared(options.repair(fitted), options, "")
+    fitted = _prepare(options.repair(fitted), options, "")
     observed, action = options.observed, options.action(fitted)
     if not options.fits:
         _check_duration(fitted, options)
@@ -56,7 +56,7 @@ def read(options: Identify) -> Data:
     period = 1.0 / options.rate if options.rate else float(f"{np.median(periods):.5g}")
     aligned = scored = fitted.align(period, observed, action)
     if validation is not None:
-        validation = _prepared(validation, options, "validation, ")
+        validation = _prepare(validation, options, "validation, ")
         scored = validation.align(period, observed, action)
     problems = tuple(options.problems(aligned))
     noise = measurement_noise(aligned.observation)
@@ -77,7 +77,7 @@ def _read(paths: tuple[Path, ...], options: Identify) -> Recording:
     return join([options.read(path) for path in paths])
 
 
-def _prepared(recording: Recording, options: Identify, where: str) -> Recording:
+def _prepare(recording: Recording, options: Identify, where: str) -> Recording:
     """The recording as the family needs it; what was put right before and thereby is printed."""
     prepared = options.prepare(recording)
     for note in dict.fromkeys((*recording.notes, *prepared.notes)):

@@ -199,12 +199,12 @@ class _Row:
 
     @classmethod
     def of(cls, parts: Sequence[Episodes], reserve: float) -> "_Row":
-        joined = functools.partial(_joined, parts)
+        joined = functools.partial(_join, parts)
         level = joined("level")
         broken = (np.isfinite(level) & (level < reserve)) | (joined("rise") > GAIN)
         ends = np.concatenate([np.array(part["end"], object) for part in parts])
         return cls(ends == GOAL, joined("drawn"), joined("flow"), broken)
 
 
-def _joined(parts: Sequence[Episodes], name: str) -> np.ndarray:
+def _join(parts: Sequence[Episodes], name: str) -> np.ndarray:
     return np.concatenate([np.array(part[name], float) for part in parts])

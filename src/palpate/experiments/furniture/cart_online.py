@@ -76,7 +76,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     seeds = [EVALUATION_SEEDS + 10 * seed + world for world in range(WORLDS[size])]
     earned = {}
     for name in TASKS:
-        earned[name] = _earned(experiment, name, seeds, DECISIONS[size])
+        earned[name] = _rewards_of(experiment, name, seeds, DECISIONS[size])
         print("\n".join(_lines(name, earned[name])), flush=True)
     draw(out / "curves.png", earned)
     return experiment.result(
@@ -105,7 +105,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
 
 
-def _earned(experiment: Experiment, name: str, seeds: list[int], decisions: int) -> Rewards:
+def _rewards_of(experiment: Experiment, name: str, seeds: list[int], decisions: int) -> Rewards:
     """What every agent earned in every world, in a stage."""
     configuration = {
         "stage": name,

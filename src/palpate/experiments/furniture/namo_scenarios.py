@@ -138,8 +138,8 @@ def plan_map(
         world = read_map(path)
         goals = world.goals or (world.check(),)
     except PalpateError as error:
-        return Trial(_named(path.stem, path, taken), 1, (), 0.0, 0.0, str(error))
-    own = _named(world.name, path, taken)
+        return Trial(_name_of(path.stem, path, taken), 1, (), 0.0, 0.0, str(error))
+    own = _name_of(world.name, path, taken)
     plans, faults, efficiencies, planning_s = [], [], [], 0.0
     for number, goal in enumerate(goals, start=1):
         try:
@@ -168,7 +168,7 @@ def plan_map(
     return Trial(own, len(goals), tuple(plans), planning_s, efficiency, fault)
 
 
-def _named(name: str, path: Path, taken: Collection[str]) -> str:
+def _name_of(name: str, path: Path, taken: Collection[str]) -> str:
     """A name that is a folder's, and that no other map of the study has."""
     stem, parts = re.sub(r"[^\w .-]", "_", name).strip(" .") or "map", path.with_suffix("").parts
     names = [stem, *("-".join(parts[-k:]) for k in range(2, len(parts))), path.name]

@@ -97,7 +97,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     }
     given = {"seed": first, "pushes": size.pushes, "draws": size.compared_draws}
     compared = {
-        kind: found(f"samples-{kind}", "samples", _compared, kind=kind, **given)
+        kind: found(f"samples-{kind}", "samples", _compare, kind=kind, **given)
         for kind in progress(movable, "sample sizes")
     }
     given = {"seed": first, "pushes": size.pushes, "pieces": size.pieces}
@@ -106,7 +106,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         for kind in progress(movable, "mujoco.sysid")
     }
     given = {"seed": first, "draws": size.raced_draws, "budget_s": size.budget}
-    raced = found("samplers", "samplers", _raced, kind=RACED, **given)
+    raced = found("samplers", "samplers", _race, kind=RACED, **given)
     given = {"seed": first, "pushes": size.scene_pushes, "draws": size.scene_draws}
     joint = None if quick else found("scene", "scene", _joint, kinds=SCENE, **given)
     shares_figure(out / FIGURE, compared)
@@ -131,7 +131,7 @@ def _piece(kind: str, seed: int, pushes: int, draws: int) -> dict[str, Any]:
     handled, pushed = recordings(kind, seed, pushes)
     found, seconds = fit(handled, draws, seed)
     return {
-        **_judged(found.posterior, pushed),
+        **_judge(found.posterior, pushed),
         "structure": found.structure,
         "probability": found.probability,
         "divergences": found.posterior.draws.divergences,
@@ -139,7 +139,7 @@ def _piece(kind: str, seed: int, pushes: int, draws: int) -> dict[str, Any]:
     }
 
 
-def _compared(kind: str, seed: int, pushes: int, draws: int) -> dict[str, Any]:
+def _compare(kind: str, seed: int, pushes: int, draws: int) -> dict[str, Any]:
     """One piece after growing numbers of samples, beside regressions."""
     found = shares(*recordings(kind, seed, pushes), draws, seed)
     return {"shares": {name: {str(n): v for n, v in of.items()} for name, of in found.items()}}
@@ -153,13 +153,13 @@ def _sysid(kind: str, seed: int, pushes: int, pieces: int) -> dict[str, Any]:
     refused = {}
     for piece in range(seed, seed + pieces):
         try:
-            return {**_fitted_by_sysid(kind, piece, pushes), "refused": refused}
+            return {**_fit_by_sysid(kind, piece, pushes), "refused": refused}
         except one_shot_sysid.CastersUnknownError as error:
             refused[str(piece)] = str(error)
     return {"error_m": [], "displacement_m": [], "refused": refused}
 
 
-def _raced(kind: str, seed: int, draws: int, budget_s: float) -> dict[str, Any]:
+def _race(kind: str, seed: int, draws: int, budget_s: float) -> dict[str, Any]:
     """The samplers on the posterior of a piece.
 
     Ours is timed as a user waits for it: search for modes, compiling, warm-up and draws.
@@ -183,10 +183,10 @@ def _raced(kind: str, seed: int, draws: int, budget_s: float) -> dict[str, Any]:
 def _joint(kinds: tuple[str, ...], seed: int, pushes: int, draws: int) -> dict[str, Any]:
     """Pieces in one scene, fitted together from ten seconds in which all are handled."""
     handled, pushed = scene(kinds, seed, pushes)
-    return _judged(fit_jointly(handled, draws, seed), pushed)
+    return _judge(fit_jointly(handled, draws, seed), pushed)
 
 
-def _judged(posterior: Posterior, pushes: Recording) -> dict[str, Any]:
+def _judge(posterior: Posterior, pushes: Recording) -> dict[str, Any]:
     """What a posterior says of pushes, and how far its draws are to be trusted."""
     model = posterior.target.coordinates.reference
     asked = pushes_of(pushes, model)
@@ -198,7 +198,7 @@ def _judged(posterior: Posterior, pushes: Recording) -> dict[str, Any]:
     }
 
 
-def _fitted_by_sysid(kind: str, seed: int, pushes: int) -> dict[str, Any]:
+def _fit_by_sysid(kind: str, seed: int, pushes: int) -> dict[str, Any]:
     """What mujoco.sysid says of the pushes of one piece, whose structure it is given."""
     handled, pushed = recordings(kind, seed, pushes)
     world = FurnitureWorld([Piece(kind)])

@@ -122,10 +122,10 @@ def fit_scene(
 
     random = np.random.default_rng(seed)
     guesses = np.array([scene.shares(draw_parameters(kind, random)) for _ in range(GUESSES)])
-    errors, *_ = residual(guesses.T, _counted(sysid, scene, guesses[0]))
+    errors, *_ = residual(guesses.T, _scale(sysid, scene, guesses[0]))
     shares = guesses[np.argmin(np.square(np.concatenate(errors)).sum(0))]
     for difference in DIFFERENCES:
-        found = _optimized(residual, _counted(sysid, scene, shares), difference)
+        found = _optimize(residual, _scale(sysid, scene, shares), difference)
         shares = found.x
     return SysidFit(scene, scene.parameters(*shares.tolist()), found.status > 0)
 
@@ -152,7 +152,7 @@ def predict_pieces(
         states = [
             rolling_state(sysid, scene, model, settled, start[0], np.zeros(3), a) for a in angles
         ]
-        control = np.tile(_held(action), (draws, 1, 1))
+        control = np.tile(_hold(action), (draws, 1, 1))
         data = [mujoco.MjData(model) for _ in range(THREADS)]
         rolled, _ = mujoco.rollout.rollout(model, data, np.array(states), control)
         predicted.append(poses_of(model, rolled, pose[2]).mean(0))
@@ -191,7 +191,7 @@ def _check(recording: Recording, aligned: Aligned) -> None:
             )
 
 
-def _counted(sysid: Any, scene: ToldScene, shares: np.ndarray) -> Any:
+def _scale(sysid: Any, scene: ToldScene, shares: np.ndarray) -> Any:
     """The constants as mujoco.sysid counts them, in shares of their bounds."""
     parameters = sysid.ParameterDict()
     for name, share in zip(scene.bounds, shares.tolist(), strict=True):
@@ -199,7 +199,7 @@ def _counted(sysid: Any, scene: ToldScene, shares: np.ndarray) -> Any:
     return parameters.move_off_bounds()
 
 
-def _optimized(residual: Callable[..., Any], parameters: Any, difference: float) -> Any:
+def _optimize(residual: Callable[..., Any], parameters: Any, difference: float) -> Any:
     """SciPy's result of a fit with derivatives by such differences.
 
     Of mujoco.sysid's optimizers the one that says why it ended: SciPy's trust region with
@@ -260,7 +260,7 @@ def _sequences(sysid: Any, scene: ToldScene, aligned: Aligned) -> Any:
             angles = np.array([angle[frame] for angle, _ in tracks[trial]])
             pose, rate = pieces.pose[piece, 0], pieces.rate[piece, 0]
             states.append(rolling_state(sysid, scene, model, settled, pose, rate, angles))
-            held = _held(pieces.action[piece])
+            held = _hold(pieces.action[piece])
             held = np.concatenate([held, held[-1:]])  # the last one is never applied
             controls.append(sysid.TimeSeries(TIME_STEP * np.arange(len(held)), held))
             deviation = np.sqrt(
@@ -294,6 +294,6 @@ def _residual(
     return error / deviation, measured, measured
 
 
-def _held(action: np.ndarray) -> np.ndarray:
+def _hold(action: np.ndarray) -> np.ndarray:
     """Controls (time steps, 3) of wrenches (periods, 1, 3)."""
     return np.repeat(np.asarray(action[:, 0], float), STEPS_PER_PERIOD, axis=0)

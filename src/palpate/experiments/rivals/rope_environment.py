@@ -54,7 +54,7 @@ class Actor(CommandPolicy):
         self, command: Float[Array, "*batch driven 3"], action: Float[Array, "*batch outputs"]
     ) -> Float[Array, "*batch driven 3"]:
         """The next command (m/s) after an action in [-1, 1]^3."""
-        return self._moved(command, _within_ball(action.reshape(command.shape)))
+        return self._move(command, _within_ball(action.reshape(command.shape)))
 
     def _direction(self, carry: Array, observation: Array) -> Array:
         network = jax.vmap(self.network) if observation.ndim == 2 else self.network
@@ -135,7 +135,7 @@ class Episodes(eqx.Module):
         back = jnp.arange(-self._estimator.frames, 0, dtype=position.dtype).reshape(-1, 1, 1, 1)
         window = position + back * moved
         window = window + self.noise * jax.random.normal(keys[3], window.shape)
-        return self._seen(Situation(models, start, start.state, start.command, window, keys[4]))
+        return self._see(Situation(models, start, start.state, start.command, window, keys[4]))
 
     @eqx.filter_jit
     def step(
@@ -148,13 +148,13 @@ class Episodes(eqx.Module):
         instant = jax.tree.map(lambda leaf: leaf[:, None], state)
         reward = -self.task.loss(models, situation.start, instant, command[:, None])
         following = dataclasses.replace(situation, state=state, command=command)
-        return *self._seen(following), reward
+        return *self._see(following), reward
 
     @property
     def _estimator(self) -> VelocityEstimator:
         return VelocityEstimator(self.model.control_period)
 
-    def _seen(self, situation: Situation) -> tuple[Situation, Array]:
+    def _see(self, situation: Situation) -> tuple[Situation, Array]:
         key, for_noise = jax.random.split(situation.key)
         position = situation.models.observe(situation.state)
         position = position + self.noise * jax.random.normal(for_noise, position.shape)

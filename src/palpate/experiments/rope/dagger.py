@@ -263,7 +263,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
             **about,
             **settings,
             "alarm": dataclasses.asdict(outcome.alarm),
-            "collected": [_counted(one.collected) for one in outcome.rounds],
+            "collected": [_count(one.collected) for one in outcome.rounds],
             "trial_periods": TRIAL_PERIODS,
         },
         {
@@ -292,7 +292,7 @@ def _figures(summaries: Mapping[str, Summary], outcome: Outcome) -> list[Figure]
     return rows
 
 
-def _counted(collected: np.ndarray) -> dict[str, int]:
+def _count(collected: np.ndarray) -> dict[str, int]:
     return {
         "trials": len(collected),
         "trials_with_a_shift": int(collected.any(axis=1).sum()),

@@ -93,16 +93,16 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         some = lasting([trials[i] for pose in groups(trials).values() for i in pose[:PLAIN_ROPES]])
         observed = ObservedController(policy, task, model, row.base.observation_noise)
         used = experiment, name, row, about
-        summaries[name] = _evaluated(*used, {CONTROLLED: observed}, trials)
+        summaries[name] = _evaluate(*used, {CONTROLLED: observed}, trials)
         print(summaries[name].line(name), flush=True)
-        plain[name] = _evaluated(*used, {PLAIN: LearnedController(policy, task)}, some)
+        plain[name] = _evaluate(*used, {PLAIN: LearnedController(policy, task)}, some)
         print(plain[name].line(f"  {PLAIN}"), flush=True)
     return experiment.result(
         _figures(summaries, plain),
         {
             "weights": "shipped",
             "policy": about,
-            "rows": {name: _changed(row) for name, row in ROWS.items()},
+            "rows": {name: _changes_of(row) for name, row in ROWS.items()},
             "push_N": PUSH,
             "push_s": PUSH_DURATION,
             "ropes": ropes,
@@ -117,7 +117,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
     )
 
 
-def _changed(row: Row) -> dict[str, Any]:
+def _changes_of(row: Row) -> dict[str, Any]:
     """What a row differs in from the nominal one."""
     own, nominal = dataclasses.asdict(row.base), dataclasses.asdict(BASE)
     changes = {name: value for name, value in own.items() if value != nominal[name]}
@@ -141,7 +141,7 @@ def _trials(row: Row, ropes: int, seed: int) -> list[StabilizationTrial]:
     return pushed
 
 
-def _evaluated(
+def _evaluate(
     experiment: Experiment,
     name: str,
     row: Row,
@@ -152,7 +152,7 @@ def _evaluated(
     """How a controller does in trials of the row."""
     (who,) = controllers
     folder = f"{name}/{who}".replace(" ", "-")
-    world = {"row": _changed(row), "world": constants(row.base), "policy": about}
+    world = {"row": _changes_of(row), "world": constants(row.base), "policy": about}
     evaluated, _ = experiment.evaluated(folder, world, controllers, trials, write_trial_evidence)
     return summarise(trials, _after_push(row, evaluated[who]))
 

@@ -99,7 +99,7 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         }
         folder = name.replace(", ", "-").replace(" ", "-")
         with experiment.stage(folder, configuration) as stage:
-            filmed[name] = kept = _filmed(stage.run, name, row, trials, model, policy)
+            filmed[name] = kept = _film(stage.run, name, row, trials, model, policy)
             if not stage.finished:
                 time = np.arange(kept["true"].shape[1]) * BASE.control_period
                 motions = {f"motion.{who}": kept[who][0] for who in ("true", "tracked")}
@@ -148,7 +148,7 @@ def _trials(row: Row, counts: dict[str, int], seed: int) -> list[StabilizationTr
     ]
 
 
-def _filmed(
+def _film(
     run: Run,
     name: str,
     row: Row,
@@ -168,11 +168,11 @@ def _filmed(
         for chosen, note in resumable(run, work, arrays, f"filming: {name}"):
             rows = [{name: part[place] for name, part in arrays.items()} for place in chosen]
             list(threads.map(one, [trials[place] for place in chosen], rows))
-            note(rmse_cm=_rmse(_missed(arrays)[: chosen[-1] + 1]))
+            note(rmse_cm=_rmse(_squared_errors(arrays)[: chosen[-1] + 1]))
     return arrays
 
 
-def _missed(arrays: dict[str, np.ndarray]) -> np.ndarray:
+def _squared_errors(arrays: dict[str, np.ndarray]) -> np.ndarray:
     """Squared errors of the tracker (trials, times) in m^2; infinite where it knew no state.
 
     NaN stays where there was no rope any more to be followed: a mean leaves that out.
@@ -193,7 +193,7 @@ def _figures(
 ) -> list[Figure]:
     """Errors over the rows, how often ropes come to rest, and the computing `took` (frames,) s."""
     swinging = np.concatenate([filmed[name]["squared_error"] for name in ("released", "shaken")])
-    missed = np.concatenate([_missed(filmed[name]) for name in ("released", "shaken")])
+    missed = np.concatenate([_squared_errors(filmed[name]) for name in ("released", "shaken")])
     by_trial = np.sqrt(np.nanmean(missed, axis=-1)) * 100.0
     spread = two_standard_errors(by_trial) if np.isfinite(by_trial).all() else None
     own = rates["stabilised"]
@@ -210,7 +210,7 @@ def _figures(
     for place, kind in enumerate(KINDS[1:], 1):
         rows.append(Figure(f"node_rmse_cm.{suffix(kind)}", _rmse(swinging[:, place]), "cm"))
     for name, arrays in filmed.items():
-        rows.append(Figure(f"node_rmse_cm.{suffix(name)}", _rmse(_missed(arrays)), "cm"))
+        rows.append(Figure(f"node_rmse_cm.{suffix(name)}", _rmse(_squared_errors(arrays)), "cm"))
         if not ROWS[name].controlled:
             hidden = float(np.nanmean(arrays["hidden"]))
             rows.append(Figure(f"hidden_share.{suffix(name)}", hidden, ""))

@@ -78,7 +78,7 @@ def reproduce(
     split: dict[str, Any] = {}
     for name, world in WORLDS.items():
         with experiment.counted():
-            fitted, unseen = _simulated(experiment, world)
+            fitted, unseen = _simulate(experiment, world)
             half_life = swing_half_life(world)
         rope = starting_rope(fitted, mass=world.mass)
         source = {"world": constants(world), "trials": [len(fitted.length), len(unseen.length)]}
@@ -88,7 +88,7 @@ def reproduce(
             f"(a rope's: {ROPE_HALF_LIFE[0]} to {ROPE_HALF_LIFE[1]})"
         )
         errors = _compare(experiment, name, rope, fitted, unseen, settings, source)
-        figures += _simulated_figures(name, world, errors, unseen)
+        figures += _figures_in_simulation(name, world, errors, unseen)
         figures.append(Figure(f"{name}.swing_half_life_periods", half_life, "periods"))
         evidence |= _evidence(name, errors)
         split[name] = {
@@ -118,7 +118,7 @@ def remove_damping(rope: Rope) -> Rope:
     return declare(still, **{name: {"fixed": True} for name in DAMPING})
 
 
-def _simulated(experiment: Experiment, world: RopeConfiguration) -> tuple[Aligned, Aligned]:
+def _simulate(experiment: Experiment, world: RopeConfiguration) -> tuple[Aligned, Aligned]:
     counts = (4, 3) if experiment.quick else (FITTED_TRIALS, UNSEEN_TRIALS)
     firsts = (experiment.uses(0, counts[0]), experiment.uses(UNSEEN_SEEDS, counts[1]))
     fitted, unseen = (
@@ -163,18 +163,18 @@ def tip_errors(error: PredictionError) -> np.ndarray:
     return np.sqrt(squared.sum(1) / np.maximum(seen.sum(1), 1))
 
 
-def _pooled(tips: np.ndarray) -> float:
+def _pool(tips: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(tips))))
 
 
-def _simulated_figures(
+def _figures_in_simulation(
     name: str, world: RopeConfiguration, errors: dict[str, PredictionError], unseen: Aligned
 ) -> list[Figure]:
     tips = {label: tip_errors(error) / world.length for label, error in errors.items()}
     target = np.asarray(errors["damped"].segments.target)
     hanging = unseen.action[:, 1 : 1 + target.shape[1], 0] - np.array([0.0, 0.0, world.length])
     still = np.linalg.norm(target[:, :, -1] - hanging, axis=-1) / world.length
-    ours, theirs = _pooled(tips["damped"]), _pooled(tips["undamped"])
+    ours, theirs = _pool(tips["damped"]), _pool(tips["undamped"])
     table = SEED_TABLE[name]
     spread = two_standard_errors(tips["damped"])
     return [
@@ -188,9 +188,9 @@ def _simulated_figures(
         ),
         Figure(f"{name}.undamped.tip_rmse_per_length", theirs, "m/m", seed_document=table[1]),
         Figure(
-            f"{name}.before_fitting.tip_rmse_per_length", _pooled(tips["before fitting"]), "m/m"
+            f"{name}.before_fitting.tip_rmse_per_length", _pool(tips["before fitting"]), "m/m"
         ),
-        Figure(f"{name}.hanging.tip_rmse_per_length", _pooled(still), "m/m"),
+        Figure(f"{name}.hanging.tip_rmse_per_length", _pool(still), "m/m"),
     ]  # fmt: skip
 
 

@@ -124,9 +124,9 @@ class NumpyRope(World):
     def _advance(self, command: np.ndarray) -> None:
         step, limits = self._step, self.configuration
         position, velocity, edge = self._position, self._velocity, self._edge
-        command = _shortened(command, limits.speed_limit)
+        command = _shorten(command, limits.speed_limit)
         for _ in range(self._steps):
-            change = _shortened(command - self._command, limits.acceleration_limit * step)
+            change = _shorten(command - self._command, limits.acceleration_limit * step)
             self._command = self._command + change
             along = np.diff(position, axis=0)
             size = np.sqrt((along * along).sum(1))[:, None]
@@ -205,6 +205,6 @@ def ranges() -> dict[str, Any]:
             "bend_damping": BEND_DAMPING, "lost": LOST}  # fmt: skip
 
 
-def _shortened(vector: np.ndarray, limit: float) -> np.ndarray:
+def _shorten(vector: np.ndarray, limit: float) -> np.ndarray:
     size = math.sqrt(vector @ vector)
     return vector if size <= limit else vector * (limit / size)

@@ -57,7 +57,7 @@ def reproduce(
     recording = out / "simulated.npz"
     write_recording(recording, record_rope(experiment.uses(0, TRIALS)))
     simulated_rope = options(recordings=(recording,), mass=MASS, out=out / "simulated")
-    results = {"simulated": _identified(experiment, simulated_rope)}
+    results = {"simulated": _identify(experiment, simulated_rope)}
     figures: list[Figure] = []
     if real is None:
         print("real: left out; give --mocap DIR with dlo1_train.npz and dlo1_eval.npz")
@@ -67,10 +67,10 @@ def reproduce(
             recordings=(fitted,), validate=(unseen,), driven=GRIPPED, rate=RATE,
             out=out / "real",
         )  # fmt: skip
-        results["real"] = _identified(experiment, captured)
+        results["real"] = _identify(experiment, captured)
         figures = _real_figures(results["real"], out / "real", unseen)
     return experiment.result(
-        figures + _simulated_figures(results["simulated"]),
+        figures + _figures_in_simulation(results["simulated"]),
         {
             "simulated": constants(),
             **{f"{name}.residual": found.settings[CORRECTION] for name, found in results.items()},
@@ -101,7 +101,7 @@ def record_rope(seed: int) -> Recording:
     return simulate(rope, hanging, np.stack(commands), NOISE, seed)
 
 
-def _identified(experiment: Experiment, options: IdentifyRope) -> Result:
+def _identify(experiment: Experiment, options: IdentifyRope) -> Result:
     found = read_result(identify.run(options) / RESULT)
     experiment.seconds += found.wall_time_s
     return found
@@ -134,7 +134,7 @@ def gain_figures(ours: np.ndarray, alone: np.ndarray) -> list[Figure]:
     ]
 
 
-def _simulated_figures(found: Result) -> list[Figure]:
+def _figures_in_simulation(found: Result) -> list[Figure]:
     dropped = int(not found.settings[CORRECTION]["kept"])
     head = Figure("simulated.dropped", dropped, "", bar=1, better="higher")
     return [head, *_figures("simulated", found)]

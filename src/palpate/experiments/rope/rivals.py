@@ -98,9 +98,9 @@ def reproduce(out: Path, *, quick: bool = False, seed: int = 0) -> Result:
         experiment, BUDGET, METHODS,
         lambda method, size: decision_about(stabilising_planner(method, model, size), jnp.ones(())),
     )  # fmt: skip
-    hurried = _planned(model, sizes, "10 ms", seed)
+    hurried = _planners_of(model, sizes, "10 ms", seed)
     more = {method: -(-most // (LESS if quick else 1)) for method, most in UNHURRIED.items()}
-    unhurried = _planned(model, more, "unhurried", seed)
+    unhurried = _planners_of(model, more, "unhurried", seed)
     first = experiment.uses(EVALUATION_SEEDS)
     trials = evaluation_trials(nominal.BASE, size.ropes, first)
     if quick:
@@ -200,7 +200,7 @@ def _effort(
     return rows
 
 
-def _planned(
+def _planners_of(
     model: Rope, sizes: Mapping[str, int], when: str, seed: int
 ) -> dict[str, PlannedStabiliser]:
     """Those of the planners that have a size."""

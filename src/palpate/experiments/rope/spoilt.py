@@ -34,7 +34,7 @@ class Spoilt:
     mass: float = 1.0  # factor
 
 
-def _jumped(markers: Motion, random: np.random.Generator) -> Motion:
+def _jump(markers: Motion, random: np.random.Generator) -> Motion:
     """Two motions in one trial: the second is moved, and runs backwards."""
     cut = int(random.uniform(0.3, 0.7) * len(markers))
     after = markers[cut:][::-1] + np.array([0.6, 0.2, 0.0])
@@ -51,7 +51,7 @@ KINDS = {
     ),
     "unit": Spoilt("unit of length", markers=lambda markers, _: 1e3 * markers),
     "mass": Spoilt("unit of mass", mass=1e3),
-    "discontinuity": Spoilt("discontinuity", markers=_jumped),
+    "discontinuity": Spoilt("discontinuity", markers=_jump),
 }
 WRONG_FILE = "wrong file"
 
@@ -76,12 +76,12 @@ def check_recordings(experiment: Experiment, count: int) -> Flagged:
     """Record `count` ropes; let `palpate identify` read each as it is, and spoilt."""
     first = experiment.uses(FIRST, count)
     found = experiment.found(
-        "checked", {"ropes": count}, lambda: _checked(experiment.out / "checked", first, count)
+        "checked", {"ropes": count}, lambda: _check(experiment.out / "checked", first, count)
     )
     return Flagged(count, found["false"], found["missed"])
 
 
-def _checked(folder: Path, first: int, count: int) -> dict[str, Any]:
+def _check(folder: Path, first: int, count: int) -> dict[str, Any]:
     false, missed, names = [], [], [*KINDS, WRONG_FILE]
     for index in progress(range(count), "recordings"):
         seed, name = first + index, names[index % len(names)]

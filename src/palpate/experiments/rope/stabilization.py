@@ -106,11 +106,11 @@ def _figures(trials: list[StabilizationTrial], evaluated: dict[str, Episodes]) -
         at_once = summaries[name].at_rest_at_once / len(trials)
         rows.append(Figure(f"gripper_at_rest_at_once{end}", at_once, "", better="higher"))
         rows.append(Figure(f"gripper_speed_at_end{end}", summaries[name].final_speed, "m/s"))
-    rows.append(_left_when_still(trials, evaluated[STILL]))
+    rows.append(_energy_left_when_still(trials, evaluated[STILL]))
     return rows
 
 
-def _left_when_still(trials: list[StabilizationTrial], episodes: Episodes) -> Figure:
+def _energy_left_when_still(trials: list[StabilizationTrial], episodes: Episodes) -> Figure:
     """Of all ropes held still, the least share of its energy that one has after three periods."""
     shares = [
         energy[math.floor(3.0 * trial.period / trial.control_period)] / energy[0]

@@ -29,7 +29,7 @@ def read_scene(file: str | Path, body: str | None = None) -> Scene:
     if kind not in ("mujoco", "robot"):
         raise PalpateError(f"{file} holds <{kind}>: expected <robot> of URDF or <mujoco> of MJCF")
     if kind == "mujoco":
-        return foreign_scene(_parsed(file), file, body)
+        return foreign_scene(_parse(file), file, body)
     doubts: list[str] = []
     description, faults = mend(read_urdf(file, lambda where, what: doubts.append(where)))
     for fault in faults:
@@ -41,10 +41,10 @@ def read_scene(file: str | Path, body: str | None = None) -> Scene:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mended.xml"
         write_mjcf(path, with_copied_meshes(description, path.parent, "meshes"))
-        return foreign_scene(_parsed(path), file, body)
+        return foreign_scene(_parse(path), file, body)
 
 
-def _parsed(file: Path) -> mujoco.MjSpec:
+def _parse(file: Path) -> mujoco.MjSpec:
     try:
         return mujoco.MjSpec.from_file(str(file))
     except ValueError as error:

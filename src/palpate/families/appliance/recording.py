@@ -100,7 +100,7 @@ def twin_of(recording: Recording) -> ApplianceTwin:
     for trial in recording.trials:
         looks: list[Cloud] = []
         for images in _images(trial):
-            moved = twin.looks and _moved(images, first)
+            moved = twin.looks and _has_moved(images, first)
             earlier = [*twin.looks[:1], *twin.looks[-1:], *looks]
             looks.append(cloud_of(exact_poses(images, earlier) if moved else images))
             if not twin.looks:
@@ -150,7 +150,7 @@ def _three(trial: Trial, name: str, unit: str) -> Channel:
     return dataclasses.replace(channel, values=channel.values.astype(np.float64))
 
 
-def _moved(images: Sequence[DepthImage], first: Sequence[DepthImage]) -> bool:
+def _has_moved(images: Sequence[DepthImage], first: Sequence[DepthImage]) -> bool:
     """Whether a camera is not where it was in the first look, or another one sees.
 
     Where it looks may differ: clouds of points are seen by cameras that look at their middles.

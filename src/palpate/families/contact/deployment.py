@@ -77,10 +77,10 @@ class MazeDeployment(_SkillDeployment):
         """See `Deployment.filter_numbers`; usually the tank of the policy's training."""
         if name not in WITH_TANK:
             return {}
-        return tank_numbers(tank, self._trained_tank)
+        return tank_numbers(tank, self._tank_in_training)
 
     @property
-    def _trained_tank(self) -> Mapping[str, Any]:
+    def _tank_in_training(self) -> Mapping[str, Any]:
         """Numbers of the tank that the policy was trained with, else of the maze's."""
         return self.manifest.get("constants", {}).get("energy", TANK)
 
@@ -102,7 +102,7 @@ class MazeDeployment(_SkillDeployment):
             Channel("position", (3,), "m", FARTHEST, FASTEST),
         )
         if self.method.passive:
-            scale.append(self._trained_tank["initial"])
+            scale.append(self._tank_in_training["initial"])
             sensors = *sensors, TANK_CHANNEL
         return Scaling(
             sensors=sensors,

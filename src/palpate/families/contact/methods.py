@@ -71,7 +71,7 @@ def _agent() -> SoftActorCritic:
     return SoftActorCritic(LEARNING_RATE, DISCOUNT, target_entropy=TARGET_ENTROPY, width=WIDTH)
 
 
-def _guarded(
+def _guard(
     seen: tuple[int, ...] | None = WRENCH,
     kind: type[RecoveryAgent] = RecoveryAgent,
     discount: float = RISK_DISCOUNT,
@@ -82,15 +82,15 @@ def _guarded(
 
 
 METHODS: dict[str, Callable[[], Method]] = {
-    "srl-vic": lambda: Method(_guarded()),
-    "bresa": lambda: Method(_guarded(kind=ReflexAgent)),
-    "position-critic": lambda: Method(_guarded(seen=None)),
+    "srl-vic": lambda: Method(_guard()),
+    "bresa": lambda: Method(_guard(kind=ReflexAgent)),
+    "position-critic": lambda: Method(_guard(seen=None)),
     "no-recovery": lambda: Method(_agent()),
-    "k300": lambda: Method(_guarded(), 300.0),
-    "k500": lambda: Method(_guarded(), 500.0),
-    "k600": lambda: Method(_guarded(), 600.0),  # with 3 cm 4 N more than the heaviest block resists
-    "k1000": lambda: Method(_guarded(), 1000.0),
-    "self-tuning": lambda: Method(_guarded(), SELF_TUNING),
+    "k300": lambda: Method(_guard(), 300.0),
+    "k500": lambda: Method(_guard(), 500.0),
+    "k600": lambda: Method(_guard(), 600.0),  # with 3 cm 4 N more than the heaviest block resists
+    "k1000": lambda: Method(_guard(), 1000.0),
+    "self-tuning": lambda: Method(_guard(), SELF_TUNING),
     "lagrangian": lambda: Method(
         Lagrangian(_agent(), COST_LIMIT, discount=DISCOUNT, multiplier_rate=1e-3, width=WIDTH)
     ),
@@ -110,7 +110,7 @@ METHODS: dict[str, Callable[[], Method]] = {
 
 
 _beside = functools.partial(
-    _guarded, seen=None, discount=NAVIGATION_DISCOUNT, threshold=NAVIGATION_THRESHOLD
+    _guard, seen=None, discount=NAVIGATION_DISCOUNT, threshold=NAVIGATION_THRESHOLD
 )
 NAVIGATION_METHODS: dict[str, Callable[[], Method]] = {
     "srl-vic": lambda: Method(_beside()),

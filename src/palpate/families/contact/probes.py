@@ -56,20 +56,20 @@ def probe(policy: ActorPolicy, environments: GymnasiumWorlds, seed: int) -> Prob
         proposed, executed, risky = map(np.asarray, decide(observation))
         now, ahead = when == step, (when <= step) & (step < when + AHEAD) & ~over
         risk[now], force[now] = risky[now], np.hypot(observation[now, 0], observation[now, 1])
-        before = _pushed(worlds)
+        before = _displacements(worlds)
         action = np.where(ahead[:, None], proposed, executed)
         observation, _, terminated, truncated, info = environments.step(action)
         greatest[ahead] = np.maximum(greatest, info["force"])[ahead]
         ended = terminated | truncated
         over |= ended & ahead
-        pushing = (step < when) & ~ended & (_pushed(worlds) - before > PUSHED)
+        pushing = (step < when) & ~ended & (_displacements(worlds) - before > PUSHED)
         pushes.append(executed[pushing, 2:4])
     low, high = STIFFNESS_RANGE
     along, across = (low + (high - low) * (np.concatenate(pushes) + 1) / 2).T
     return Probes(risk, force, greatest, along, across)
 
 
-def _pushed(worlds: Sequence[Any]) -> Float[np.ndarray, " worlds"]:
+def _displacements(worlds: Sequence[Any]) -> Float[np.ndarray, " worlds"]:
     """m by which each world's obstacle has been; 0 where none is known."""
     return np.array([getattr(world.truth(), "obstacle", 0.0) for world in worlds])
 

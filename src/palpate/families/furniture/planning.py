@@ -72,7 +72,7 @@ def steps(plan: Plan) -> list[str]:
             )
         else:
             lines.append(f"{number}. drive to {where}: {segment.distance:.2f} m")
-    turns = sum(_turned(segment.poses) for segment in plan.segments)
+    turns = sum(_turning_of(segment.poses) for segment in plan.segments)
     lines.append(
         f"{plan.distance:.2f} m in all, {plan.carried:.2f} m of it carrying, "
         f"{plan.transfers} transfers, {turns:.0f} degrees of turning; "
@@ -81,7 +81,7 @@ def steps(plan: Plan) -> list[str]:
     return lines
 
 
-def _turned(poses: np.ndarray) -> float:
+def _turning_of(poses: np.ndarray) -> float:
     """Degrees that the robot turns in all."""
     change = np.diff(poses[:, 2])
     return float(np.degrees(np.abs(np.arctan2(np.sin(change), np.cos(change))).sum()))

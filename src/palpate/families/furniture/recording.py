@@ -55,7 +55,7 @@ def prepare(recording: Recording) -> Recording:
             bodies.add(shape[0] if len(shape) == 2 else 1)
             values = channel.values.reshape(len(channel.values), -1, 3)
             if name == POSE:
-                values = _unwrapped(values)
+                values = _unwrap(values)
             channels[name] = dataclasses.replace(channel, values=values)
         trials.append(dataclasses.replace(trial, channels=channels))
     if len(bodies) > 1:
@@ -69,7 +69,7 @@ def prepare(recording: Recording) -> Recording:
 def _check_convention(trial: str, channel: Channel, unit: str, frame: str) -> None:
     """Refuse what is said to be in another unit or frame, and clocks that are not in seconds."""
     each = ", ".join(dict.fromkeys(unit.split(", ")))  # "m, rad" says as much as "m, m, rad"
-    if channel.unit and _normalised(channel.unit) not in (_normalised(unit), _normalised(each)):
+    if channel.unit and _normalise(channel.unit) not in (_normalise(unit), _normalise(each)):
         raise PalpateError(
             f"channel '{channel.name}' of trial '{trial}' is in '{channel.unit}': expected {unit}"
         )
@@ -87,7 +87,7 @@ def _check_convention(trial: str, channel: Channel, unit: str, frame: str) -> No
         )
 
 
-def _normalised(unit: str) -> str:
+def _normalise(unit: str) -> str:
     """Without what may be written one way or another."""
     return re.sub(r"[\s*·⋅.()\[\]-]", "", unit.replace("radians", "rad"))
 
@@ -164,7 +164,7 @@ def starting_furniture(
         outlines,
         walls.polygons if walls else (),
         control_period=period,
-        poses=_first_seen(recording),
+        poses=_first_poses(recording),
         **structure,
     )
 
@@ -243,7 +243,7 @@ def one_body(recording: Recording, body: int) -> Recording:
     return dataclasses.replace(recording, trials=tuple(trials))
 
 
-def _first_seen(recording: Recording) -> np.ndarray:
+def _first_poses(recording: Recording) -> np.ndarray:
     """Where each body is seen first, (bodies, 3)."""
     poses = recording.trials[0][POSE].values.astype(float)
     complete = np.isfinite(poses).all(axis=2)
@@ -252,7 +252,7 @@ def _first_seen(recording: Recording) -> np.ndarray:
     return poses[complete.argmax(axis=0), np.arange(poses.shape[1])]
 
 
-def _unwrapped(poses: np.ndarray) -> np.ndarray:
+def _unwrap(poses: np.ndarray) -> np.ndarray:
     """Poses (frames, bodies, 3) without jumps of the angle by a whole turn."""
     poses = np.array(poses, float)
     for body in range(poses.shape[1]):

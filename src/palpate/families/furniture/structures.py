@@ -71,7 +71,7 @@ def structures(
     held = declare(held, link_other_anchor={"fixed": True})  # a pivot's follows from its own
     held = _with_pivots(held, {body: _hinge(recording, body) for body in bodies})
     return {
-        name: _masked(held if name == "hinge" else free, dict.fromkeys(bodies, name))
+        name: _mask(held if name == "hinge" else free, dict.fromkeys(bodies, name))
         for name in ("wheels", "feet", "hinge", "bolted")
     }
 
@@ -120,7 +120,7 @@ def hypotheses(
         where = {pair: likely[pair] for pair in chosen}
         model = _together(recording, period, size, wheels, law, together, where)
         begun = [pieces[body][kind] for body, kind in together.items()]
-        models[_named(names, together, chosen)] = _begun(model, begun)
+        models[_name_of(names, together, chosen)] = _begun(model, begun)
     return Hypotheses(models, by_itself)
 
 
@@ -134,7 +134,7 @@ def joints(recording: Recording) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
     trials = [dataclasses.replace(recording, trials=(trial,)) for trial in recording.trials]
     found = {}
     for pair in itertools.combinations(range(len(names_of(recording))), 2):
-        of = [seen for trial in trials if len(seen := _seen(trial, pair))]
+        of = [seen for trial in trials if len(seen := _poses_of(trial, pair))]
         if not of or not all(
             max(np.ptp(seen[:, body], axis=0).max() for seen in of) > MOVED for body in range(2)
         ):
@@ -180,9 +180,9 @@ def _together(
     for (owner, other), pair in zip(others.items(), chosen, strict=True):
         own, place = (chosen[pair][pair.index(body)] for body in (owner, other))
         # Where both were seen, not where each was seen first: the one may have moved before.
-        first = _seen(recording, [owner, other])[0]
+        first = _poses_of(recording, [owner, other])[0]
         held[owner] = Held(own, place, first[0, 2] - first[1, 2])
-    return _masked(_with_bolts(_with_pivots(model, held), recording), kinds, set(others))
+    return _mask(_with_bolts(_with_pivots(model, held), recording), kinds, set(others))
 
 
 def _hinge(recording: Recording, body: int) -> Held:
@@ -191,14 +191,14 @@ def _hinge(recording: Recording, body: int) -> Held:
     Of all frames: a hinge that is where the noise of one pose puts it is off by as much at every
     moment, and evidence then prefers a wheel that hardly gives way.
     """
-    seen = _seen(recording, [body])
+    seen = _poses_of(recording, [body])
     # Seen from where it was first: of what never turns the point is its centroid, wherever it is.
     first = np.array([*seen[0, 0, :2], 0.0])
     (own, place), _ = _common_point(np.concatenate([seen - first, np.zeros_like(seen)], axis=1))
     return Held(own, place + first[:2], seen[0, 0, 2])
 
 
-def _seen(recording: Recording, bodies: Sequence[int]) -> Float[np.ndarray, "frames bodies 3"]:
+def _poses_of(recording: Recording, bodies: Sequence[int]) -> Float[np.ndarray, "frames bodies 3"]:
     """Poses of these bodies in the frames that show all of them."""
     poses = np.concatenate([np.asarray(trial[POSE].values, float) for trial in recording.trials])
     poses = poses[:, bodies]
@@ -213,7 +213,7 @@ def _with_bolts(model: Planar, recording: Recording) -> Planar:
     """
     standing = []
     for body in range(model.bodies):
-        seen = _seen(recording, [body])[:, 0]
+        seen = _poses_of(recording, [body])[:, 0]
         off = seen - seen[0]
         off[:, 2] = wrap_angle(jnp.asarray(off[:, 2]))
         standing.append(seen[0] + off.mean(axis=0))
@@ -248,7 +248,7 @@ def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:
     return with_values(model, values | {"link_anchor": anchor})
 
 
-def _masked(model: Planar, kinds: Mapping[int, str], joined: Iterable[int] = ()) -> Planar:
+def _mask(model: Planar, kinds: Mapping[int, str], joined: Iterable[int] = ()) -> Planar:
     """The model with the wheels, hinges and bolts of what its bodies are, and their joints."""
     rows = range(len(kinds))
     rolls = jnp.asarray([[kinds[b] == "wheels"] for b in rows])
@@ -262,7 +262,7 @@ def _masked(model: Planar, kinds: Mapping[int, str], joined: Iterable[int] = ())
     )
 
 
-def _named(names: tuple[str, ...], kinds: Mapping[int, str], chosen: Iterable[Pair]) -> str:
+def _name_of(names: tuple[str, ...], kinds: Mapping[int, str], chosen: Iterable[Pair]) -> str:
     """Such as "cart: wheels, table: wheels, cart joined to table"."""
     parts = [f"{names[body]}: {kind}" for body, kind in kinds.items()]
     parts += [f"{names[first]} joined to {names[second]}" for first, second in chosen]

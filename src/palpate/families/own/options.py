@@ -74,7 +74,7 @@ class IdentifyOwnModel(Identify):
             for name, shape in named.items():
                 alone = len(self.observe if name in self.observe else self.act) == 1
                 role = Role.OBSERVATION if name in self.observe else Role.COMMAND
-                channel = _shaped(trial[name], shape) if alone else trial[name]
+                channel = _shape(trial[name], shape) if alone else trial[name]
                 if role is Role.OBSERVATION or channel.role is not Role.DRIVEN:
                     channel = dataclasses.replace(channel, role=role)
                 channels[name] = channel
@@ -192,7 +192,7 @@ def _options_of(base: Any, place: str, called: str) -> Any:
     return type(base.__name__, (base,), {"place": place, called: words, "__doc__": base.__doc__})
 
 
-def _shaped(channel: Channel, shape: tuple[int, ...]) -> Channel:
+def _shape(channel: Channel, shape: tuple[int, ...]) -> Channel:
     """A channel of as many numbers in the model's shape: one number is (1,)."""
     own = channel.values.shape
     if own[1:] == shape or math.prod(own[1:]) != math.prod(shape):

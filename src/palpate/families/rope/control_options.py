@@ -30,7 +30,7 @@ RENDERED = 3.0  # s of a trial in the moving picture
 FASTEST = 120.0  # Hz, at which a policy decides: a rope swings once in a second or two
 
 
-def _controlled(rope: Rope) -> Rope:
+def _control(rope: Rope) -> Rope:
     """The rope moved by its gripper's velocity, at most `FASTEST`: after every so many frames."""
     from palpate.models.rope import Rope as Physics
 
@@ -67,7 +67,7 @@ class TrainRope(Train):
         """The rope moved by its gripper's velocity; refused if it could not be tried in MuJoCo."""
         from palpate.families.rope.counterpart import counterpart
 
-        prepared = _controlled(model)
+        prepared = _control(model)
         counterpart(prepared, self.observation_noise or 0.0)
         if (every := round(prepared.control_period / model.control_period)) > 1:
             print(
@@ -140,7 +140,7 @@ class EvaluateRope(Evaluate):
 
     def prepare(self, model: Rope) -> Rope:
         """The rope moved by its gripper's velocity."""
-        return _controlled(model)
+        return _control(model)
 
     def check(self, policy: CommandPolicy, base: RopeConfiguration) -> None:
         """See `Evaluate.check`; there has to be a rope, too."""

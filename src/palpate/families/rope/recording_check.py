@@ -47,8 +47,8 @@ def problems(aligned: Aligned, driven: Sequence[int], mass: float | None) -> lis
     # What is wrong first makes the rest meaningless.
     first = _order(seen) or _unit(length)
     if not first:
-        seen = _filled(seen, max(3, round(SMOOTHED / aligned.period)))
-        first = _spliced(seen, length) or _direction(seen, at_both_ends, aligned.period)
+        seen = _fill(seen, max(3, round(SMOOTHED / aligned.period)))
+        first = _splice(seen, length) or _direction(seen, at_both_ends, aligned.period)
     if not first and not at_both_ends:
         first = _rate(gravity(seen, aligned.period))
     weighed = "" if mass is None or _unit(length) else _mass(mass, length)
@@ -111,7 +111,7 @@ def gravity(
     return np.linalg.solve(normal, right)[:3]
 
 
-def _filled(
+def _fill(
     seen: Float[np.ndarray, "trials frames markers 3"], longest: int
 ) -> Float[np.ndarray, "trials frames markers 3"]:
     """Gaps of up to `longest` frames filled in time, others along the rope between its neighbours.
@@ -155,7 +155,7 @@ def _order(seen: Float[np.ndarray, "trials frames markers 3"]) -> str:
     )
 
 
-def _spliced(seen: Float[np.ndarray, "trials frames markers 3"], length: float) -> str:
+def _splice(seen: Float[np.ndarray, "trials frames markers 3"], length: float) -> str:
     for number, trial in enumerate(seen):
         step = np.diff(trial, n=2, axis=0)
         size = np.median(np.linalg.norm(step, axis=2), axis=1)

@@ -170,13 +170,13 @@ class SegmentSource:
             length = int(self.aligned.length[trial])
             observed, action = self.aligned.observation[trial, :length], self.aligned.action[trial]
             if (trial, first, smoothed) not in self._begun:
-                start = _smoothed(observed, self.model, first, self.aligned.period, self._noise)
+                start = _smooth(observed, self.model, first, self.aligned.period, self._noise)
                 if start is None or not smoothed:
                     start = self._two_frames(observed, first)
                 self._begun[trial, first, smoothed] = start
-            piece = _padded(observed, action, first, length - 1, horizon)
+            piece = _pad(observed, action, first, length - 1, horizon)
             pieces.append((*self._begun[trial, first, smoothed], *piece))
-        return _joined(pieces)
+        return _join(pieces)
 
     def _two_frames(self, observed: np.ndarray, first: int) -> tuple[np.ndarray, ...]:
         """Pose, rate and their deviations, from a frame and the one before."""
@@ -232,10 +232,10 @@ def cut(
                 start = _mean(observed, model, rest, period, spread)
             else:
                 still = at_rest and first == 0
-                start = _smoothed(observed, model, first, period, spread, still, reaches=1)
+                start = _smooth(observed, model, first, period, spread, still, reaches=1)
             if start is None:
                 continue  # nothing is seen around: the piece before it ends here
-            pieces.append((*start, *_padded(observed, aligned.action[trial], first, last, horizon)))
+            pieces.append((*start, *_pad(observed, aligned.action[trial], first, last, horizon)))
     if not pieces:
         raise PalpateError(
             f"no piece of {seconds:.3g} s can begin anywhere: expected a few frames in a row in "
@@ -245,10 +245,10 @@ def cut(
         raise PalpateError(f"{len(pieces)} pieces do not fit into {count}: expected a larger count")
     # Copies of the first piece in which nothing is seen: they can be computed and say nothing.
     blind = (*pieces[0][:-1], np.zeros_like(pieces[0][-1]))
-    return _joined(pieces + [blind] * ((count or 0) - len(pieces)), relaxation)
+    return _join(pieces + [blind] * ((count or 0) - len(pieces)), relaxation)
 
 
-def _joined(pieces: list[tuple[np.ndarray, ...]], relaxation: int = 0) -> Segments:
+def _join(pieces: list[tuple[np.ndarray, ...]], relaxation: int = 0) -> Segments:
     columns = [np.stack(column) for column in zip(*pieces, strict=True)]
     return Segments(
         *(jnp.asarray(c, bool if c.dtype == bool else jnp.zeros(()).dtype) for c in columns),
@@ -326,7 +326,7 @@ def _mean(
     observed: np.ndarray, model: Model, rest: int, period: float, spread: np.ndarray
 ) -> tuple[np.ndarray, ...] | None:
     """Pose, rate and their deviations at the end of a rest of so many frames."""
-    found = _fitted(observed, model, 0, slice(0, rest), 0, period)
+    found = _fit_polynomial(observed, model, 0, slice(0, rest), 0, period)
     if found is None:
         return None
     noise = np.broadcast_to(spread, observed.shape[1:])
@@ -334,7 +334,7 @@ def _mean(
     return found[0][0], np.zeros_like(noise), noise * found[1][0] / VAGUE, np.zeros_like(noise)
 
 
-def _smoothed(
+def _smooth(
     observed: np.ndarray,
     model: Model,
     first: int,
@@ -352,7 +352,7 @@ def _smoothed(
     noise = np.broadcast_to(spread, observed.shape[1:])
     if still:
         around = slice(first, first + max(1, round(STILL / period)))
-        found = _fitted(observed, model, first, around, 0, period)
+        found = _fit_polynomial(observed, model, first, around, 0, period)
         if found is None:
             return None
         pose, deviation, *_ = found
@@ -360,7 +360,7 @@ def _smoothed(
     best, reach = None, max(ORDER, round(REACH / period))
     for within in sorted({reach // 2**halved for halved in range(reaches)}):
         around = slice(max(0, first - within), first + within + 1)
-        found = _fitted(observed, model, first, around, ORDER, period)
+        found = _fit_polynomial(observed, model, first, around, ORDER, period)
         if found is None:
             continue
         value, deviation, squares, freedom = found
@@ -376,7 +376,7 @@ def _smoothed(
     return best
 
 
-def _fitted(
+def _fit_polynomial(
     observed: np.ndarray, model: Model, first: int, around: slice, order: int, period: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int] | None:
     """A polynomial in time about a frame, by least squares; None where too little is seen.
@@ -401,7 +401,7 @@ def _fitted(
     return value, deviation, squares, len(frames) - order - 1
 
 
-def _padded(
+def _pad(
     observed: np.ndarray, action: np.ndarray, first: int, last: int, horizon: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Actions, targets and what was seen of the frames after `first`, to `last` at most."""

@@ -106,7 +106,7 @@ class Objective(eqx.Module):
         variance = 2.0 * float(mean)
         products = self.products(free, offset, segments).sum(axis=1, dtype=np.float64)
         own = np.asarray(offset, np.float64).reshape(len(products), -1)
-        reduced = _eliminated(products, flat.size, variance, own)
+        reduced = _eliminate(products, flat.size, variance, own)
         weight = float(self.weight(jnp.asarray(variance))) * count
         matrix = reduced.matrix + weight * np.eye(flat.size)
         gradient = reduced.gradient + weight * np.asarray(flat)
@@ -177,7 +177,7 @@ class Reduced:
     slope: Float[np.ndarray, "segments starts free"]
 
 
-def _eliminated(
+def _eliminate(
     products: Float[np.ndarray, "segments columns columns"],
     free: int,
     variance: float,
@@ -245,12 +245,12 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
         )
     freedom = int(np.sum(segments.seen)) - flat.size
     nowhere = np.zeros((segments.count, offset[0].size))
-    own = _eliminated(alone, 0, _noise(alone, freedom), nowhere).start
+    own = _eliminate(alone, 0, _noise(alone, freedom), nowhere).start
     offset = jnp.asarray(own.reshape(offset.shape), offset.dtype)
     products = objective.products(free, offset, segments, curved=True).astype(np.float64)
     total = products.sum(axis=1)
     noise = _noise(total[:, flat.size :, flat.size :], freedom)
-    reduced = _eliminated(total, flat.size, noise, own)
+    reduced = _eliminate(total, flat.size, noise, own)
     # From all columns to J, and to the residuals that are left at the best starts.
     count, identity = segments.count, np.eye(flat.size)
     itself, nothing = np.repeat(identity[None], count, axis=0), np.zeros((count, flat.size))

@@ -123,7 +123,7 @@ def fit_residual(
     """
     check_correctable(model, aligned)
     check_shapes(model, aligned)
-    fitted, held_out = _split(aligned, settings)
+    fitted, held_out = _split_trials(aligned, settings)
     source = SegmentSource.of(_select(aligned, fitted), model)
     judge = _select(aligned, held_out)
     physics = prediction_error(model, judge)
@@ -148,7 +148,7 @@ def check_correctable(model: Model, aligned: Aligned) -> None:
         )
 
 
-def _split(aligned: Aligned, settings: ResidualSettings) -> tuple[np.ndarray, np.ndarray]:
+def _split_trials(aligned: Aligned, settings: ResidualSettings) -> tuple[np.ndarray, np.ndarray]:
     count = len(aligned.length)
     order = np.random.default_rng(settings.seed).permutation(count)
     judges = min(max(JUDGES, round(settings.held_out * count)), count - 1)

@@ -51,7 +51,7 @@ def discover(tree: PartTree, before: int, after: int, handling: Handling) -> boo
     """
     way = handling.points
     found = _best(tree, before, after, -1, way, screws_of_way(way))
-    if found is not None and (known := _contradicted(tree, before, after, found, way)):
+    if found is not None and (known := _parts_that_contradict(tree, before, after, found, way)):
         if len(known) > 1 or not _is_hinged_on(tree, known[0], before, found.estimate.screw):
             return False  # both have moved, and their way looks like a circle
         tree.parts[known[0]].positions[after] = tree.parts[known[0]].positions[before]
@@ -216,7 +216,7 @@ def _relatives(
     return parent, carried, same
 
 
-def _contradicted(
+def _parts_that_contradict(
     tree: PartTree,
     before: int,
     after: int,
@@ -282,9 +282,11 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
             continue
         carried = part.parent == carrier
         now = dataclasses.replace(part, positions=list(part.positions))
-        other = _hung(tree, part, tree.parts[carrier].parent if carried else carrier, first)
-        before = _seen(tree, number, now, gone)  # as free to be elsewhere as on the carrier
-        gain = _seen(tree, number, other, gone) - before
+        other = _hang(tree, part, tree.parts[carrier].parent if carried else carrier, first)
+        before = _evidence_with(
+            tree, number, now, gone
+        )  # as free to be elsewhere as on the carrier
+        gain = _evidence_with(tree, number, other, gone) - before
         beside = (
             not carried
             and _travel(other, look) + STILLER < _travel(part, look)
@@ -298,7 +300,7 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
             tree.parts[number] = part
 
 
-def _hung(tree: PartTree, part: Part, parent: int, look: int) -> Part:
+def _hang(tree: PartTree, part: Part, parent: int, look: int) -> Part:
     """A part as it is in a look, on another parent."""
     onto = tree.pose(parent, look).inverse @ tree.pose(part.parent, look)
     return dataclasses.replace(
@@ -310,7 +312,7 @@ def _hung(tree: PartTree, part: Part, parent: int, look: int) -> Part:
     )
 
 
-def _seen(tree: PartTree, number: int, part: Part, looks: list[int]) -> float:
+def _evidence_with(tree: PartTree, number: int, part: Part, looks: list[int]) -> float:
     """Put a part in the place of another; the evidence of looks for it, wherever it may be."""
     tree.parts[number] = part
     return float(np.mean([tree.find(number, look) for look in looks]))

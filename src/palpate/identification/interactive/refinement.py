@@ -219,7 +219,7 @@ def _add_pair(
 
 def _add_way(sums: _Sums, screw: Screw, way: Float[np.ndarray, "times 3"]) -> None:
     """The way of a hand, whose errors are whitened: there the information is the scatter."""
-    slopes, standard = _whitened(screw, way)
+    slopes, standard = _whiten(screw, way)
     rows = np.zeros((len(standard), len(sums.slope)))
     rows[:, :AXES] = slopes
     sums.add(rows, standard, np.ones(len(standard)))
@@ -258,7 +258,7 @@ def _add_travel(
     sums.scatter += rows.T @ rows
 
 
-def _whitened(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _whiten(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Slopes and residuals of a hand's way: a random walk, white noise, an offset not known."""
     way = way[np.unique(np.linspace(0, len(way) - 1, MOMENTS).astype(int))]
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
@@ -277,7 +277,7 @@ def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
     The squared Mahalanobis distance of its errors, for each of them: those of the hand, and what
     the covariance of the joint leaves open.
     """
-    slopes, standard = _whitened(estimate.screw, way)
+    slopes, standard = _whiten(estimate.screw, way)
     known = np.linalg.inv(estimate.covariance + 1e-10 * np.eye(AXES))
     left = slopes.T @ standard
     explained = left @ np.linalg.solve(known + slopes.T @ slopes, left)
@@ -286,7 +286,7 @@ def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
 
 def way_information(screw: Screw, way: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "4 4"]:
     """What one more way of a hand would say of a joint's four numbers (Fisher information)."""
-    rows, _ = _whitened(screw, way)
+    rows, _ = _whiten(screw, way)
     return rows.T @ rows
 
 

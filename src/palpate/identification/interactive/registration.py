@@ -81,7 +81,7 @@ def register(cloud: Cloud, onto: Cloud) -> tuple[Pose, int]:
         slopes = np.concatenate([np.cross(there[met] - middle, planes), planes], axis=1)
         matrix = (slopes * weight[:, None]).T @ slopes + np.diag(GIVEN**-2.0)
         step = np.linalg.solve(matrix, -slopes.T @ (weight * missed) - change / GIVEN**2)
-        change = _joined(step, change)
+        change = _join(step, change)
         if float(np.abs(step).max()) < DONE:
             break
     return _pose(change, middle), count
@@ -93,7 +93,7 @@ def _pose(change: Float[np.ndarray, "6"], middle: Float[np.ndarray, "3"]) -> Pos
     return Pose(rotation, middle - rotation @ middle + change[3:])
 
 
-def _joined(step: Float[np.ndarray, "6"], change: Float[np.ndarray, "6"]) -> np.ndarray:
+def _join(step: Float[np.ndarray, "6"], change: Float[np.ndarray, "6"]) -> np.ndarray:
     """First the change, then the step, both about the same point of the world."""
     turn = Rotation.from_rotvec(step[:3])
     both = turn * Rotation.from_rotvec(change[:3])

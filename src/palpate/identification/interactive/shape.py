@@ -58,7 +58,7 @@ def boxes_of(tree: PartTree, part: int) -> list[Geometry]:
             tuple(((last - first) * size).tolist()),
             Place((low + 0.5 * (first + last) * size) @ axes, axes.T),
         )
-        for first, last in _filled(taken.reshape(tuple(count)))
+        for first, last in _fill(taken.reshape(tuple(count)))
     ]
 
 
@@ -94,7 +94,7 @@ def _open(
     return found
 
 
-def _filled(
+def _fill(
     taken: Bool[np.ndarray, "_ _ _"],
 ) -> list[tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]]:
     """Boxes of whole cells that fill what is taken: their first cells, and those after the last.
@@ -107,14 +107,14 @@ def _filled(
         depth = distance_transform_cdt(padded, "chessboard")[1:-1, 1:-1, 1:-1]
         deepest = np.argwhere(depth == depth.max())
         seeds = deepest[:: math.ceil(len(deepest) / SEEDS)]
-        boxes = [_grown(left, cell) for cell in seeds]
+        boxes = [_grow(left, cell) for cell in seeds]
         first, last = max(boxes, key=lambda box: math.prod((box[1] - box[0]).tolist()))
         left[tuple(map(slice, first, last))] = False
         found.append((first, last))
     return found
 
 
-def _grown(
+def _grow(
     left: Bool[np.ndarray, "_ _ _"], cell: Int[np.ndarray, "3"]
 ) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
     first, last = cell.copy(), cell + 1

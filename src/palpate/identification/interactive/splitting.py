@@ -113,7 +113,7 @@ def _add_options(
     pieces = _pieces(tree.looks[look]) if moved else []
     if not pieces:
         return
-    known = _known(tree, look, other, pieces)
+    known = _evidence_of_pieces(tree, look, other, pieces)
     # the carrier has to be seen where it has gone: else it is elsewhere, and what is on it as well
     whose = tree.labels[look]
     carriers = [
@@ -133,7 +133,7 @@ def _add_options(
     ]
     if not carriers or not strange:
         return
-    others = _explained(tree, other, look)
+    others = _find_explained(tree, other, look)
     for number in strange:
         best = float(known[number].mean(axis=1).max())
         for carrier in carriers:
@@ -156,7 +156,7 @@ def _is_sure(part: Part) -> bool:
     return turned < SURE[0] and (aside < SURE[1] or part.screw.joint == "prismatic")
 
 
-def _known(
+def _evidence_of_pieces(
     tree: PartTree, look: int, other: int, pieces: list[Piece]
 ) -> list[Float[np.ndarray, "labels n"]]:
     """The evidence of another look for each piece's points, if they went with each label."""
@@ -191,7 +191,7 @@ def _is_same(hinge: Screw, other: Screw, turned: float = 0.0, aside: float = 0.0
     return other.joint == "revolute" and bool(alike and away < HINGE + aside)
 
 
-def _explained(tree: PartTree, look: int, other: int) -> Bool[np.ndarray, " points"]:
+def _find_explained(tree: PartTree, look: int, other: int) -> Bool[np.ndarray, " points"]:
     """Which points of a look another one shows where something known has gone."""
     cloud, found = tree.looks[look], np.zeros(len(tree.looks[look].points), bool)
     for part in range(-1, len(tree.parts)):

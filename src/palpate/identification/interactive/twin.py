@@ -35,7 +35,7 @@ class Twin(PartTree):
         before = self.add_look(handling.before)
         after = self.add_look(handling.after)
         self.handled.append(handling)
-        part, new = self._held(before, after, handling)
+        part, new = self._explain(before, after, handling)
         self.held.append((part, before))
         count = len(self.parts)
         self._keep(new, before, after)
@@ -165,11 +165,11 @@ class Twin(PartTree):
             after = before + 1
             for look in (before, after):
                 self.relabel(look)
-            part, new = self._held(before, after, handling)
+            part, new = self._explain(before, after, handling)
             self.held[number] = part, before
             self._keep(new, before, after)
 
-    def _held(self, before: int, after: int, handling: Handling) -> tuple[int, bool]:
+    def _explain(self, before: int, after: int, handling: Handling) -> tuple[int, bool]:
         """The part that the hand held, -1: none that is known; and whether it is new."""
         if not handling.moved:
             nearest = self.looks[before].tree.query(handling.push.point)[1]

@@ -88,7 +88,7 @@ def ranks_of(given: Problem, key: PRNGKeyArray, simulations: int, draws: int = 6
     which does not know the truth, the chains, and the draws they end with. Raises as `sample`.
     """
     first, second = jax.random.split(key)
-    truth, observed = jax.device_get(_simulated(given, jax.random.split(first, simulations)))
+    truth, observed = jax.device_get(_simulate(given, jax.random.split(first, simulations)))
     seeds = np.asarray(jax.random.randint(second, (simulations,), 0, np.iinfo(np.int32).max))
     length = THIN * -(-draws // CHAINS)
 
@@ -131,7 +131,7 @@ def histogram(
 
 
 @eqx.filter_jit
-def _simulated(given: Problem, keys: Array) -> tuple[Array, Array]:
+def _simulate(given: Problem, keys: Array) -> tuple[Array, Array]:
     """True coordinates (simulations, free), and what was observed of the motions they make."""
 
     def one(key: PRNGKeyArray) -> tuple[Array, Array]:

@@ -22,31 +22,31 @@ def rhat(draws: Float[np.ndarray, "chains draws ..."]) -> Float[np.ndarray, "...
 
     Below 1.01 the chains tell the same. Raises `PalpateError` for fewer than 4 draws, or NaN.
     """
-    whole = _checked(draws)
-    values = _split(whole)
+    whole = _check(draws)
+    values = _halve(whole)
     folded = np.abs(values - np.median(values, axis=(0, 1)))
-    found = np.maximum(_rhat(_rank_normalised(values)), _rhat(_rank_normalised(folded)))
+    found = np.maximum(_rhat(_normalise_ranks(values)), _rhat(_normalise_ranks(folded)))
     return np.where(_constant(whole), 1.0, found).reshape(np.shape(draws)[2:])
 
 
 def bulk_size(draws: Float[np.ndarray, "chains draws ..."]) -> Float[np.ndarray, "..."]:
     """Effective number of independent draws for the centre of the distribution (section 4.2)."""
-    whole = _checked(draws)
-    found = _effective_size(_rank_normalised(_split(whole)))
+    whole = _check(draws)
+    found = _effective_size(_normalise_ranks(_halve(whole)))
     return np.where(_constant(whole), _number(whole), found).reshape(np.shape(draws)[2:])
 
 
 def tail_size(draws: Float[np.ndarray, "chains draws ..."]) -> Float[np.ndarray, "..."]:
     """Effective number of independent draws for the 5 % and 95 % quantiles, the lesser one."""
-    whole = _checked(draws)
+    whole = _check(draws)
     sizes = []
     for level in TAILS:
         below = (whole <= np.quantile(whole, level, axis=(0, 1))).astype(np.float64)
-        sizes.append(np.where(_constant(below), _number(whole), _effective_size(_split(below))))
+        sizes.append(np.where(_constant(below), _number(whole), _effective_size(_halve(below))))
     return np.minimum(*sizes).reshape(np.shape(draws)[2:])
 
 
-def _checked(draws: np.ndarray) -> np.ndarray:
+def _check(draws: np.ndarray) -> np.ndarray:
     """The draws as (chains, draws, quantities)."""
     values = np.asarray(draws, np.float64)
     if values.ndim < 2 or values.shape[1] < FEWEST:
@@ -66,13 +66,13 @@ def _constant(values: np.ndarray) -> np.ndarray:
     return np.ptp(values, axis=(0, 1)) == 0.0
 
 
-def _split(values: np.ndarray) -> np.ndarray:
+def _halve(values: np.ndarray) -> np.ndarray:
     """Each chain as two, so that a drift along it shows."""
     half = values.shape[1] // 2
     return np.concatenate([values[:, :half], values[:, values.shape[1] - half :]])
 
 
-def _rank_normalised(values: np.ndarray) -> np.ndarray:
+def _normalise_ranks(values: np.ndarray) -> np.ndarray:
     """Normal quantiles of the ranks over all chains (equation 14)."""
     chains, draws = values.shape[:2]
     ranks = rankdata(values.reshape(chains * draws, -1), axis=0).reshape(values.shape)

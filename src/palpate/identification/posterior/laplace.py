@@ -72,10 +72,10 @@ def find_modes(target: Target, key: PRNGKeyArray, starts: int = 8, steps: int = 
 
 def climb(target: Target, position: Float[Array, "starts free"], steps: int = 40) -> Modes:
     """Climb from given positions; raises `PalpateError` when all of them fail."""
-    return _found(target, climb_each(functools.partial(_each, target), np.asarray(position), steps))
+    return _find(target, climb_each(functools.partial(_each, target), np.asarray(position), steps))
 
 
-def _found(target: Target, modes: Modes) -> Modes:
+def _find(target: Target, modes: Modes) -> Modes:
     if not np.any(np.isfinite(modes.density)):
         raise PalpateError(
             "the likelihood is not finite anywhere a search began: expected data that the model "
@@ -235,7 +235,7 @@ def settle(
     else:
         target, followed = _narrow(target, np.asarray(position), watch)
     modes = climb_each(functools.partial(_each, target), followed, CLIMBING, None, watch)
-    modes = _found(target, modes)
+    modes = _find(target, modes)
     if target.sensitivity is None:
         return target, modes
     if target.error is None:

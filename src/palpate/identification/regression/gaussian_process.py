@@ -102,7 +102,7 @@ def gaussian_process(inputs: np.ndarray, targets: np.ndarray) -> GaussianProcess
 def _process(x: np.ndarray, y: np.ndarray) -> tuple[Any, ...]:
     """Length, size, noise, slope, linear, solved and whitener of one output."""
     squares, products = (x[:, None] - x) ** 2, x @ x.T
-    free = _fitted(squares, products, y)
+    free = _fit(squares, products, y)
     size, noise, slope = np.exp(free[:3])
     near, far = _kernels(free, squares, products)
     factor = np.linalg.cholesky(near + far + noise**2 * np.eye(len(y)))
@@ -139,7 +139,7 @@ def _kernels(
     return near, np.exp(2 * free[2]) * products
 
 
-def _fitted(squares: np.ndarray, products: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _fit(squares: np.ndarray, products: np.ndarray, y: np.ndarray) -> np.ndarray:
     """The hyper-parameters of the greatest marginal likelihood, as their logarithms."""
 
     def loss(free: np.ndarray) -> tuple[float, np.ndarray]:

@@ -71,7 +71,7 @@ class LocallyWeighted(Regression):
         weight = self._eligible(condition.reshape(len(asked), self.condition.shape[-1]))
         weight = _kernel(_squares(asked, self.inputs), weight, self.bandwidth)
         moments = weight @ _products(self.inputs, self.targets)
-        predicted = _solved(moments, asked, self.ridge, self.targets.shape[-1])
+        predicted = _solve(moments, asked, self.ridge, self.targets.shape[-1])
         return self._answered(predicted, inputs)
 
     def _eligible(self, condition: Bool[Array, "queries bits"]) -> Float[Array, "queries data"]:
@@ -105,14 +105,14 @@ def locally_weighted(
     dtype = jnp.zeros(()).dtype
     (centre, scale), (target_centre, target_scale) = standard(inputs), standard(targets)
     arrays = {
-        "inputs": _padded((inputs - centre) / scale, room),
-        "targets": _padded((targets - target_centre) / target_scale, room),
-        "weight": _padded(np.ones(count), room),
+        "inputs": _pad((inputs - centre) / scale, room),
+        "targets": _pad((targets - target_centre) / target_scale, room),
+        "weight": _pad(np.ones(count), room),
         **{"centre": centre, "scale": scale, "bandwidth": 1.0, "ridge": 1.0},
         **{"target_centre": target_centre, "target_scale": target_scale},
     }
     regression = LocallyWeighted(
-        condition=jnp.asarray(_padded(condition, room)),
+        condition=jnp.asarray(_pad(condition, room)),
         **{name: jnp.asarray(values, dtype) for name, values in arrays.items()},
     )
     if count == 1:
@@ -154,7 +154,7 @@ def standard(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return centre, np.where(scale > least, scale, 1.0)
 
 
-def _padded(values: np.ndarray, room: int) -> np.ndarray:
+def _pad(values: np.ndarray, room: int) -> np.ndarray:
     return np.concatenate([values, np.zeros((room - len(values), *values.shape[1:]), values.dtype)])
 
 
@@ -184,7 +184,7 @@ def _products(inputs: Array, targets: Array) -> Array:
     return (row[:, :, None] * both[:, None, :]).reshape(len(inputs), -1)
 
 
-def _solved(moments: Array, asked: Array, ridge: Array, outputs: int) -> Array:
+def _solve(moments: Array, asked: Array, ridge: Array, outputs: int) -> Array:
     size = asked.shape[1] + 1
     moments = moments.reshape(-1, size, size + outputs)
     held = jnp.ones(size, asked.dtype).at[0].set(0.0)
@@ -208,7 +208,7 @@ def _chosen(regression: LocallyWeighted, left_out: Array) -> tuple[Array, Array]
 
     def errors(bandwidth: Array) -> Array:
         moments = _kernel(squares, weight, bandwidth) @ products
-        solve = partial(_solved, moments, asked, outputs=wanted.shape[1])
+        solve = partial(_solve, moments, asked, outputs=wanted.shape[1])
         return jnp.stack([jnp.mean((solve(ridge) - wanted) ** 2) for ridge in ridges])
 
     ridges = jnp.asarray(RIDGES, asked.dtype)

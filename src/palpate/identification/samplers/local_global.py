@@ -82,7 +82,7 @@ def local_global(
         steps = -(-size // LOOKS) if learning else STEPS * size
         length = np.asarray(np.exp(log_length), position.dtype)
         seen, density, stepped, leapt = jax.device_get(
-            _walked(
+            _walk_chains(
                 target, mixture, length, np.linalg.cholesky(covariance).astype(position.dtype),
                 np.asarray([count, steps]), power, position, value,
                 jax.random.split(jax.random.fold_in(key, index), chains),
@@ -135,7 +135,7 @@ def compile_beside(target: Target, chains: int = CHAINS) -> Iterator[None]:
             keys = jax.random.split(jax.random.key(0), chains)
             of_nothing = np.zeros(2, int)
             mixture = fit_mixture(nowhere, root)
-            _walked(target, mixture, none[0], root, of_nothing, none, some, none, keys)
+            _walk_chains(target, mixture, none[0], root, of_nothing, none, some, none, keys)
 
     with ThreadPoolExecutor(1) as pool:
         compiling = pool.submit(work)
@@ -144,7 +144,7 @@ def compile_beside(target: Target, chains: int = CHAINS) -> Iterator[None]:
 
 
 @compile_sooner
-def _walked(
+def _walk_chains(
     target: Target,
     mixture: Mixture,
     length: Array,

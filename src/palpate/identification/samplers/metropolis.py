@@ -50,7 +50,7 @@ def metropolis(
     begin, walking = jax.random.split(key)
     start, *_ = start_chains(target, modes, begin, chains)
     size = target.dimension
-    return _sampled(
+    return _sample(
         target, jnp.asarray(start), walking, draws, WARM_UP * size, STEPS * size, adapted=True,
         covariance=np.asarray(modes.covariance[0], np.float64), watch=watch,
     )  # fmt: skip
@@ -65,7 +65,7 @@ def prior_scaled(
     thin: int = 1,
 ) -> Draws:
     """Metropolis with proposals N(0, c^2 1) in whitened coordinates; see `covariance_adapted`."""
-    return _sampled(target, start, key, draws, warm_up, thin, adapted=False)
+    return _sample(target, start, key, draws, warm_up, thin, adapted=False)
 
 
 def covariance_adapted(
@@ -81,10 +81,10 @@ def covariance_adapted(
     Keeps `draws` of each chain, every `thin`-th step. Raises `PalpateError` when the density is
     not finite where a chain begins.
     """
-    return _sampled(target, start, key, draws, warm_up, thin, adapted=True)
+    return _sample(target, start, key, draws, warm_up, thin, adapted=True)
 
 
-def _sampled(
+def _sample(
     target,
     start,
     key,

@@ -100,7 +100,7 @@ def fit_mixture(
         mean = (share @ white.T) / of[:, None]
         second = (share[:, None] * white).reshape(-1, count) @ white.T
         # About its mean: the draws are white, so that nothing cancels.
-        scatter = second.reshape(spread.shape) - of[:, None, None] * _squared(mean)
+        scatter = second.reshape(spread.shape) - of[:, None, None] * _outer_products(mean)
         diagonal = np.einsum("kii->ki", scatter) / of[:, None] + NARROWEST
         spread = scatter + prior * np.einsum("ki,ij->kij", diagonal, np.eye(size))
         spread = spread / (of + prior)[:, None, None]
@@ -114,7 +114,7 @@ def fit_mixture(
     return Mixture(*(jnp.asarray(part, jnp.zeros(()).dtype) for part in parts))
 
 
-def _squared(vectors: Float[np.ndarray, "components free"]) -> np.ndarray:
+def _outer_products(vectors: Float[np.ndarray, "components free"]) -> np.ndarray:
     """Their outer products with themselves."""
     return vectors[:, :, None] * vectors[:, None, :]
 

@@ -53,7 +53,7 @@ def temper(target: Target, key: PRNGKeyArray, particles: int = 512, moves: int =
     `moves` Metropolis steps are made at each temperature. Raises `PalpateError` when fewer than
     two particles have a finite likelihood, or when the temperatures run out.
     """
-    return _checked(*_temper(target, key, particles, moves))
+    return _check(*_temper(target, key, particles, moves))
 
 
 def populations(
@@ -87,7 +87,7 @@ def populations(
     )
 
 
-def _checked(particles: Particles, possible: Int[Array, ""]) -> Particles:
+def _check(particles: Particles, possible: Int[Array, ""]) -> Particles:
     """The particles, if so many draws of the prior were `possible` that there are any to trust."""
     temperature = float(particles.temperature)
     if int(possible) < FEWEST:

@@ -87,7 +87,7 @@ def advance(
     following = after.copy()
     for number in np.flatnonzero(ended):
         following[number] = infos["final_obs"][number]
-    cost = _reported(infos, "cost", ended, np.zeros(len(ended), np.float32))
+    cost = _reports_of(infos, "cost", ended, np.zeros(len(ended), np.float32))
     lived = Transition(
         np.array(observation, np.float32),
         np.array(action, np.float32),
@@ -97,8 +97,8 @@ def advance(
         _finite("observation", following),
         np.asarray(terminated, np.float32),
     )
-    end = _reported(infos, "end", ended, np.full(len(ended), "", object))
-    info = {name: _reported(infos, name, ended, np.full(len(ended), np.nan)) for name in REPORTED}
+    end = _reports_of(infos, "end", ended, np.full(len(ended), "", object))
+    info = {name: _reports_of(infos, name, ended, np.full(len(ended), np.nan)) for name in REPORTED}
     info |= {name: infos[name] for name in ("motions",) if name in infos}
     return lived, _finite("observation", after), {"ended": ended, "end": end, **info}
 
@@ -113,7 +113,7 @@ def motions_of(info: dict[str, Any]) -> tuple[Motion, int]:
     return Motion(action=done, reward=np.zeros_like(found["cost"]), **found), count
 
 
-def _reported(
+def _reports_of(
     infos: dict[str, Any], name: str, ended: np.ndarray, default: np.ndarray
 ) -> np.ndarray:
     """What is reported of each under a name; of an episode that ended, by its last step.

@@ -97,7 +97,7 @@ class SoftActorCritic:
         def improved() -> tuple[Any, ...]:
             gradient, entropy = jax.grad(actor_loss, has_aux=True)(state.actor, critic)
             moved = descend(optimiser, gradient, before["actor"], state.actor)
-            return *moved, *self._cooled(state, entropy, optimiser)
+            return *moved, *self._cool(state, entropy, optimiser)
 
         if self.actor_every == 1:
             acting = improved()
@@ -112,7 +112,7 @@ class SoftActorCritic:
         figures = {"critic_loss": lost, "entropy": -jnp.mean(density), "temperature": temperature}
         return state, {**figures, "value": jnp.mean(target)}
 
-    def _cooled(
+    def _cool(
         self, state: SoftActorCriticState, entropy: Array, optimiser: optax.GradientTransformation
     ) -> tuple[Array, optax.OptState]:
         """Cooler where the actions are more random than they should be."""

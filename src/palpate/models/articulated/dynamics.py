@@ -141,7 +141,7 @@ def solve(matrix: Inertia, right: Each) -> Each:
         return jnp.sum(matrix * x[None, :], axis=1)
 
     def eliminated(_: Callable[[Array], Array], b: Array) -> Array:
-        return _substituted(_factors(jax.lax.stop_gradient(matrix)), b)
+        return _substitute(_factors(jax.lax.stop_gradient(matrix)), b)
 
     return jax.lax.custom_linear_solve(times, right, eliminated, symmetric=True)
 
@@ -158,7 +158,7 @@ def _factors(matrix: Inertia) -> list[tuple[Array, Array]]:
     return factors
 
 
-def _substituted(factors: list[tuple[Array, Array]], right: Array) -> Array:
+def _substitute(factors: list[tuple[Array, Array]], right: Array) -> Array:
     """(L D L')^-1 right."""
     halfway, rest = [], right
     for column, inverse in factors:

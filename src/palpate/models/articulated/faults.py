@@ -148,13 +148,13 @@ def _with_one_root(description: Description, faults: Faults) -> Description:
     if len(roots) < 2:
         return description
     taken = {link.name for link in description.links}
-    base = next(name for name in _numbered("base") if name not in taken)
+    base = next(name for name in _numbers_of("base") if name not in taken)
     used = {joint.name for joint in description.joints}
     what = f"{len(roots)} links hang on none: {', '.join(roots[:4])}"
     faults.append(Fault("the file", what, (*READERS, MUJOCO), f"hung on a new link '{base}'"))
     added = []
     for root in roots:
-        name = next(n for n in _numbered(f"{base}_to_{root}") if n not in used)
+        name = next(n for n in _numbers_of(f"{base}_to_{root}") if n not in used)
         used.add(name)
         added.append(DescribedJoint(name, "fixed", base, root))
     return dataclasses.replace(
@@ -164,7 +164,7 @@ def _with_one_root(description: Description, faults: Faults) -> Description:
     )
 
 
-def _numbered(name: str) -> Iterable[str]:
+def _numbers_of(name: str) -> Iterable[str]:
     yield name
     yield from (f"{name}_{number}" for number in range(2, 1_000_000))
 
@@ -173,7 +173,7 @@ def _with_own_names(joints: Sequence[DescribedJoint], faults: Faults) -> Iterabl
     used: set[str] = set()
     for index, joint in enumerate(joints):
         wanted = joint.name or f"joint_{index}"
-        name = next(each for each in _numbered(wanted) if each not in used)
+        name = next(each for each in _numbers_of(wanted) if each not in used)
         used.add(name)
         if name != joint.name:
             what = "another joint has this name" if joint.name else "it has no name"
@@ -214,7 +214,7 @@ def mend_joint(joint: DescribedJoint, of: Description, faults: Faults) -> Descri
             note(what, (MUJOCO, PALPATE), "exchanged", lower=high, upper=low)
         elif low == high:
             note(f"its range is empty, {low:g} to {high:g}", (MUJOCO,), "fixed there", kind="fixed",
-                 place=_moved(joint, low), lower=None, upper=None)  # fmt: skip
+                 place=_frame_at(joint, low), lower=None, upper=None)  # fmt: skip
         else:
             joint = dataclasses.replace(joint, lower=low, upper=high)
     if joint.kind in MOVING:
@@ -235,7 +235,7 @@ def mend_joint(joint: DescribedJoint, of: Description, faults: Faults) -> Descri
     return joint
 
 
-def _moved(joint: DescribedJoint, position: float) -> Place:
+def _frame_at(joint: DescribedJoint, position: float) -> Place:
     """The frame of a joint's child where the joint is at `position` (rad or m)."""
     axis = joint.axis / np.linalg.norm(joint.axis)
     if joint.kind == "prismatic":
@@ -256,14 +256,14 @@ def mend_shapes(link: DescribedLink, of: Description, faults: Faults) -> Describ
         kind: tuple(
             sound
             for shape in getattr(link, kind)
-            if (sound := _mended_shape(f"link '{link.name}'", shape, of, faults)) is not None
+            if (sound := _mend_shape(f"link '{link.name}'", shape, of, faults)) is not None
         )
         for kind in ("visuals", "collisions")
     }
     return dataclasses.replace(link, **kept)
 
 
-def _mended_shape(where: str, shape: Geometry, of: Description, faults: Faults) -> Geometry | None:
+def _mend_shape(where: str, shape: Geometry, of: Description, faults: Faults) -> Geometry | None:
     if not all(abs(value) > 0.0 for value in shape.size):
         faults.append(Fault(where, f"a {shape.kind} has no size", (MUJOCO,), "left out"))
         return None

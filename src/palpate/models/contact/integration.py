@@ -95,15 +95,15 @@ def advance(
     # after the other, as in a corner each acts on the rest. Of the arm last: where a wall holds the
     # tip, nothing is left for the arm to hold, and the sensor feels all of it.
     for wall in range(normal.shape[-2]):
-        tangent = jnp.broadcast_to(_turned(normal[..., wall, :]), mean.shape)
+        tangent = jnp.broadcast_to(_turn(normal[..., wall, :]), mean.shape)
         most = (surfaces.friction * force)[..., wall]
-        mean, rubbing = _rubbed(mean, velocity, tangent, most, inverse, slip)
+        mean, rubbing = _rub(mean, velocity, tangent, most, inverse, slip)
         total = total - tangent * rubbing[..., None]
         late = late - tangent * (later[..., wall] * rubbing)[..., None]
     sliding = 2.0 * mean - velocity
     speed = jnp.sqrt(jnp.sum(jnp.square(sliding), axis=-1) + 1e-18)
     along = sliding / speed[..., None]
-    mean, _ = _rubbed(mean, velocity, along, impedance.friction, inverse, impedance.creep)
+    mean, _ = _rub(mean, velocity, along, impedance.friction, inverse, impedance.creep)
     position = position + time * mean
     within = jnp.maximum(surfaces.place - _along(normal, position), 0.0)
     plates = PlateState(jnp.where(walls.carried > 0.0, within, walls.free), walls.carried)
@@ -174,7 +174,7 @@ def _contacts(
     )
 
 
-def _rubbed(
+def _rub(
     mean: Array,
     velocity: Array,
     along: Array,
@@ -218,7 +218,7 @@ def _along(normal: Array, vector: Array) -> Array:
     return jnp.sum(normal * vector[..., None, :], axis=-1)
 
 
-def _turned(normal: Array) -> Array:
+def _turn(normal: Array) -> Array:
     """A quarter of a turn to the left."""
     return jnp.stack([-normal[..., 1], normal[..., 0]], axis=-1)
 

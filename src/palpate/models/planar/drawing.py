@@ -39,8 +39,8 @@ def drawing(
     closed = jnp.concatenate([model.outline, model.outline[..., :1, :]], axis=-2)
     return {
         "": placed(closed),
-        WHEEL: placed(_shown(wheels, model.wheel)),
-        PIVOT: placed(_shown(pivots, model.pivot)),
+        WHEEL: placed(_hide_others(wheels, model.wheel)),
+        PIVOT: placed(_hide_others(pivots, model.pivot)),
     }
 
 
@@ -53,7 +53,7 @@ def _crosses(centre: Array, direction: Array, along: Array, across: Array) -> Ar
     return jnp.stack(strokes, axis=-3)
 
 
-def _shown(crosses: Array, there: Array) -> Array:
+def _hide_others(crosses: Array, there: Array) -> Array:
     """(*batch, bodies, lines, 2 ends, 2) of those that are there, NaN of the others."""
     crosses = jnp.where(there[..., None, None, None] > 0, crosses, jnp.nan)
     return crosses.reshape(*crosses.shape[:-4], -1, 2, 2)

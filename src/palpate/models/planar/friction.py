@@ -214,7 +214,7 @@ def curvature(resisting: Resistance, velocity: Triple, pull: Pull) -> Entries:
     one = 1.0 - pull.first * along.first
     other = 1.0 - pull.second * along.second
     both = -0.5 * (pull.first * along.second + pull.second * along.first)
-    return _plus(resisting.entries, _weighted(dry, dry.impulse * soft, Tensor(one, other, both)))
+    return _plus(resisting.entries, _weight(dry, dry.impulse * soft, Tensor(one, other, both)))
 
 
 def _directions(dry: Dry, velocity: Triple) -> tuple[Array, Pull]:
@@ -234,10 +234,10 @@ def as_viscous(resisting: Resistance, velocity: Triple) -> Entries:
     soft = inverse_size(*rates(dry, velocity))
     one = jnp.ones_like(soft)
     even = Tensor(one, one, jnp.zeros_like(soft))
-    return _plus(resisting.entries, _weighted(dry, dry.impulse * soft, even))
+    return _plus(resisting.entries, _weight(dry, dry.impulse * soft, even))
 
 
-def _weighted(dry: Dry, weight: Array, tensor: Tensor) -> Entries:
+def _weight(dry: Dry, weight: Array, tensor: Tensor) -> Entries:
     """Entries of w J' T J of each element, for a tensor T of its two rates."""
     (xx, yy, xy), inner = dry.tensor, tensor
     first_x, first_y = inner.xx * xx + inner.xy * xy, inner.xx * xy + inner.xy * yy

@@ -92,7 +92,7 @@ class Planar(PlanarParameters):
         frames = observations.shape[-3]
         last = observations[..., -1, :, :]
         if frames < 2:
-            return self._allowed(PlanarState(last, jnp.zeros_like(last)))
+            return self._nearest_allowed(PlanarState(last, jnp.zeros_like(last)))
         steps = self.difference(observations[..., 1:, :, :], observations[..., :-1, :, :])
         back = jnp.flip(jnp.cumsum(jnp.flip(steps, axis=-3), axis=-3), axis=-3)
         change = jnp.concatenate([-back, jnp.zeros_like(back[..., :1, :, :])], axis=-3)
@@ -100,7 +100,7 @@ class Planar(PlanarParameters):
         centred = time - jnp.mean(time)
         slope = jnp.sum(centred * change, axis=-3) / jnp.sum(jnp.square(centred))
         offset = jnp.mean(change, axis=-3) - slope * jnp.mean(time)
-        return self._allowed(PlanarState(last + (offset if frames > 2 else 0.0), slope))
+        return self._nearest_allowed(PlanarState(last + (offset if frames > 2 else 0.0), slope))
 
     def step(self, state: PlanarState, action: Float[Array, "*batch bodies 3"]) -> PlanarState:
         """The state one control period later."""
@@ -117,7 +117,7 @@ class Planar(PlanarParameters):
 
         def step(state: PlanarState, action: Array) -> PlanarState:
             given = state.pose, state.velocity, action
-            after = self._advanced(system, *_side_by_side(given, [2, 2, 2], own[0].shape[-1]))
+            after = self._advance(system, *_side_by_side(given, [2, 2, 2], own[0].shape[-1]))
             if batched or any(leaf.ndim > 2 for leaf in given):
                 return PlanarState(*(jnp.moveaxis(leaf, -1, 0) for leaf in after))
             return PlanarState(*(leaf[..., 0] for leaf in after))
@@ -198,11 +198,11 @@ class Planar(PlanarParameters):
         """`step` of bodies that links or contacts couple."""
 
         def step(model: Planar, state: PlanarState, action: Array) -> tuple[Array, Array]:
-            return model._advanced(system_of(model), state.pose, state.velocity, action)
+            return model._advance(system_of(model), state.pose, state.velocity, action)
 
         return _one_by_one(step, self, state, action)
 
-    def _allowed(self, state: PlanarState) -> PlanarState:
+    def _nearest_allowed(self, state: PlanarState) -> PlanarState:
         """The nearest state that bolts and links allow."""
         stands = self.bolted[..., None] > 0.0
         pose = jnp.where(stands, self.bolted_pose, state.pose)
@@ -214,7 +214,7 @@ class Planar(PlanarParameters):
 
         return _one_by_one(nearest, self, state) if self.link_to.shape[-1] else state
 
-    def _advanced(
+    def _advance(
         self, system: System, pose: Array, velocity: Array, wrench: Array
     ) -> tuple[Array, Array]:
         """Poses and rates one control period later, (bodies, 3) and then lanes, if any."""

@@ -70,8 +70,8 @@ def furniture(
         bolts[_existing(body, count)] = 1.0
     fields |= _links(count, pivots or {}, distances or {})
     fields |= {
-        "outline": _padded([_padded(pieces) for pieces in parts]),
-        "walls": _padded(wall_parts) if wall_parts else np.zeros((0, 3, 2)),
+        "outline": _pad([_pad(pieces) for pieces in parts]),
+        "walls": _pad(wall_parts) if wall_parts else np.zeros((0, 3, 2)),
         "half_extent": extent,
         "even_gyration": gyration,
         "bolted": bolts,
@@ -178,7 +178,7 @@ def _corners(polygon: Any) -> Float[np.ndarray, "corners 2"]:
     return np.asarray(orient(hull).exterior.coords)[:-1]
 
 
-def _padded(arrays: Sequence[np.ndarray]) -> np.ndarray:
+def _pad(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """Stacked, all as long as the longest: the last row again where one is shorter."""
     shape = np.max([array.shape for array in arrays], axis=0)
     return np.stack(

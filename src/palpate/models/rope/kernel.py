@@ -85,7 +85,7 @@ def integrate(
 
     def advance(state: tuple[Axes, Axes]) -> tuple[Axes, Axes]:
         position, velocity = state
-        velocity = _moved_by_forces(position, velocity, rest_bend, coefficients, lanes)
+        velocity = _move_by_forces(position, velocity, rest_bend, coefficients, lanes)
         velocity = tuple(v + i for v, i in zip(velocity, increment, strict=True))
         position = tuple(p + time_step * v for p, v in zip(position, velocity, strict=True))
         return position, velocity
@@ -99,7 +99,7 @@ def integrate(
     return state
 
 
-def _moved_by_forces(
+def _move_by_forces(
     position: Axes, velocity: Axes, rest_bend: Axes | None, c: Coefficients, lanes: int
 ) -> Axes:
     """Each node's velocity one time step later.

@@ -84,7 +84,7 @@ class MarkerObserver:
             state = _advance(self._model, state, sent)
         measured = jnp.asarray(measured, jnp.float32)
         rate = beta / (since * period)
-        state = _corrected(state, measured, jnp.asarray(alpha), jnp.asarray(rate))
+        state = _correct(state, measured, jnp.asarray(alpha), jnp.asarray(rate))
         self._at_measurement, self._time = state, time
         self._commands = self._commands[since:]
         for sent in self._commands:
@@ -99,7 +99,7 @@ def _advance(model: Rope, state: RopeState, command: Array) -> RopeState:
 
 
 @jax.jit
-def _corrected(state: RopeState, measured: Array, alpha: Array, rate: Array) -> RopeState:
+def _correct(state: RopeState, measured: Array, alpha: Array, rate: Array) -> RopeState:
     """Node by node from the gripper on, each as far from the one before as was predicted."""
     missed = measured - state.position
     position = (state.position + alpha * missed).at[:, 0].set(measured[:, 0])

@@ -75,8 +75,8 @@ class RopeTracker:
         self._instant = frame.time  # of the beliefs
         self._path: list[Array] = []  # of the gripper since then, one each control period
         self._doubt = 0
-        seen = self._segmented(frame, np.asarray(gripper))
-        self._hypotheses = self._found(seen, np.asarray(gripper))
+        seen = self._segment(frame, np.asarray(gripper))
+        self._hypotheses = self._find(seen, np.asarray(gripper))
         self._correct(frame, seen)
         self._state = _state(self.belief)
         return self._state
@@ -103,7 +103,7 @@ class RopeTracker:
                 hypothesis.belief = _advance(self._model, hypothesis.belief, place)
         self._path = self._path[steps:]
         self._instant += steps * period
-        self._correct(frame, self._segmented(frame, np.asarray(self.belief.gripper)))
+        self._correct(frame, self._segment(frame, np.asarray(self.belief.gripper)))
         state = _state(self.belief)
         for place in self._path:
             state = _forecast(self._model, self.belief, state, place)
@@ -125,11 +125,11 @@ class RopeTracker:
         """The rope's length in m, as believed."""
         return float(self._rest_length.sum() * np.exp(self.belief.mean[-1]))
 
-    def _segmented(self, frame: Frame, gripper: np.ndarray) -> Segmentation:
+    def _segment(self, frame: Frame, gripper: np.ndarray) -> Segmentation:
         reach = REACH * float(self._rest_length.sum())
         return segment(frame, self._rope, self.pinhole, gripper, reach)
 
-    def _found(self, seen: Segmentation, gripper: np.ndarray) -> list[_Hypothesis]:
+    def _find(self, seen: Segmentation, gripper: np.ndarray) -> list[_Hypothesis]:
         """What a picture alone leaves open."""
         whole = float(self._rest_length.sum())
         found = []
@@ -155,7 +155,7 @@ class RopeTracker:
         shown = best.unexplained == 0
         self._doubt = max(self._doubt - 1, 0) if shown else min(self._doubt + 1, LOST_FRAMES)
         if best.unexplained >= LOST_FRAMES and sighting.valid.sum() >= FEWEST:
-            for other in self._found(seen, np.asarray(best.belief.gripper)):
+            for other in self._find(seen, np.asarray(best.belief.gripper)):
                 other.belief = eqx.tree_at(
                     lambda b: b.gripper_velocity, other.belief, best.belief.gripper_velocity
                 )
@@ -180,10 +180,10 @@ class RopeTracker:
         explained = np.asarray(fit.explained).sum() / max(valid.sum(), 1)
         # Without depth what else has the rope's colour is taken for rope, and not explained.
         fits = frame.depth is None or explained > LEAST_SHOWN
-        fits &= self._shown(each.belief, frame, seen) > LEAST_SHOWN
+        fits &= self._share_shown(each.belief, frame, seen) > LEAST_SHOWN
         each.unexplained = 0 if fits else each.unexplained + 1
 
-    def _shown(self, belief: RopeBelief, frame: Frame, seen: Segmentation) -> float:
+    def _share_shown(self, belief: RopeBelief, frame: Frame, seen: Segmentation) -> float:
         """The share of the rope, as believed, where the picture shows a rope.
 
         Of what nothing hides; 0 where everything is hidden, which confirms nothing.

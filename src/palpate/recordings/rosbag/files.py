@@ -160,7 +160,7 @@ def _records(file: Any, summary: Any, skipped: Collection[str]) -> Iterator[Any]
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=CHUNK)
         for record in reader.records:
             if isinstance(record, Chunk):
-                yield from _unpacked(record)
+                yield from _unpack(record)
             else:
                 yield record
         return
@@ -171,10 +171,10 @@ def _records(file: Any, summary: Any, skipped: Collection[str]) -> Iterator[Any]
             opcode, length = file.read(1), int.from_bytes(file.read(8), "little")
             if opcode != b"\x06" or length > CHUNK:
                 raise DamagedFileError("the index of the file does not fit its content")
-            yield from _unpacked(Chunk.read(ReadDataStream(file)))
+            yield from _unpack(Chunk.read(ReadDataStream(file)))
 
 
-def _unpacked(chunk: Any) -> list[Any]:
+def _unpack(chunk: Any) -> list[Any]:
     """The records in a chunk, after a look at how much memory they take."""
     import zstandard
     from lz4.frame import get_frame_info

@@ -95,7 +95,7 @@ def _markers(message: Any) -> Sight | None:
         there = [item for item in items if _field(item, "action") not in _DELETED]
         points, names = _places(there)
         # visualization_msgs/Marker: its points lie in a frame of their own
-        points = _moved(points, _field(message, "pose"))
+        points = _move(points, _field(message, "pose"))
     if points is None or len(points) > MAX_POINTS:
         return None
     stamp, frame = header(message)
@@ -114,7 +114,7 @@ def _places(items: list[Any]) -> tuple[np.ndarray, tuple[str, ...] | None]:
     ]
     if len(lists) == 1 and not single:
         points, _ = _places(_field(lists[0], "points"))
-        return _moved(points, _field(lists[0], "pose")), None
+        return _move(points, _field(lists[0], "pose")), None
     places = [_place(item) for item in single]
     hidden = [_field(item, "occluded") is True for item in single]
     if None in places:
@@ -170,7 +170,7 @@ def cloud_points(message: Any, most: int = MAX_POINTS) -> np.ndarray | None:
     return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
-def _moved(points: np.ndarray, pose: Any) -> np.ndarray:
+def _move(points: np.ndarray, pose: Any) -> np.ndarray:
     """`points` (points, 3) of the frame that lies at `pose`, in the frame in which it lies there.
 
     A quaternion of length 0, as an unset one has, turns nothing.

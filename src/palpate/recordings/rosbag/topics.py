@@ -145,7 +145,7 @@ def choose(tracks: dict[str, Track], bag: Bag, topics: Sequence[str]) -> Chosen:
     if markers is None:
         raise PalpateError(
             "no topic holds markers, which are lists of places such as geometry_msgs/PoseArray or "
-            f"visualization_msgs/MarkerArray; {_listed(bag)}"
+            f"visualization_msgs/MarkerArray; {_list_of_topics(bag)}"
         )
     _check_whole(markers, bag)
     positions, names, notes = _positions(markers)
@@ -197,10 +197,10 @@ def _unusable(topic: str, tracks: dict[str, Track], bag: Bag) -> str:
             f"topic '{topic}' of type {bag.types[topic]} has no messages that show markers, a "
             "pose or a velocity"
         )
-    return f"there is no topic '{topic}'; {_listed(bag)}"
+    return f"there is no topic '{topic}'; {_list_of_topics(bag)}"
 
 
-def _listed(bag: Bag) -> str:
+def _list_of_topics(bag: Bag) -> str:
     there = []
     for topic, kind in bag.types.items():
         why = bag.unreadable.get(topic)

@@ -120,14 +120,14 @@ def _motion(
     acts[:, link, 4:] = hold
     start = np.array([twin.parts[one].positions[look] for one in dynamics.parts])
     models = dynamics.draws(DRAWS, seed)
-    ways = np.asarray(_rolled(models, jnp.asarray(start), jnp.asarray(acts)))[:, :, link]
+    ways = np.asarray(_roll(models, jnp.asarray(start), jnp.asarray(acts)))[:, :, link]
     sign = 1.0 if twin.screw(part, look).axis @ axis > 0.0 else -1.0
     gone = sign * real_way
     noise = PLACE * random.standard_normal(ways.shape)
     low, high = np.quantile(ways - start[link] + noise, WITHIN, axis=0)
 
     def error_of(model: Model) -> float:
-        way = np.asarray(_rolled_alone(model, jnp.asarray(start), jnp.asarray(acts)))[:, link]
+        way = np.asarray(_roll_alone(model, jnp.asarray(start), jnp.asarray(acts)))[:, link]
         return float(np.sqrt(np.mean(np.square((way - start[link] - gone) / own.range))))
 
     return Motion(
@@ -166,7 +166,7 @@ def _real(
 
 
 @eqx.filter_jit
-def _rolled(
+def _roll(
     models: Articulated, start: Float[jax.Array, " links"], acts: Float[jax.Array, "time links 7"]
 ) -> Float[jax.Array, "draws time links"]:
     count = models.mass.shape[0]
@@ -177,7 +177,7 @@ def _rolled(
 
 
 @eqx.filter_jit
-def _rolled_alone(
+def _roll_alone(
     model: Model, start: Float[jax.Array, " links"], acts: Float[jax.Array, "time links 7"]
 ) -> Float[jax.Array, "time links"]:
     position = start.astype(acts.dtype)

@@ -221,7 +221,7 @@ class CartController(FeedbackController):
             strength=as_floating(self._task.strength),
             handle=as_floating(self._task.handles),
         )
-        action = self._unplanned() if model is None else self._planned(handled, before)
+        action = self._act_without_plan() if model is None else self._planned(handled, before)
         wrench = _wrench(handled, before.pose, jnp.asarray(action))
         return _Holding(held, before, np.asarray(wrench), [])
 
@@ -240,7 +240,7 @@ class CartController(FeedbackController):
     def _state(self) -> PlanarState:
         return _estimated(self._tracker, jnp.asarray(np.array(self._frames), jnp.float32))
 
-    def _unplanned(self) -> np.ndarray:
+    def _act_without_plan(self) -> np.ndarray:
         """Anything within the ball of actions, or nothing."""
         if self._idle:
             return np.zeros(3, np.float32)

@@ -45,14 +45,14 @@ class PiecePosterior:
 
     def keep(self, stretches: list[tuple[Aligned, bool]]) -> None:
         """Remember handling that is over."""
-        self._kept += self._cut(stretches)
+        self._kept += self._segments_of(stretches)
 
     def update(self, stretches: list[tuple[Aligned, bool]]) -> Planar | None:
         """The most probable model, given what is kept and handling that still goes on.
 
         None as long as nothing has been seen.
         """
-        target = self._target(self._kept + self._cut(stretches))
+        target = self._target(self._kept + self._segments_of(stretches))
         if target is None:
             return None
         self._key, draw, choose = jax.random.split(self._key, 3)
@@ -98,7 +98,7 @@ class PiecePosterior:
         assert isinstance(found, Planar)
         return found
 
-    def _cut(self, stretches: list[tuple[Aligned, bool]]) -> list[Segments]:
+    def _segments_of(self, stretches: list[tuple[Aligned, bool]]) -> list[Segments]:
         return [cut(aligned, self.model, PIECE, at_rest=rest) for aligned, rest in stretches]
 
 

@@ -127,7 +127,7 @@ def best_scene(task: CartTask, planning: Planning, seed: int) -> Planar:
     elsewhere it may end at a table that is too heavy to be moved, is believed, and so never seen to
     move. Nor does wiggling tell at what force a caster gives way that holds more than that takes.
     """
-    stretches = _wiggled(task, seed)
+    stretches = _wiggle(task, seed)
     tossed = CartController(task, planning, seed, TOSSING)
     list(rewards_by_episode(task, tossed, seed, TOSSED * task.episode, TOSSING))
     for body, handled in enumerate(stretches):
@@ -169,7 +169,7 @@ def _hidden(task: CartTask, seed: int) -> list[Planar]:
     return pieces
 
 
-def _wiggled(task: CartTask, seed: int) -> list[list[tuple[Aligned, bool]]]:
+def _wiggle(task: CartTask, seed: int) -> list[list[tuple[Aligned, bool]]]:
     """Handling of each piece, that begins at rest, as `Episode.handling` has it."""
     poses = [(4.0 * index, 0.0, 0.0) for index in range(len(task.kinds))]
     world = FurnitureWorld(

@@ -161,7 +161,7 @@ def episode(room: Room, opinion: Opinion, drive: Drive | None = None) -> Episode
 def _episode(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> None:
     while outcome.attempts < ATTEMPTS:
         outcome.beliefs.append((run.time, opinion.movability()))
-        plan = _planned(run, room, opinion, outcome)
+        plan = _plan(run, room, opinion, outcome)
         if plan is None:
             outcome.reason = "no way"
             return
@@ -189,13 +189,13 @@ def _episode(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> 
         opinion.tried(transfer.name, share)
 
 
-def _planned(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> Plan | None:
+def _plan(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> Plan | None:
     """The plan from here; None if there is none, even close by things and after relenting."""
     try:
-        _seen(run, room, MARGIN).check()
+        _map_of(run, room, MARGIN).check()
     except PalpateError:  # so near to something that it could not turn
         run.back_off()
-    maps = {margin: _seen(run, room, margin) for margin in MARGINS}
+    maps = {margin: _map_of(run, room, margin) for margin in MARGINS}
     begin, end = ends_of(maps[TIGHT])
     if begin == end >= 0:  # nothing needs to be moved
         maps = {TIGHT: maps[TIGHT]}
@@ -215,7 +215,7 @@ def _planned(run: Execution, room: Room, opinion: Opinion, outcome: Episode) -> 
     return None
 
 
-def _seen(run: Execution, room: Room, margin: float) -> Map:
+def _map_of(run: Execution, room: Room, margin: float) -> Map:
     return room.map(run.outlines, run.poses(), run.robot(), margin)
 
 

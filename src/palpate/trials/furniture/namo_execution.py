@@ -135,7 +135,7 @@ class Execution:
         for corner, after in pairwise(points):
             if not self._straight(corner, after, heading):
                 return False
-        return self._settled(points[-1], heading)
+        return self._has_settled(points[-1], heading)
 
     def transfer(self, segment: Segment, examine: bool) -> float:
         """Grasp, carry along, let go: the share of the way that the object came along.
@@ -148,7 +148,7 @@ class Execution:
         body = self.names.index(segment.name)
         pose = segment.grasp.robot_pose(self.poses()[body], RADIUS + REACH + GAP)
         if np.hypot(*(pose[:2] - self.robot()[:2])) < AWAY:  # it has rolled on a little meanwhile
-            self._settled(pose[:2], float(pose[2]))
+            self._has_settled(pose[:2], float(pose[2]))
         self._posture(POSTURE)
         for _ in range(round(1.0 / self.period)):
             if _robot(self.now).holding == body:
@@ -200,10 +200,10 @@ class Execution:
             self._step(np.array([*velocity, self._turning(heading)]), np.zeros(3))
         return True
 
-    def _settled(self, place: np.ndarray, heading: float) -> bool:
+    def _has_settled(self, place: np.ndarray, heading: float) -> bool:
         for _ in range(round(4.0 / self.period)):
             pose = _robot(self.now).base_pose
-            off, turn = place - pose[:2], _wrapped(heading - pose[2])
+            off, turn = place - pose[:2], _wrap(heading - pose[2])
             if np.hypot(*off) < 0.004 and abs(turn) < 0.01:
                 self._rest()
                 return True
@@ -211,7 +211,7 @@ class Execution:
         return bool(np.hypot(*(place - _robot(self.now).base_pose[:2])) < 0.03)
 
     def _turning(self, heading: float) -> float:
-        return float(np.clip(4 * _wrapped(heading - _robot(self.now).base_pose[2]), -1.2, 1.2))
+        return float(np.clip(4 * _wrap(heading - _robot(self.now).base_pose[2]), -1.2, 1.2))
 
     def _carry(self, body: int, path: np.ndarray) -> tuple[float, bool]:
         """Pull the object along a path of poses (points, 3).
@@ -227,7 +227,7 @@ class Execution:
         while made < way[-1] - END:
             robot, pose = _robot(self.now), self.now.poses[body]
             at = min(int(np.searchsorted(way, made, side="right")), len(path) - 1) - 1
-            wanted = self._wanted(path, at, pose, robot.gripper_pose)
+            wanted = self._wanted_velocity(path, at, pose, robot.gripper_pose)
             advance = (pose - last) * np.array([1, 1, ARM])
             unit = wanted * np.array([1, 1, ARM])
             size = max(float(np.linalg.norm(unit)), 1e-9)
@@ -244,7 +244,7 @@ class Execution:
             wanted *= min(1.0, max(slower, LEAST_SPEED / SPEED))
             share = np.clip((made - way[at]) / max(way[at + 1] - way[at], 1e-9), 0, 1)
             target = path[at] + share * (path[at + 1] - path[at])
-            off = np.append(target[:2] - pose[:2], _wrapped(target[2] - pose[2]))
+            off = np.append(target[:2] - pose[:2], _wrap(target[2] - pose[2]))
             velocity = wanted + np.clip(CORRECTION * off, *_both(MOST_CORRECTION))
             gripper = robot.gripper_pose
             hand = velocity_at(velocity, pose, gripper[:2])
@@ -259,7 +259,7 @@ class Execution:
         """Stop what rolls before it is let go."""
         for _ in range(round(HOLDING / self.period)):
             pose, gripper = self.now.poses[body], _robot(self.now).gripper_pose
-            off = np.append(place[:2] - pose[:2], _wrapped(place[2] - pose[2]))
+            off = np.append(place[:2] - pose[:2], _wrap(place[2] - pose[2]))
             velocity = np.clip(CORRECTION * off, *_both(MOST_CORRECTION))
             self._hand(velocity_at(velocity, pose, gripper[:2]), body)
 
@@ -282,7 +282,7 @@ class Execution:
         )
         self._step(base, joints, body)
 
-    def _wanted(
+    def _wanted_velocity(
         self, path: np.ndarray, at: int, pose: np.ndarray, gripper: np.ndarray
     ) -> np.ndarray:
         """The object's velocity (3,) here and now that the path has at step `at`."""
@@ -387,5 +387,5 @@ def _both(most: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     return -np.array(most), np.array(most)
 
 
-def _wrapped(angle: float) -> float:
+def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -179,12 +179,12 @@ def generated_room(seed: int) -> Room:
     """The room of a seed: drawn again until start and goal are apart and nothing overlaps."""
     random = np.random.default_rng([seed, 17])
     while True:
-        room = _drawn(seed, random)
+        room = _draw(seed, random)
         if room is not None and room.closed():
             return room
 
 
-def _drawn(seed: int, random: np.random.Generator) -> Room | None:
+def _draw(seed: int, random: np.random.Generator) -> Room | None:
     width, depth = random.uniform(*WIDTH), random.uniform(*DEPTH)
     count = int(random.integers(DOORS[0], DOORS[1] + 1))
     doors = _doors(depth, count, random)

@@ -85,8 +85,8 @@ class SwingDamper(FeedbackController):
             - gains.position * away
             - gains.velocity * command
         )
-        command = _shortened(
-            command + self.period * _shortened(acceleration, self._acceleration_limit),
+        command = _shorten(
+            command + self.period * _shorten(acceleration, self._acceleration_limit),
             self._speed_limit,
         )
         return (home, command, window), np.pad(command, ((0, 0), (0, 1)))
@@ -97,7 +97,7 @@ class SwingDamper(FeedbackController):
         return (seen.markers[:, 1 : last + 1].mean(1) - seen.gripper_position)[:, :2]
 
 
-def _shortened(vectors: np.ndarray, limit: float) -> np.ndarray:
+def _shorten(vectors: np.ndarray, limit: float) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors * np.minimum(1.0, limit / np.maximum(length, 1e-12))
 

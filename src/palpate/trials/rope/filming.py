@@ -72,8 +72,8 @@ def film(
         )  # fmt: skip
     with contextlib.suppress(DivergedError):  # a failure to settle
         observation = world.reset(trial.seed, start=trial.start)
-        state = _started(tracker, observation)
-        predicted = _started(alone, observation)
+        state = _start(tracker, observation)
+        predicted = _start(alone, observation)
         decide = None if policy is None else _Decisions(policy)
         for step in range(steps + 1):
             if step:
@@ -105,7 +105,7 @@ def frame_times(model: Rope) -> np.ndarray:
     configuration = RopeConfiguration()
     world = FilmedRope(configuration)
     tracker = RopeTracker(model, world.pinhole, Appearance(ROPE_COLOUR, configuration.radius))
-    _started(tracker, world.reset(0, start="half_circle"))
+    _start(tracker, world.reset(0, start="half_circle"))
     times = []
     for step in range(COMPILED + TIMED):
         observation = world.step(np.zeros(3))
@@ -116,7 +116,7 @@ def frame_times(model: Rope) -> np.ndarray:
     return np.array(times)
 
 
-def _started(tracker: RopeTracker, observation: FilmedObservation) -> RopeState:
+def _start(tracker: RopeTracker, observation: FilmedObservation) -> RopeState:
     assert observation.frame is not None  # there is one at every reset
     return tracker.start(observation.frame, observation.gripper_position)
 

@@ -57,7 +57,7 @@ def box(random: Random) -> Design:
     if kind == "lid":
         side: Side = random.choice(["top", "left", "right"], p=[0.8, 0.1, 0.1])
         parts = [door(random, top, "lid", side, material, thickness=thickness)]
-        parts += _nested(random, top, thickness, parts, material)
+        parts += _nested_flaps(random, top, thickness, parts, material)
     elif kind == "two":
         half = top.width / 2
         sides: list[Side] = ["right", "left"]
@@ -110,7 +110,7 @@ def door_frame(random: Random) -> Design:
         leaf_door = door(random, front, "leaf", side, material, thickness=thickness, inset=inset)
         parts = [leaf_door]
         face = 0.0 if inset else thickness
-        parts += _nested(random, front, face, parts, material)
+        parts += _nested_flaps(random, front, face, parts, material)
     return Design("door", tuple(body), tuple(parts), 0.0)
 
 
@@ -201,7 +201,7 @@ def refrigerator(random: Random) -> Design:
             parts.append(drawer(random, front, f"drawer {index + 1}", depth - 0.08, "sheet"))
     front = whole if kind == "one" else whole.part(0.0, 0.0, width, 0.6 * height)
     if kind in ("one", "above"):
-        parts += _nested(random, front, 0.003 + thickness, parts, "plastic")
+        parts += _nested_flaps(random, front, 0.003 + thickness, parts, "plastic")
     return Design("refrigerator", tuple(body), tuple(parts), 0.0)
 
 
@@ -245,7 +245,7 @@ def storage_furniture(random: Random) -> Design:
                 inset = chance(random, 0.3)
                 parts.append(door(random, cell, f"door {name}", hinge, material, inset=inset))
                 if not inset and len(parts) < MOST_PARTS and min(cell.width, cell.height) > 0.3:
-                    parts += _nested(random, cell, 0.023, parts, material)
+                    parts += _nested_flaps(random, cell, 0.023, parts, material)
     for column in range(columns + 1):
         at = column * (width - rails) / columns
         body.append(
@@ -273,7 +273,7 @@ CATEGORIES: dict[str, Callable[[Random], Design]] = {
 }
 
 
-def _nested(
+def _nested_flaps(
     random: Random, front: Front, face: float, parts: list[Part], material: str
 ) -> list[Part]:
     """A flap on the last of the parts, or none. That part has to carry it, too."""

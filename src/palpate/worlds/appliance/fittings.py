@@ -123,7 +123,7 @@ def door(
         resistance = replace(resistance, stiffness=stiffness, rest=uniform(random, -0.2, 0.3))
     share = math.hypot(axis[0], axis[1])  # of its weight that turns it
     weight = 0.5 * share * mass_of(shapes, DENSITIES[material]) * GRAVITY * length
-    density, resistance = _held_up(resistance, weight, length, DENSITIES[material])
+    density, resistance = _hold_up(resistance, weight, length, DENSITIES[material])
     return Part(
         name, parent, "revolute", turn * axis, position, reach, tuple(shapes), density, resistance,
         lever=length,
@@ -153,7 +153,7 @@ def drawer(
         latch, reach = uniform(random, 2.0, 7.0), uniform(random, 0.01, 0.03)
         resistance = replace(resistance, latch=latch, reach=reach)
     weight = abs(front.rotation[2, 0]) * mass_of(shapes, DENSITIES[material]) * GRAVITY
-    density, resistance = _held_up(resistance, weight, 1.0, DENSITIES[material])
+    density, resistance = _hold_up(resistance, weight, 1.0, DENSITIES[material])
     return Part(
         name, parent, "prismatic", front.rotation[:, 0], front.at(0.0, 0.5 * width, 0.5 * height),
         uniform(random, 0.55, 0.9) * depth, tuple(shapes), density, resistance,
@@ -193,7 +193,7 @@ def hatch(random: Random, front: Front, face: float, name: str, parent: int, mat
     return door(random, raised, name, side, material, parent=parent, thickness=0.012)
 
 
-def _held_up(
+def _hold_up(
     resistance: Resistance, weight: float, lever: float, density: float
 ) -> tuple[float, Resistance]:
     """A density, and resistance with the friction that keeps a part from falling.

@@ -46,7 +46,7 @@ def foreign_scene(spec: mujoco.MjSpec, file: Path, body: str | None = None) -> S
     for key in list(spec.keys):
         spec.delete(key)
     _leave_out_scenery(spec)
-    model = _compiled(spec, file)
+    model = _compile(spec, file)
     joints = [joint for joint in range(model.njnt) if int(model.jnt_type[joint]) in KINDS]
     if not joints:
         raise PalpateError(f"nothing moves in {file}: expected at least one hinge or slide")
@@ -61,11 +61,11 @@ def foreign_scene(spec: mujoco.MjSpec, file: Path, body: str | None = None) -> S
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8.0, 8.0, 0.1), pos=(0.0, 0.0, low[2] - FEET),
         contype=0, conaffinity=0, rgba=(0.8, 0.8, 0.78, 1.0),
     )  # fmt: skip
-    model = _compiled(spec, file)
+    model = _compile(spec, file)
     return _scene(body or file.stem, model, joints)
 
 
-def _compiled(spec: mujoco.MjSpec, file: Path) -> mujoco.MjModel:
+def _compile(spec: mujoco.MjSpec, file: Path) -> mujoco.MjModel:
     """A model in which what viewers hide cannot be seen."""
     try:
         model = spec.compile()

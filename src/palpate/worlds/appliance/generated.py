@@ -31,7 +31,7 @@ def generated_scene(design: Design, yaw: float) -> Scene:
     latches = [np.array([getattr(one, of) for one in resists]) for of in ("latch", "reach")]
     return Scene(
         design.category,
-        _compiled(design, yaw),
+        _compile(design, yaw),
         tuple(
             MovingPart(
                 part.name, part.parent, part.joint, 0.0, part.range, part.resistance.friction,
@@ -56,7 +56,7 @@ def _corners(shapes: Sequence[Shape]) -> Float[np.ndarray, "corners 3"]:
     return np.concatenate([corners_of(shape) for shape in shapes])
 
 
-def _compiled(design: Design, yaw: float) -> mujoco.MjModel:
+def _compile(design: Design, yaw: float) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.modelname = design.category
     spec.compiler.degree = False

@@ -60,7 +60,7 @@ class ArmMaze(BlindMaze):
     meter = World.meter  # nobody has told what gravity does
     _view = (0.0, -0.12, 0.12), 1.5, 140.0, -25.0
 
-    def _compiled(self, layout: Layout) -> mujoco.MjModel:
+    def _compile(self, layout: Layout) -> mujoco.MjModel:
         model = maze_scene(layout, _add_arm).compile()
         inverse_mass = model.body_invweight0[model.body(TIP).id, 0]
         model.pair_solref[:] = contact_solref(inverse_mass)

@@ -107,7 +107,7 @@ class PlatesWorld(World):
         self._data = mujoco.MjData(self._model)
         self._sensed = np.zeros(2)
         self._count = 0
-        return self._observed()
+        return self._observe()
 
     def step(self, action: Any) -> PlatesObservation:
         model, data, plates = self._now()
@@ -134,7 +134,7 @@ class PlatesWorld(World):
         kept = math.exp(-CONTROL_PERIOD / CORRELATION)
         kick = WANDERING * math.sqrt(1.0 - kept**2) * self._random.normal(size=2)
         self._wandered = kept * self._wandered + kick
-        return self._observed()
+        return self._observe()
 
     def truth(self) -> PlatesTruth:
         _, data, plates = self._now()
@@ -151,7 +151,7 @@ class PlatesWorld(World):
         view.distance, view.azimuth, view.elevation = 0.5, 90, -60
         return camera.picture(data, view)
 
-    def _observed(self) -> PlatesObservation:
+    def _observe(self) -> PlatesObservation:
         _, data, plates = self._now()
         force = self._sensed + plates.bias + self._wandered
         return PlatesObservation(

@@ -224,8 +224,8 @@ class RobotInScene:
     def advance(self, action: RobotAction, period: float) -> tuple[np.ndarray, np.ndarray]:
         """Run `period` seconds; returns the mean wrist wrench (3,) and base force (2,)."""
         model, data = self._model, self._data
-        base = _checked(action.base_velocity, "base_velocity")
-        joints = _checked(action.joint_velocity, "joint_velocity")
+        base = _check(action.base_velocity, "base_velocity")
+        joints = _check(action.joint_velocity, "joint_velocity")
         base[:2] *= min(1.0, BASE_SPEED / max(float(np.hypot(*base[:2])), 1e-9))
         base[2] = np.clip(base[2], -TURN_SPEED, TURN_SPEED)
         wanted = np.array([*base, *np.clip(joints, -JOINT_SPEED, JOINT_SPEED)])
@@ -346,7 +346,7 @@ class RobotInScene:
         data.eq_active[weld] = 1
 
 
-def _checked(velocity: np.ndarray, name: str) -> np.ndarray:
+def _check(velocity: np.ndarray, name: str) -> np.ndarray:
     velocity = np.array(velocity, float)
     if velocity.shape != (3,) or not np.isfinite(velocity).all():
         raise PalpateError(

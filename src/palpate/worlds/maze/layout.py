@@ -147,7 +147,7 @@ class Layout:
         number = np.arange(free.size).reshape(free.shape)
         rows, columns, lengths = [], [], []
         for step in ((1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)):
-            here, there = _shifted(step, free.shape)
+            here, there = _shift(step, free.shape)
             open_both = free[here] & free[there]
             rows.append(number[here][open_both])
             columns.append(number[there][open_both])
@@ -170,7 +170,7 @@ class Layout:
         return table[tuple(nearest)] + away, low, places.reshape(-1, 2)[way]
 
 
-def _shifted(step: tuple[int, int], shape: tuple[int, ...]) -> tuple[tuple, tuple]:
+def _shift(step: tuple[int, int], shape: tuple[int, ...]) -> tuple[tuple, tuple]:
     """Slices of all cells that have a neighbour `step` away, and of those neighbours."""
     here = [slice(max(0, -s), n - max(0, s)) for s, n in zip(step, shape, strict=True)]
     there = [slice(max(0, s), n - max(0, -s)) for s, n in zip(step, shape, strict=True)]

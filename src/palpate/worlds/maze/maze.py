@@ -142,7 +142,7 @@ class BlindMaze(TipWorld):
     def _place(self, place: np.ndarray, pushed: float) -> None:
         """A maze's engine with the constants of this episode, the tip at rest on its base."""
         if self._layout not in self._models:
-            model = self._compiled(self._layout)
+            model = self._compile(self._layout)
             self._models[self._layout] = (model, mujoco.MjData(model))
         model, data = self._model, self._data = self._models[self._layout]
         tip, block = model.body(TIP).id, model.body(BLOCK).id
@@ -169,7 +169,7 @@ class BlindMaze(TipWorld):
     _carried = TIP_MASS  # kg on the base
     _view = (0.0, 0.0, 0.0), 0.75, 90.0, -80.0
 
-    def _compiled(self, layout: Layout) -> mujoco.MjModel:
+    def _compile(self, layout: Layout) -> mujoco.MjModel:
         return maze_scene(layout).compile()
 
     def _seat(self, x: float, y: float) -> None:

@@ -121,7 +121,7 @@ class MjcfWorld(TipWorld):
         touching = (model.geom_contype | model.geom_conaffinity) != 0
         touching[model.pair_geom1] = touching[model.pair_geom2] = True
         self._unless((touching & self._own).any(), "a geom in the body `tip` that collides")
-        self._put(None)
+        self._place(None)
         self._mass = self._mass_at_start()
         self._read_sites()
         self._view = tuple(model.stat.center), 1.5 * model.stat.extent, 90.0, -60.0
@@ -151,19 +151,19 @@ class MjcfWorld(TipWorld):
         model, start = self._model, self._tip_place[:2].copy()
         self._region: np.ndarray | None = None  # (2, 2): from its middle to two of its sides, m
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, START) >= 0:
-            site = self._fixed(START)
+            site = self._id_of_body(START)
             is_box = model.site_type[site] == mujoco.mjtGeom.mjGEOM_BOX
             self._unless(is_box, f'the site `{START}` with type="box"')
             turn = self._data.site_xmat[site].reshape(3, 3)[:2, :2]
             self._region, start = turn * model.site_size[site, :2], self._data.site_xpos[site, :2]
-        site = self._fixed(GOAL)
+        site = self._id_of_body(GOAL)
         goal, radius = self._data.site_xpos[site, :2], float(model.site_size[site, 0])
         x, y = start.tolist()
         self._layout = OpenLayout(self._path.name, (x, y), (float(goal[0]), float(goal[1])), radius)
         away = math.dist(start, goal)
         self._unless(away > radius, f"a start outside the goal, not {away:.3g} m from its middle")
 
-    def _fixed(self, name: str) -> int:
+    def _id_of_body(self, name: str) -> int:
         site = self._model.site(name).id
         moves = self._model.body_weldid[self._model.site_bodyid[site]]
         self._unless(not moves, f"the site `{name}` on something that does not move")
@@ -180,12 +180,12 @@ class MjcfWorld(TipWorld):
         random = self._begin(seed)
         if start is not None:
             place = np.asarray(start, float)
-            if not (place.shape == (2,) and np.isfinite(place).all() and self._put(place)):
+            if not (place.shape == (2,) and np.isfinite(place).all() and self._place(place)):
                 raise PalpateError(
                     f"the tip of {self._path} starts at (x, y) in m, where it can be and touches "
                     f"nothing, not at {start}"
                 )
-        elif not any(self._put(self._drawn_place(random)) for _ in range(DRAWS)):
+        elif not any(self._place(self._drawn_place(random)) for _ in range(DRAWS)):
             raise PalpateError(
                 f"{self._path}: in {DRAWS} trials there was no place to start at: expected the tip "
                 f"no more than {DENT:g} m in what it touches, and joints within their limits"
@@ -202,7 +202,7 @@ class MjcfWorld(TipWorld):
                 return place
         return None if self._region is None else start + self._region @ random.uniform(-1, 1, 2)
 
-    def _put(self, place: np.ndarray | None) -> bool:
+    def _place(self, place: np.ndarray | None) -> bool:
         """Everything as the file has it, and the tip at `place`; whether it may start there."""
         model, data = self._model, self._data
         if model.nkey:

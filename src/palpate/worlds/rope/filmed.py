@@ -73,12 +73,12 @@ class FilmedRope(World):
         reach = self.control_period + 0.5 * self._sensor.exposure
         back = -np.arange(math.ceil(reach / self.control_period), -2, -1) * self.control_period
         # Before and after the start: as if it went on at its velocity.
-        self._poses = deque(((time, self._moved(time)) for time in back), maxlen=len(back))
+        self._poses = deque(((time, self._move(time)) for time in back), maxlen=len(back))
         first = self._film(0.0)
         while self._poses[-1][0] > 0:
             self._poses.pop()
         self._taken, self._waiting = 1, deque[Frame]()
-        return self._observed(observation, first)
+        return self._observe(observation, first)
 
     def step(self, action: np.ndarray) -> FilmedObservation:
         """See `RopeWorld.step`."""
@@ -93,7 +93,7 @@ class FilmedRope(World):
         ready = now - 0.5 * self._sensor.exposure - self._sensor.latency + 1e-9
         if self._waiting and self._waiting[0].time <= ready:
             frame = self._waiting.popleft()
-        return self._observed(observation, frame)
+        return self._observe(observation, frame)
 
     def truth(self) -> RopeTruth:
         return self._world.truth()
@@ -101,7 +101,7 @@ class FilmedRope(World):
     def render(self, width: int = 640, height: int = 480) -> np.ndarray:
         return self._world.render(width, height)
 
-    def _observed(self, observation, frame: Frame | None) -> FilmedObservation:
+    def _observe(self, observation, frame: Frame | None) -> FilmedObservation:
         seen = observation.time, observation.gripper_position, observation.gripper_velocity
         return FilmedObservation(*seen, frame)
 
@@ -109,7 +109,7 @@ class FilmedRope(World):
         poses = [self._pose(time + instant) for instant in self._sensor.instants]
         return self._camera.expose(poses, time, self._random)
 
-    def _moved(self, time: float) -> np.ndarray:
+    def _move(self, time: float) -> np.ndarray:
         """The present pose, moved on at its velocity for `time` seconds."""
         data = self._world._data
         pose = data.qpos.copy()

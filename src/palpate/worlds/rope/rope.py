@@ -149,7 +149,7 @@ class RopeWorld(World):
         if self.drive is not None:
             self.drive.begin()
         mujoco.mj_forward(self._model, self._data)
-        self._pull = GRIPPER_MASS * self._data.qacc[:3] - self._given()
+        self._pull = GRIPPER_MASS * self._data.qacc[:3] - self._given_force()
         self._history = [self._measure()] * (self._delay + 1)
         return self._history[0]
 
@@ -232,7 +232,7 @@ class RopeWorld(World):
             if disturbed and self.drive is not None:
                 self._pass(self.drive)
             mujoco.mj_step(self._model, data)
-            given += self._given()
+            given += self._given_force()
         # What the servo has not given to the gripper's momentum, which keeps its own weight.
         gained = GRIPPER_MASS * (data.qvel[:3] - before) / self.control_period
         self._pull = gained - given / self._steps_per_period
@@ -249,7 +249,7 @@ class RopeWorld(World):
         servo = SERVO_STIFFNESS * (data.ctrl - position) - SERVO_DAMPING * velocity
         data.qfrc_applied[:3] = drive(servo, position, velocity) - servo
 
-    def _given(self) -> np.ndarray:
+    def _given_force(self) -> np.ndarray:
         """What servo and drive have given to the gripper in the last time step, N."""
         return self._data.qfrc_actuator[:3] + self._data.qfrc_applied[:3]
 

@@ -25,7 +25,7 @@ def read_map(path: str | Path) -> Map:
     """
     path = Path(path)
     if path.is_dir():
-        raise PalpateError(f"{path} is a folder: expected a map, {_expected()}")
+        raise PalpateError(f"{path} is a folder: expected a map, {_expectation()}")
     if not path.exists():
         raise PalpateError(f"there is no file {path}")
     suffix = path.suffix.lower()
@@ -35,7 +35,7 @@ def read_map(path: str | Path) -> Map:
         return read_namosim(path) if "map_yaml" in read_map_yaml(path) else read_ros(path)
     if suffix == ".json":
         return read_described(path)
-    raise PalpateError(f"{path} has the suffix '{path.suffix}': expected {_expected()}")
+    raise PalpateError(f"{path} has the suffix '{path.suffix}': expected {_expectation()}")
 
 
 def maps_in(folder: str | Path) -> list[Path]:
@@ -65,9 +65,9 @@ def maps_in(folder: str | Path) -> list[Path]:
                 parts |= {path.parent / str(name) for name in named if name is not None}
     found = [path for path in found if path not in parts]
     if not found:
-        raise PalpateError(f"{folder} holds no map: expected {_expected()}")
+        raise PalpateError(f"{folder} holds no map: expected {_expectation()}")
     return found
 
 
-def _expected() -> str:
+def _expectation() -> str:
     return "a namosim .svg, a ROS map_server .yaml, or a .json of our own"

@@ -33,7 +33,7 @@ def path_outlines(d: str, what: str) -> list[np.ndarray]:
             f"{what} has {rest.strip()[:20]!r} in its path: expected the commands "
             "M L H V Z C S Q T A and numbers"
         )
-    tokens = _TOKEN.findall(_ARC.sub(_separated_flags, d))
+    tokens = _TOKEN.findall(_ARC.sub(_separate_flags, d))
     if not tokens or tokens[0][0] not in ("M", "m"):
         raise PalpateError(f"{what} has a path that does not begin with M: {d[:30]!r}")
     outlines: list[list[np.ndarray]] = []
@@ -59,7 +59,7 @@ def path_outlines(d: str, what: str) -> list[np.ndarray]:
             raise PalpateError(f"{what} has an arc with other flags than 0 and 1, each by itself")
         position += count
         base = here if command.islower() else np.zeros(2)
-        new, handle = _drawn(kind, numbers, here, base, handle)
+        new, handle = _draw(kind, numbers, here, base, handle)
         if kind == "M":
             begin = new[-1]
             outlines.append([])
@@ -72,7 +72,7 @@ def path_outlines(d: str, what: str) -> list[np.ndarray]:
     return [points for points in every if len(points) > 1] or every[:1]
 
 
-def _separated_flags(arc: re.Match[str]) -> str:
+def _separate_flags(arc: re.Match[str]) -> str:
     """An arc command whose flags stand apart: `a 5 5 0 01-20 20` may be written without spaces."""
     rest, separated, position, count = arc[2], [arc[1]], 0, 0
     while match := _NEXT.match(rest, position):
@@ -99,7 +99,7 @@ def _numbers(texts: list[str], what: str) -> np.ndarray:
     return numbers
 
 
-def _drawn(
+def _draw(
     kind: str, numbers: np.ndarray, here: np.ndarray, base: np.ndarray, handle: np.ndarray | None
 ) -> tuple[list[np.ndarray], np.ndarray | None]:
     """The points that a command adds, and the control point that the next one may mirror."""

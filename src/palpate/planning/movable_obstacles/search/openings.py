@@ -127,7 +127,7 @@ class OpeningSearch:
     def actions(self, state: State) -> list[Any]:
         """Grasps that can be reached, nearest to the way first; then primitives with a share."""
         if state.grasp < 0:
-            return self._ordered_grasps
+            return self._order_grasps
         # what comes last goes on until the way is open
         last, final = state.parts[-1:], len(state.parts) == _PRIMITIVES - 1
         key = state.grasp, last[0].primitive if last else None, final
@@ -165,7 +165,7 @@ class OpeningSearch:
     def act(self, state: State, action: Any) -> Step:
         """See `Domain`."""
         if state.grasp < 0:
-            return self._grasped(state, action)
+            return self._grasp(state, action)
         primitive, share = action
         key = self._key(state, primitive)
         if key not in self._sweeps:
@@ -214,7 +214,7 @@ class OpeningSearch:
         return {int(k): float(bounds[k]) for k in np.flatnonzero(~hit & (bounds < math.inf))}
 
     @cached_property
-    def _ordered_grasps(self) -> list[int]:
+    def _order_grasps(self) -> list[int]:
         return sorted(self._grasp_bounds, key=lambda index: self._grasp_bounds[index])
 
     def approach(self, grasp: int) -> float:
@@ -233,7 +233,7 @@ class OpeningSearch:
         grasp, approach = self.grasps[state.grasp], self.approach(state.grasp)
         return Opening(self.name, grasp, way, approach, cost, probability, energy, state.parts)
 
-    def _grasped(self, state: State, grasp: int) -> Step:
+    def _grasp(self, state: State, grasp: int) -> Step:
         length = self.approach(grasp)
         if length == math.inf:
             return Step(state, 0.0)
@@ -258,7 +258,7 @@ class OpeningSearch:
             index = self._passage.first_open(motion, onward, begin, sweep.limit)
             if index is None:
                 break
-            opened = self._released(state, primitive, sweep, index, float(onward[index]))
+            opened = self._release(state, primitive, sweep, index, float(onward[index]))
             if opened is not None:
                 return dataclasses.replace(sweep, limit=index, opened=opened)
             begin = index + 1
@@ -292,7 +292,7 @@ class OpeningSearch:
                 break
         return done
 
-    def _released(
+    def _release(
         self, state: State, primitive: Primitive, sweep: _Sweep, index: int, limit: float
     ) -> Step | None:
         """The end of a rollout; None unless the robot gets to the aim within `limit` m."""

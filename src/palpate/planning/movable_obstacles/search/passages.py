@@ -56,11 +56,11 @@ class Passage:
         looks = np.arange(begin + _STRIDE - 1, stop, _STRIDE)
         if stop > begin and (not len(looks) or looks[-1] != stop - 1):
             looks = np.append(looks, stop - 1)
-        open_at = self._opened(motion, limits, looks)
+        open_at = self._first_opening(motion, limits, looks)
         if open_at is None:
             return None
         between = np.arange(max(begin, open_at - _STRIDE + 1), open_at)
-        earlier = self._opened(motion, limits, between)
+        earlier = self._first_opening(motion, limits, between)
         return open_at if earlier is None else earlier
 
     def onward(self, object_pose: np.ndarray, robot_pose: np.ndarray, limit: float) -> float:
@@ -83,7 +83,7 @@ class Passage:
         ways = distances(after, part, robot_pose, free, self._held, standing=True, limit=limit)
         return ways.to(self._towards, self._passed)
 
-    def _opened(self, motion: Motion, limits: np.ndarray, looks: np.ndarray) -> int | None:
+    def _first_opening(self, motion: Motion, limits: np.ndarray, looks: np.ndarray) -> int | None:
         """The first of the steps `looks` at which free cells join the robot's place to the aim."""
         if not len(looks):
             return None

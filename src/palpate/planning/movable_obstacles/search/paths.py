@@ -220,7 +220,7 @@ def straighten(space: Space, points: np.ndarray, first: Allowed, last: Allowed) 
     """
     for finer in (False, True):
         if finer:
-            points = _resampled(points, space.cell / 2)
+            points = _resample(points, space.cell / 2)
         kept, here = [0], 0
         while here < len(points) - 1:
             ahead = np.arange(here + 1, len(points))
@@ -228,21 +228,21 @@ def straighten(space: Space, points: np.ndarray, first: Allowed, last: Allowed) 
             straight = lines(ways)
             begin = first if here == 0 else _NOTHING
             seen = clear(space, straight, begin)
-            seen[-1] |= clear(space, straight[-1:], _joined(begin, last))[0]
+            seen[-1] |= clear(space, straight[-1:], _join(begin, last))[0]
             here = int(ahead[seen][-1]) if seen.any() else here + 1
             kept.append(here)
         points = points[kept]
     return points
 
 
-def _joined(one: Allowed, other: Allowed) -> Allowed:
+def _join(one: Allowed, other: Allowed) -> Allowed:
     """What either of them allows."""
     walls = {k: min(gap, one.walls.get(k, gap)) for k, gap in other.walls.items()}
     objects = {k: min(gap, one.objects.get(k, gap)) for k, gap in other.objects.items()}
     return Allowed(one.walls | walls, one.objects | objects)
 
 
-def _resampled(points: np.ndarray, spacing: float) -> np.ndarray:
+def _resample(points: np.ndarray, spacing: float) -> np.ndarray:
     """The corners and points between them, at most `spacing` apart."""
     parts = [points[:1]]
     for begin, end in pairwise(points):

@@ -76,29 +76,29 @@ class Planner:
         if len(self._known) > _MOST_KNOWN:
             self._known.clear()
         self._sizes = {"regions": 0, "borders": 0, "evaluations": 0, "sweeps": 0}
-        done = self._found(world, goal, fixed, _HALVINGS)
+        done = self._find(world, goal, fixed, _HALVINGS)
         return Plan(world.name, goal, tuple(done.segments), planning_clock() - began, self._sizes)
 
     # --- above --------------------------------------------------------------------------------
 
-    def _found(self, world: Map, goal: Pose, fixed: set[str], halvings: int) -> Progress:
+    def _find(self, world: Map, goal: Pose, fixed: set[str], halvings: int) -> Progress:
         """The situation at the goal; raises `NoWayError`."""
         self._world = static_map(world)
         begin = Progress(Space(world, fixed), np.array(world.start))
         try:
-            return self._planned(begin, goal, regrasps=False)
+            return self._plan(begin, goal, regrasps=False)
         except WalledError:
             finer = world.finer if halvings else None
             if finer is None:
                 raise
         except NoWayError as closed:
             try:
-                return self._planned(begin, goal, regrasps=True)
+                return self._plan(begin, goal, regrasps=True)
             except NoWayError:
                 raise closed from None
-        return self._found(finer, goal, fixed, halvings - 1)
+        return self._find(finer, goal, fixed, halvings - 1)
 
-    def _planned(self, now: Progress, goal: Pose, regrasps: bool) -> Progress:
+    def _plan(self, now: Progress, goal: Pose, regrasps: bool) -> Progress:
         """The situation at the goal, stage by stage; raises `NoWayError`."""
         world = now.space.map
         least, stale = np.inf, 0
@@ -138,7 +138,7 @@ class Planner:
             for move in moves:
                 resolved = self._resolve(ahead, move, _DEPTH)
                 if resolved is None and regrasps:
-                    resolved = self._regrasped(ahead, move)
+                    resolved = self._regrasp(ahead, move)
                 if resolved is None:
                     graph.fail(move.action)
                     failed = True
@@ -176,12 +176,12 @@ class Planner:
         others = set(ahead.space.movables) - {move.name}
         near = at_hand(ahead) & others
         for away in (near, others) if near != others else (others,):
-            resolved = self._cleared(ahead, move, away, depth) if away else None
+            resolved = self._clear(ahead, move, away, depth) if away else None
             if resolved is not None:
                 return resolved
         return None
 
-    def _cleared(self, ahead: Progress, move: Move, away: set[str], depth: int) -> Progress | None:
+    def _clear(self, ahead: Progress, move: Move, away: set[str], depth: int) -> Progress | None:
         """The move, planned as if the objects `away` were not there, and these put aside first."""
         alone = Progress(ahead.space.without(away), ahead.robot)
         lone_move = dataclasses.replace(move, ignored=move.ignored - away)
@@ -206,7 +206,7 @@ class Planner:
         opening = self._open(ahead, move)
         return None if opening is None else carry_out(ahead, opening)
 
-    def _regrasped(self, ahead: Progress, move: Move) -> Progress | None:
+    def _regrasp(self, ahead: Progress, move: Move) -> Progress | None:
         """The move in two carries of the same object, the cheaper the better."""
         found = []
         for stop in self._stops(ahead, move):

@@ -37,7 +37,7 @@ def faults_of(plan: Plan, world: Map) -> list[str]:
 
 def _faults(plan: Plan, world: Map) -> Iterator[str]:
     standing = {
-        name: _turned(movable.outline, movable.pose) for name, movable in world.movables.items()
+        name: _turn(movable.outline, movable.pose) for name, movable in world.movables.items()
     }
     robot = np.array(world.start)
     released: str | None = None
@@ -59,7 +59,7 @@ def _faults(plan: Plan, world: Map) -> Iterator[str]:
         if name not in standing or segment.object_poses is None or segment.grasp is None:
             yield f"{what}: holds nothing that is on the map"
             continue
-        body = _turned(world.movables[name].outline, segment.object_poses[0])
+        body = _turn(world.movables[name].outline, segment.object_poses[0])
         if body.symmetric_difference(standing[name]).area > 1e-6 + 1e-6 * body.area:
             yield f"{what}: '{name}' does not stand where it is taken up"
         hold = segment.grasp.robot_pose(segment.object_poses[0], world.robot.radius + world.reach)
@@ -68,7 +68,7 @@ def _faults(plan: Plan, world: Map) -> Iterator[str]:
         others = {other: shape for other, shape in standing.items() if other != name}
         yield from (f"{what}: {fault}" for fault in _disc(segment, world, others, set()))
         yield from (f"{what}: {fault}" for fault in _body(segment, world, others, body))
-        standing[name] = _turned(world.movables[name].outline, segment.object_poses[-1])
+        standing[name] = _turn(world.movables[name].outline, segment.object_poses[-1])
         released = name
     if np.abs(robot[:2] - np.array(plan.goal[:2])).max() > _JOINED:
         yield "the plan does not end at the goal"
@@ -76,7 +76,7 @@ def _faults(plan: Plan, world: Map) -> Iterator[str]:
         yield "the plan does not end in the goal's direction"
 
 
-def _turned(outline: np.ndarray, pose: np.ndarray | tuple[float, ...]) -> Polygon:
+def _turn(outline: np.ndarray, pose: np.ndarray | tuple[float, ...]) -> Polygon:
     turned = affinity.rotate(Polygon(outline), float(pose[2]), origin=(0, 0), use_radians=True)
     return affinity.translate(turned, float(pose[0]), float(pose[1]))
 
@@ -172,10 +172,10 @@ def _swept(outline: np.ndarray, poses: np.ndarray) -> BaseGeometry:
         pieces = max(1, math.ceil(abs(there[2] - here[2]) / finest))
         shares = np.linspace(0, 1, pieces + 1)[:, None]
         between = here + shares * (there - here)
-        corners = np.stack([np.asarray(_turned(outline, pose).exterior.coords) for pose in between])
+        corners = np.stack([np.asarray(_turn(outline, pose).exterior.coords) for pose in between])
         first, second = corners[:-1], corners[1:]
         quads = np.stack([first[:, :-1], first[:, 1:], second[:, 1:], second[:, :-1]], axis=2)
         hulls = shapely.convex_hull(polygons(quads.reshape(-1, 4, 2)))
         parts.append(shapely.union_all([*hulls.tolist(), Polygon(corners[0])]))
-    parts.append(_turned(outline, poses[-1]))
+    parts.append(_turn(outline, poses[-1]))
     return shapely.union_all(parts)

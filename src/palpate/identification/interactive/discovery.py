@@ -283,9 +283,8 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
         carried = part.parent == carrier
         now = dataclasses.replace(part, positions=list(part.positions))
         other = _hang(tree, part, tree.parts[carrier].parent if carried else carrier, first)
-        before = _evidence_with(
-            tree, number, now, gone
-        )  # as free to be elsewhere as on the carrier
+        # as free to be elsewhere as on the carrier
+        before = _evidence_with(tree, number, now, gone)
         gain = _evidence_with(tree, number, other, gone) - before
         beside = (
             not carried

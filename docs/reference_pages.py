@@ -51,7 +51,7 @@ STAGES = {
         *("identification.interactive.explanation", "identification.interactive.discovery"),
         *("identification.interactive.shape", "identification.interactive.registration"),
         *("identification.interactive.handling", "identification.interactive.splitting"),
-        "identification.interactive.averaging",
+        *("identification.interactive.averaging", "identification.interactive.duplicates"),
         *("identification.interactive.screws", "identification.interactive.labels"),
         *("identification.interactive.refinement", "identification.interactive.description"),
         *("identification.interactive.resistance", "identification.interactive.dynamics"),

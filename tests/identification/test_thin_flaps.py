@@ -7,11 +7,11 @@ import pytest
 
 from depth_scenes import depth_of
 from palpate.identification.interactive.averaging import average
+from palpate.identification.interactive.duplicates import merge_same
 from palpate.identification.interactive.labels import height_evidence, scores
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Estimate
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw
-from palpate.identification.interactive.splitting import merge_same
 from palpate.identification.interactive.tree import PartTree
 from palpate.numerics.pinhole import Pinhole
 from palpate.perception.clouds import Cloud, cloud_of
@@ -135,7 +135,7 @@ def test_a_closed_flap_is_told_from_its_door_by_the_height_of_its_face():
     given = scores(looks[0], looks[1:], motions)
     # both faces are where points are on a surface: of the door's, that tells nothing more
     assert np.median(given[2, own] - given[1, own]) == 0.0
-    found = height_evidence(looks[0], looks[1:], motions, given, 2, 1)
+    found = height_evidence(looks[0], looks[1:], [motions[2], motions[1]], given, 2, 1)
     off_hinge = own & (looks[0].points[:, 1] > 0.0)
     assert np.mean(found[off_hinge] > 0.5) > 0.9
     away = looks[0].points[:, 0] < -0.2

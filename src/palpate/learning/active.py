@@ -27,7 +27,7 @@ from palpate.perception.clouds import Cloud
 from palpate.perception.surface_features import features_of
 from palpate.perception.surfaces import STANDS_OFF, Surface, surfaces
 
-JOINT = 10.0  # nats that a joint is worth which was not known
+JOINT = 15.0  # nats that a joint is worth which was not known
 FORCES = 4.0  # nats that are worth masses and what resists one way, where no long way went there
 LONG = 0.1  # m of a way that tells them
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
@@ -41,6 +41,7 @@ ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an
 GIVES = 0.17  # share of a hand's force at which a part goes where its lever is longest, as a rule
 BLOCKED = 0.05  # rad or m: with no more room a part stays where it is
 TURNED = 0.3  # rad or m that a part has to go to hide what is on it
+AT_HINGE, MOST = 0.06, 0.8  # m from an axis, and share of a surface's points that are so near it
 LATER = 0.5  # what a try is worth that has to wait for another pull
 ASIDE = 0.3  # how much to the side of the normal a hand also pulls, which tries two joints at once
 
@@ -128,7 +129,7 @@ def _tries(
     known = 1.0 + len(twin.parts)
     trust = known / (known + failed.sum() - failed)
     for surface, chance, (pulls, missed) in zip(every, trust * before, tried, strict=True):
-        if part not in (None, surface.part):
+        if part not in (None, surface.part) or _is_at_hinge(twin, surface, cloud, look):
             continue
         belief = movable.posterior(movable.prior(float(chance)), surface, pulls)
         points, directions = _grips(cloud, surface)
@@ -165,14 +166,36 @@ def _hidden_tries(
     twin: Twin, look: int, random: np.random.Generator, guess: MovableGuess, worth: Worth
 ) -> dict[tuple[int, float], float]:
     """What it is worth to take a part (its number) one way (1 or -1), back to where it was seen
-    first: what is on it may be hidden now."""
+    first: what is on it, and worth more than what is seen of it now, may be hidden."""
     found: dict[tuple[int, float], float] = {}
     for number, part in enumerate(twin.parts):
-        way = part.positions[part.shown] - part.positions[look]
-        if abs(way) > TURNED:
-            tries = _tries(twin, part.shown, random, guess, worth, number)
-            found[number, math.copysign(1.0, way)] = LATER * max([0.0, *(one for one, _ in tries)])
+        places = np.array(part.positions)
+
+        def best(at: int, number: int = number) -> float:
+            tries = _tries(twin, at, random, guess, worth, number)
+            return max([0.0, *(value for value, _ in tries)])
+
+        for earlier in np.unique(np.round(places / TURNED), return_index=True)[1]:
+            way = float(places[earlier] - places[look])
+            if abs(way) > TURNED and (value := best(int(earlier))) > best(look):
+                side = number, math.copysign(1.0, way)
+                found[side] = max(LATER * value, found.get(side, 0.0))
     return found
+
+
+def _is_at_hinge(twin: Twin, surface: Surface, cloud: Cloud, look: int) -> bool:
+    """Whether a surface of no part is a strip along the hinge of one, where that hardly moves."""
+    points = cloud.points[surface.members]
+    for number in range(len(twin.parts)) if surface.part < 0 else ():
+        screw = twin.screw(number, look)
+        away = np.linalg.norm(np.cross(points - screw.point, screw.axis), axis=1)
+        if screw.joint == "revolute" and np.mean(away < AT_HINGE) > MOST:
+            own = twin.pose(number, look).at(twin.parts[number].support[0])
+            along = (points - screw.point) @ screw.axis
+            there = (own - screw.point) @ screw.axis
+            if np.mean((along > there.min()) & (along < there.max())) > MOST:
+                return True
+    return False
 
 
 def _force_before_carrier(

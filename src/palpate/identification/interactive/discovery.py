@@ -11,15 +11,20 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
-from palpate.identification.interactive.explanation import FURTHER, joint_of_ways, labels_near
+from palpate.identification.interactive.explanation import (
+    FURTHER,
+    OPEN,
+    joint_of_ways,
+    labels_near,
+)
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import LEAST_MOTION, distinguishing_looks, evidence
-from palpate.identification.interactive.part import Part, support_of
+from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge, support_of
 from palpate.identification.interactive.refinement import Estimate, refine, sighting, surprise
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.identification.interactive.tree import FEWEST, Candidate, PartTree
 
-TELLS = 0.02  # m that a hand has to go to tell of a joint that is not known
+TELLS = 0.03  # m that a hand has to go to tell of a joint that is not known
 WITHIN = 0.6  # share of a part's points that make it a part of another
 LITTLE = 0.05  # m that a hand has taken a part: too little was known of it to know it again
 STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see `surprise`)
@@ -44,18 +49,26 @@ class Discovery:
     masks: list[Int[np.ndarray, " _"]]
 
 
-def discover(tree: PartTree, before: int, after: int, handling: Handling) -> bool:
+def discover(
+    tree: PartTree, before: int, after: int, handling: Handling, *, carried: bool = False
+) -> bool:
     """Whether a new part explains what moved with the hand; it is the tree's last one then.
 
-    Parts that turn out to be a piece of it are taken out of the tree.
+    Parts that turn out to be a piece of it are taken out of the tree. One that has to be `carried`
+    is sought on known parts alone.
     """
     way = handling.points
-    found = _best(tree, before, after, -1, way, screws_of_way(way))
-    if found is not None and (known := _parts_that_contradict(tree, before, after, found, way)):
-        if len(known) > 1 or not _is_hinged_on(tree, known[0], before, found.estimate.screw):
-            return False  # both have moved, and their way looks like a circle
-        tree.parts[known[0]].positions[after] = tree.parts[known[0]].positions[before]
-        found = dataclasses.replace(found, carrier=known[0])
+    found = None if carried else _best(tree, before, after, -1, way, screws_of_way(way))
+    if found is not None and (known := _find_known(tree, before, found)) is not None:
+        if joint_of_ways(tree, known, [*known.ways, (before, way)]) is not None:
+            return False  # it went as a known part does, which clouds show elsewhere
+        found = None  # what is on it has moved as well
+    if found is not None and (others := _parts_that_contradict(tree, before, after, found, way)):
+        if len(others) == 1 and _is_hinged_on(tree, others[0], before, after, found):
+            tree.parts[others[0]].positions[after] = tree.parts[others[0]].positions[before]
+            found = dataclasses.replace(found, carrier=others[0])
+        else:
+            found = None  # both have moved, and their way looks like a circle
     if found is None:
         near = [one for one in labels_near(tree, before, handling.push.point) if one >= 0]
         options = (_on_carrier(tree, before, after, carrier, way) for carrier in near)
@@ -74,6 +87,11 @@ def _on_carrier(
     places = tree.parts[carrier].positions
     if abs(places[after] - places[before]) < LEAST_MOTION or math.dist(*ends) < TELLS:
         return None
+    short = np.repeat(ends, 3, axis=0)
+    followed = screws_of_way(on_moving_carrier(tree, before, after, carrier, way))[:1]
+    found = _best(tree, before, after, carrier, short, followed)
+    if found is not None:
+        return found
     cloud = tree.looks[before]
     lost = tree.unexplained(Candidate(NOWHERE, before, after), before)
     lost &= np.linalg.norm(cloud.points - ends[0], axis=1) < AROUND
@@ -86,7 +104,25 @@ def _on_carrier(
         return float(np.sum(evidence(tree.looks[after], pose.at(points), pose.turned(normals))))
 
     best = sorted(_joining(*ends), key=value, reverse=True)[:TRIED]
-    return _best(tree, before, after, carrier, np.repeat(ends, 3, axis=0), best)
+    found = _best(tree, before, after, carrier, short, best)
+    return found if found is not None and found.estimate.intervals[0] < UNSURE else None
+
+
+def on_moving_carrier(
+    tree: PartTree, before: int, after: int, carrier: int, way: Float[np.ndarray, "times 3"]
+) -> Float[np.ndarray, "times 3"]:
+    """A hand's way as if its carrier had stayed, which went along with it step by step, about."""
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    part, there = tree.parts[carrier], tree.pose(carrier, before)
+    base = tree.pose(part.parent, before)
+    places = part.positions[before] + gone / gone[-1] * (
+        part.positions[after] - part.positions[before]
+    )
+    found = [
+        (there @ (base @ part.screw.pose(float(place))).inverse).at(point[None])[0]
+        for place, point in zip(places, way, strict=True)
+    ]
+    return np.array(found)
 
 
 def _joining(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> list[Screw]:
@@ -223,21 +259,50 @@ def _parts_that_contradict(
     new: Discovery,
     way: Float[np.ndarray, "times 3"],
 ) -> list[int]:
-    """Parts that look like a piece of a new one, and are known by ways that no joint has which goes
-    the new way as well: a lid and a leaf on it are one surface."""
+    """Parts that look like a piece of a new one, or that it looks like a piece of, and that are
+    known by ways which no joint has that goes the new way as well: a lid and its leaf look like one
+    surface."""
+    held = labels_near(tree, before, way[0])[:1]
+    taken = tree.labels[before][new.masks[0]]
+    pieces = [one for one in held if one >= 0 and np.sum(taken == one) >= WITHIN * len(taken)]
     return [
         number
-        for number in _relatives(tree, before, after, new)[2]
+        for number in {*pieces, *_relatives(tree, before, after, new)[2]}
         if len(ways := tree.parts[number].ways) >= SETTLED
         and joint_of_ways(tree, tree.parts[number], [*ways, (before, way)]) is None
     ]
 
 
-def _is_hinged_on(tree: PartTree, part: int, look: int, screw: Screw) -> bool:
-    """Whether what a joint carries turns about a line on a part."""
-    away = tree.looks[look].points[tree.labels[look] == part] - screw.point
-    nearest = np.linalg.norm(np.cross(away, screw.axis), axis=1).min()
-    return screw.joint == "revolute" and bool(nearest < TOUCHES)
+def _find_known(tree: PartTree, before: int, new: Discovery) -> Part | None:
+    """The known part that a new one is made of points of, and turns about the hinge of."""
+    taken, screw = tree.labels[before][new.masks[0]], new.estimate.screw
+    for number, part in enumerate(tree.parts):
+        own = (taken == number) | np.isin(taken, _carried_by(tree, number))
+        if (
+            len(part.ways) >= SETTLED
+            and screw.joint == "revolute"
+            and np.sum(own) > WITHIN * len(taken)
+            and is_same_hinge(screw, tree.screw(number, before), *part.estimate.intervals)
+        ):
+            return part
+    return None
+
+
+def _carried_by(tree: PartTree, part: int) -> list[int]:
+    """What a part carries, on other parts or by itself."""
+    return [number for number in range(len(tree.parts)) if part in tree.carriers(number)]
+
+
+def _is_hinged_on(tree: PartTree, part: int, before: int, after: int, new: Discovery) -> bool:
+    """Whether a new part turns about a line on another one, the rest of which has stayed."""
+    cloud, screw = tree.looks[before], new.estimate.screw
+    own = np.flatnonzero(tree.labels[before] == part)
+    nearest = np.linalg.norm(np.cross(cloud.points[own] - screw.point, screw.axis), axis=1).min()
+    rest = np.setdiff1d(own, new.masks[0])
+    if screw.joint != "revolute" or nearest > TOUCHES or len(rest) < FEWEST:
+        return False
+    stayed = evidence(tree.looks[after], cloud.points[rest], cloud.normals[rest])
+    return bool(np.mean(stayed) > OPEN)
 
 
 def _carries(

@@ -8,20 +8,25 @@ from jaxtyping import Float
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import LEAST_MOTION
 from palpate.identification.interactive.part import Part
-from palpate.identification.interactive.refinement import Estimate, Way, refine, surprise
+from palpate.identification.interactive.refinement import Estimate, Way, misfit, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
 from palpate.identification.interactive.tree import NOT_MOVED, Candidate, PartTree
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
 FURTHER = 1.5  # rad or m that a part may have been beyond where it was seen
+MISFIT = 1.1  # of each of a hand's ways, for the joint that they say is theirs: at most .91 of 85
 SHORT = 0.05  # m that a hand went: a way so short fits many joints
+TOGETHER = 0.02  # of the travel: how far two joints may miss the hand, beside the metres below
+OPEN = -1.0  # of evidence, for each point: what has less is not where it is believed to be
+MOMENTS, STEPS = 25, 5  # of a hand's way, and of Gauss-Newton at each
+SMALL, DAMPED, MOST_STEP = 1e-5, 1e-5, 0.2  # rad or m, m^2, rad or m
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 
 
 def find_moved_part(tree: PartTree, before: int, after: int, handling: Handling) -> int:
     """The part that moved with the hand, which has one way more; -1 if none that is known has."""
-    for explain in (_by_way, _by_clouds, _by_all_ways):
+    for explain in (_by_way, _by_two_joints, _by_clouds, _by_all_ways):
         if (part := explain(tree, before, after, handling)) >= 0:
             return part
     return -1
@@ -79,6 +84,8 @@ def _by_way(tree: PartTree, before: int, after: int, handling: Handling) -> int:
         way = tree.pose(one.parent, before).inverse.at(handling.points)
         if surprise(one.estimate, way) > SURPRISE:
             continue
+        if joint_of_ways(tree, one, [*one.ways, (before, handling.points)]) is None:
+            continue
         if _follows_hand(tree, part, before, after, handling):
             one.ways.append((before, handling.points))
             return part
@@ -104,6 +111,68 @@ def _follows_hand(tree: PartTree, part: int, before: int, after: int, handling: 
         return True
     one.positions[after] = alone
     return False
+
+
+def _by_two_joints(tree: PartTree, before: int, after: int, handling: Handling) -> int:
+    """The part that the hand was put to, if it went as the joints of that and of what carries it
+    let it go together, and both are there."""
+    for part in labels_near(tree, before, handling.push.point):
+        if part < 0 or (carrier := tree.parts[part].parent) < 0:
+            continue
+        ends = two_positions(tree, part, before, handling)
+        if ends is None:
+            continue
+        both = tree.parts[carrier], tree.parts[part]
+        kept = [one.positions[after] for one in both]
+        for one, end in zip(both, ends, strict=True):
+            one.positions[after] = end
+        seen = [
+            float(tree.seen_at(number, after, np.array([end]))[0])
+            for number, end in zip((carrier, part), ends, strict=True)
+        ]
+        own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
+        if min(seen) > OPEN and not any(
+            tree.much_is_left(candidate, look, own) for look in (before, after)
+        ):
+            both[1].ways.append((before, handling.points))
+            return part
+        for one, place in zip(both, kept, strict=True):
+            one.positions[after] = place
+    return -1
+
+
+def two_positions(
+    tree: PartTree, part: int, before: int, handling: Handling
+) -> tuple[float, float] | None:
+    """Where the hand has taken a part's carrier and the part on it (rad or m); None if their joints
+    do not let it go there.
+
+    Three coordinates of each point of its way are to be explained by two positions (Gauss-Newton,
+    from those of the point before).
+    """
+    upper, lower = tree.parts[tree.parts[part].parent], tree.parts[part]
+    base = tree.pose(upper.parent, before)
+    places = np.array([upper.positions[before], lower.positions[before]])
+    way = handling.points[np.linspace(0, len(handling.points) - 1, MOMENTS).astype(int)]
+    start = tree.pose(part, before).inverse.at(handling.points[:3].mean(axis=0)[None])
+
+    def there(at: np.ndarray) -> np.ndarray:
+        pose = base @ upper.screw.pose(float(at[0])) @ lower.screw.pose(float(at[1]))
+        return pose.at(start)[0]
+
+    most = EXPLAINED[0] + TOGETHER * handling.travel
+    most *= 0.5 if lower.provisional else 1.0
+    for point in way:
+        for _ in range(STEPS):
+            here = there(places)
+            slopes = np.stack([there(places + one) - here for one in SMALL * np.eye(2)], axis=1)
+            slopes /= SMALL
+            square = slopes.T @ slopes + DAMPED * np.eye(2)
+            step = np.linalg.solve(square, slopes.T @ (point - here))
+            places = places + np.clip(step, -MOST_STEP, MOST_STEP)
+        if np.linalg.norm(there(places) - point) > most:
+            return None
+    return float(places[0]), float(places[1])
 
 
 def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) -> int:
@@ -138,7 +207,7 @@ def joint_of_ways(tree: PartTree, part: Part, ways: list[Way]) -> Estimate | Non
     found = [
         refine(screw, np.zeros(looks), [None] * looks, ways) for screw in screws_of_way(longest)
     ]
-    found = [one for one in found if all(surprise(one, way) < SURPRISE for _, way in ways)]
+    found = [one for one in found if all(misfit(one.screw, way) < MISFIT for _, way in ways)]
     return min(found, key=lambda one: one.criterion, default=None)
 
 
@@ -156,8 +225,10 @@ def _by_clouds(tree: PartTree, before: int, after: int, handling: Handling) -> i
     if not misses or min(misses.values()) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
         return -1
     part = min(misses, key=lambda number: misses[number])
-    way = tree.way_from(tree.parts[part].parent, before, handling.points)
-    if surprise(tree.parts[part].estimate, way) > SURPRISE:
+    one, new = tree.parts[part], (before, handling.points)
+    if surprise(one.estimate, tree.way_from(one.parent, *new)) > SURPRISE:
         return -1
-    tree.parts[part].ways.append((before, handling.points))
+    if joint_of_ways(tree, one, [*one.ways, new]) is None:
+        return -1
+    one.ways.append(new)
     return part

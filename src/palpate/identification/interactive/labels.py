@@ -35,6 +35,7 @@ MOST_OF_HEIGHT = 1.5  # of evidence, of each look: what the height of its surfac
 
 OTHERS = 6  # looks that a look is held against
 LEAST_MOTION = 0.02  # rad or m: less is none
+HARDLY = 3.0  # times as far as one part another one moves alone: where it was is not quite known
 TELLING = 0.3  # rad or m of a part: to be further away tells no more
 
 Scores = Float[np.ndarray, "labels points"]
@@ -102,7 +103,7 @@ def height_evidence(
     carrier: int,
 ) -> Float[np.ndarray, " points"]:
     """How much likelier each point is of the label of a part than of its carrier's (logarithm), by
-    how high the surface is where either label takes it.
+    how high the surface is where either label takes it: `motions` of both, to each other look.
 
     A flap stands off its door by less than a point may be off its surface, where a joint is not
     known well. But the carrier's joint takes points of both labels as far off: their difference
@@ -113,7 +114,7 @@ def height_evidence(
     unsure = np.abs(given[part] - given[carrier]) < SURE
     chosen = np.flatnonzero((best >= given.max(axis=0)) & unsure)
     for number, other in enumerate(others):
-        poses = motions[part][number], motions[carrier][number]
+        poses = motions[0][number], motions[1][number]
         if not len(chosen) or _same(*poses):
             continue
         # near a hinge both are the same place, but for what is not known of the hinge
@@ -141,8 +142,8 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
     count = places.shape[1]
     moved = np.minimum(np.abs(places - places[:, look, None]), TELLING)
     moved = np.concatenate([np.zeros((1, count)), moved])  # what stands still
-    # of each pair of labels, how far the first moves where the second stands still, or moves
-    alone = moved[:, None] * (moved[None] < LEAST_MOTION)
+    # of each pair of labels, how far the first moves where the second hardly does, or moves as well
+    alone = np.maximum(moved[:, None] - HARDLY * moved[None], 0.0)
     value = np.concatenate([alone, 0.5 * np.minimum(moved[:, None], moved[None])])
     covered, chosen = np.zeros(value.shape[:2]), []
     while len(chosen) < OTHERS:

@@ -11,6 +11,9 @@ from palpate.identification.interactive.screws import Pose, Screw
 from palpate.perception.clouds import Cloud
 
 SUPPORT = 200  # points of a look that a position is looked for with
+UNSURE = 45.0  # deg: a part whose axis is less known than so is shown by no two looks
+LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
+HINGE = 0.05  # m between the axes of what turns about one hinge
 
 Support = tuple[Float[np.ndarray, "support 3"], Float[np.ndarray, "support 3"]]
 
@@ -75,3 +78,12 @@ def support_of(
         found.append((pose.at(cloud.points[chosen]), pose.turned(cloud.normals[chosen])))
     points, normals = zip(*found, strict=True)
     return np.concatenate(points), np.concatenate(normals)
+
+
+def is_same_hinge(hinge: Screw, other: Screw, turned: float = 0.0, aside: float = 0.0) -> bool:
+    """Whether another joint turns about the same line as a hinge, as well as edges are known, or
+    less well by as much as the other is `turned` (deg) and `aside` (m)."""
+    away = np.linalg.norm(np.cross(hinge.point - other.point, other.axis))
+    angle = np.degrees(np.arccos(min(abs(float(hinge.axis @ other.axis)), 1.0)))
+    alike = angle < min(np.degrees(np.arccos(LIKE)) + turned, UNSURE)
+    return other.joint == "revolute" and bool(alike and away < HINGE + aside)

@@ -284,6 +284,12 @@ def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
     return float((standard @ standard - explained) / len(standard))
 
 
+def misfit(screw: Screw, way: Float[np.ndarray, "times 3"]) -> float:
+    """How far a way is from those of a joint, for errors of the hand alone: about .5."""
+    standard = _whiten(screw, way)[1]
+    return float(standard @ standard) / len(standard)
+
+
 def way_information(screw: Screw, way: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "4 4"]:
     """What one more way of a hand would say of a joint's four numbers (Fisher information)."""
     rows, _ = _whiten(screw, way)

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from palpate.identification.interactive.discovery import Discovery, insert
+from palpate.identification.interactive.duplicates import merge_same
 from palpate.identification.interactive.explanation import FURTHER
 from palpate.identification.interactive.labels import ON, TOLERANCE, evidence
-from palpate.identification.interactive.part import Part
+from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge
 from palpate.identification.interactive.refinement import NEAR, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.tree import FEWEST, UNEXPLAINED, PartTree
@@ -31,9 +32,6 @@ TURNS = np.arange(-2.2, 2.21, 0.1)  # rad
 TRIED = 3  # of the options, the best
 LEAST_EVIDENCE = 500.0  # of evidence, of all points and looks
 SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enough
-UNSURE = 45.0  # deg: a part whose axis is less known than so is shown by no two looks
-LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
-HINGE = 0.05  # m between the axes of what turns about one hinge
 LARGEST = 0.5  # of a carrier's points in a look: a piece that is larger is no part on it
 GROWN = 2.5  # of a piece's points: a part that takes more there is not what was tried
 MOST = 0.75  # share of a carrier's points that a part on it may take
@@ -143,7 +141,7 @@ def _add_options(
                     Option(look, pieces[number], carrier, screw)
                     for screw in _edges(pieces[number].surface)
                     # about the carrier's own hinge it would be beside the carrier, not on it
-                    if not _is_same(screw, tree.screw(carrier, look))
+                    if not is_same_hinge(screw, tree.screw(carrier, look))
                 ],
             )
             for option in options:
@@ -180,15 +178,6 @@ def _edges(surface: Surface) -> list[Screw]:
             point = surface.centre + place @ surface.sides
             found.append(Screw("revolute", surface.sides[1 - side], point))
     return found
-
-
-def _is_same(hinge: Screw, other: Screw, turned: float = 0.0, aside: float = 0.0) -> bool:
-    """Whether another joint turns about the same line as a hinge, as well as edges are known, or
-    less well by as much as the other is `turned` (deg) and `aside` (m)."""
-    away = np.linalg.norm(np.cross(hinge.point - other.point, other.axis))
-    angle = np.degrees(np.arccos(min(abs(float(hinge.axis @ other.axis)), 1.0)))
-    alike = angle < min(np.degrees(np.arccos(LIKE)) + turned, UNSURE)
-    return other.joint == "revolute" and bool(alike and away < HINGE + aside)
 
 
 def _find_explained(tree: PartTree, look: int, other: int) -> Bool[np.ndarray, " points"]:
@@ -282,31 +271,3 @@ def _insert(tree: PartTree, option: Option) -> bool:
     part.settle(estimate)
     merge_same(tree)
     return True
-
-
-def merge_same(tree: PartTree) -> None:
-    """Of parts that turn about one hinge on the same carrier keep the one that is known best.
-
-    They are one part, which went further than it was sought, or showed its other side. What stands
-    still may have two doors above each other on one hinge.
-    """
-    for number in reversed(range(len(tree.parts))):
-        part = tree.parts[number]
-        for other, one in enumerate(tree.parts[:number]):
-            if 0 <= part.parent == one.parent and _may_be_same(part, one):
-                known = min(part, one, key=lambda each: each.estimate.intervals[0])
-                known.ways = one.ways + part.ways
-                shown = {look for each in (part, one) for look in each.seen}
-                tree.remove(*((other, number) if known is part else (number, other)))
-                for look in shown:
-                    tree.find(tree.parts.index(known), look, beyond=FURTHER)
-                    tree.relabel(look)
-                known.settle(tree.estimate(known))
-                break
-
-
-def _may_be_same(part: Part, other: Part) -> bool:
-    """Whether two parts turn about one hinge, as well as both are known."""
-    turned, aside = np.add(part.estimate.intervals, other.estimate.intervals)
-    hinge = part.screw
-    return hinge.joint == "revolute" and _is_same(hinge, other.screw, float(turned), float(aside))

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Int
 from palpate.identification.interactive.averaging import average
 from palpate.identification.interactive.labels import (
     ON,
+    OTHERS,
+    TELLING,
     distinguishing_looks,
     evidence,
     height_evidence,
@@ -29,6 +31,7 @@ UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
 TAKEN = 8e-3  # m that a carrier takes the end of a hand's way: less may be an error
+UNSEEN, NOT_HIDDEN = -0.35, 1.5  # the same, of a position in which hardly anything of it is seen
 HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
 
 
@@ -92,8 +95,11 @@ class PartTree:
 
     # --- looks --------------------------------------------------------------------------------
 
-    def add_look(self, cloud: Cloud) -> int:
-        """Its number; parts are where they were last, unless they are clearly elsewhere."""
+    def add_look(self, cloud: Cloud, *, still: bool = False) -> int:
+        """Its number; parts are where they were last, unless they are clearly elsewhere.
+
+        If no hand has moved anything since the look before, all is `still`, but for what creeps.
+        """
         if self.looks and cloud is self.looks[-1]:
             return len(self.looks) - 1
         self.looks.append(cloud)
@@ -102,7 +108,7 @@ class PartTree:
         self.labels.append(np.full(len(cloud.points), -1))
         look = len(self.looks) - 1
         for part in self.ordered():
-            self.find(part, look, others=self.unchanged(part, look))
+            self.find(part, look, others=self.unchanged(part, look), creeps=still)
         return look
 
     def unchanged(self, part: int, look: int) -> Bool[np.ndarray, " points"]:
@@ -120,6 +126,7 @@ class PartTree:
         around: float | None = None,
         others: Bool[np.ndarray, " points"] | None = None,
         beyond: float | None = None,
+        creeps: bool = False,
     ) -> float:
         """Where a part is in a look: where it was, unless another position is clearly better.
 
@@ -128,13 +135,15 @@ class PartTree:
         `around` is where a hand has taken it: there it is, unless it clearly has not moved. What
         closes flush with another surface is as well seen where it was, when it has gone. Points
         of `others` are not the part's, wherever it is. It is sought `beyond` (rad or m) where it
-        was seen, less by default.
+        was seen, less by default, or no further than it `creeps` by itself.
         """
         one = self.parts[part]
         last = one.positions[look]
         turn, step = (0.5, 0.04) if one.screw.joint == "revolute" else (0.2, 0.02)
         reach = turn if beyond is None else beyond
         low, high = min(*one.range, last) - reach, max(*one.range, last) + reach
+        if creeps:
+            low, high = last - turn, last + turn
         if around is not None:
             low, high = around - turn, around + turn
         tried = np.arange(low, high, step)
@@ -143,8 +152,10 @@ class PartTree:
             tried = np.linspace(best - step, best + step, 7)
             best = tried[self.seen_at(part, look, tried, others).argmax()]
             step /= 3.0
-        ahead = -HAND_TELLS if around is not None else NOT_MOVED
         there, here = self.seen_at(part, look, np.array([best, last]), others)
+        ahead = NOT_MOVED if there > UNSEEN else NOT_HIDDEN
+        if around is not None:
+            ahead = -HAND_TELLS
         if there > here + ahead:
             one.positions[look] = float(best)
         return float(max(there, here))
@@ -217,11 +228,9 @@ class PartTree:
         given = scores(cloud, seen, motions)
         if candidate is None:
             alone = given.copy()
-            for label, one in enumerate(self.parts, 1):
+            for part, one in enumerate(self.parts):
                 if one.parent >= 0:
-                    given[label] += height_evidence(
-                        cloud, seen, motions, alone, label, one.parent + 1
-                    )
+                    given[part + 1] += self._height_evidence(part, look, alone)
         given += prior(cloud, given, motions)
         given[0] = np.maximum(given[0], UNKNOWN * len(others))
         return smooth_labels(cloud, given)
@@ -239,6 +248,21 @@ class PartTree:
         others = distinguishing_looks(places, look)
         motions = [[self.motion(part, look, other) for other in others] for part in parts]
         return others, [[NOWHERE] * len(others), *motions]
+
+    def _height_evidence(
+        self, part: int, look: int, given: Float[np.ndarray, "labels points"]
+    ) -> Float[np.ndarray, " points"]:
+        """What heights of points tell of a part on a carrier, by looks in which it is elsewhere."""
+        places = np.array(self.parts[part].positions)
+        others = np.flatnonzero(np.abs(places - places[look]) > TELLING).tolist()
+        others = others[:: max(1, -(-len(others) // OTHERS))]
+        return height_evidence(
+            self.looks[look],
+            [self.looks[other] for other in others],
+            [[self.motion(one, look, other) for other in others]
+             for one in (part, self.parts[part].parent)],
+            given, part + 1, self.parts[part].parent + 1,
+        )  # fmt: skip
 
     def unexplained(self, candidate: Candidate, look: int) -> Bool[np.ndarray, " points"]:
         """Which points of a look neither stand still nor are of a part, by the other look."""
@@ -266,9 +290,10 @@ class PartTree:
         for number in self.ordered():
             part = self.parts[number]
             found = [self.estimate(part)]
-            if number == last and len(part.ways) > 1:
-                ways = [self.way_from(part.parent, *way) for way in part.ways]
-                longest = max(ways, key=lambda way: float(np.linalg.norm(way[-1] - way[0])))
+            ways = [self.way_from(part.parent, *way) for way in part.ways]
+            whole = [way for way in ways if len(np.unique(way, axis=0)) > 2]  # of two ends: any
+            if number == last and len(ways) > 1 and whole:
+                longest = max(whole, key=lambda way: float(np.linalg.norm(way[-1] - way[0])))
                 found += [
                     self.estimate(part, screw)
                     for screw in screws_of_way(longest)

@@ -8,10 +8,17 @@ carries it.
 import numpy as np
 
 from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
-from palpate.identification.interactive.explanation import FURTHER, find_moved_part, may_have_moved
+from palpate.identification.interactive.duplicates import drop_explained, merge_same
+from palpate.identification.interactive.explanation import (
+    FURTHER,
+    find_moved_part,
+    labels_near,
+    may_have_moved,
+)
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import HIDDEN, evidence
-from palpate.identification.interactive.splitting import merge_same, split
+from palpate.identification.interactive.part import UNSURE
+from palpate.identification.interactive.splitting import split
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
 
@@ -33,9 +40,11 @@ class Twin(PartTree):
     def observe(self, handling: Handling) -> None:
         """Explain what was seen and felt."""
         before = self.add_look(handling.before)
-        after = self.add_look(handling.after)
+        after = self.add_look(handling.after, still=not handling.moved)
         self.handled.append(handling)
         part, new = self._explain(before, after, handling)
+        if part < 0 and handling.moved and self._drop_refuted(before, handling):
+            part, new = self._explain(before, after, handling)
         self.held.append((part, before))
         count = len(self.parts)
         self._keep(new, before, after)
@@ -55,11 +64,13 @@ class Twin(PartTree):
             self._explain_earlier()
             self.refit(-1)
         merge_same(self)
+        drop_explained(self)
         self._drop_unknown()
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""
-        self.relabel(self.add_look(cloud))
+        still = bool(self.handled) and not self.handled[-1].moved
+        self.relabel(self.add_look(cloud, still=still))
 
     def remove(self, part: int, heir: int) -> None:
         """See `PartTree.remove`."""
@@ -120,6 +131,15 @@ class Twin(PartTree):
                 for index in held:
                     self.held[index] = -1, self.held[index][1]
 
+    def _drop_refuted(self, before: int, handling: Handling) -> bool:
+        """Take out parts of whose joints next to nothing is known, if the hand was put to them and
+        went as none allows; whether any was."""
+        near = [one for one in labels_near(self, before, handling.push.point) if one >= 0]
+        doubtful = [one for one in near if self.parts[one].estimate.intervals[0] > UNSURE]
+        for number in sorted(doubtful, reverse=True):
+            self.remove(number, self.parts[number].parent)
+        return bool(doubtful)
+
     def _drop_unknown(self) -> None:
         """Take out parts that no hand has held and whose joint may be anywhere by what was seen."""
         for number in reversed(range(len(self.parts))):
@@ -165,17 +185,20 @@ class Twin(PartTree):
             after = before + 1
             for look in (before, after):
                 self.relabel(look)
-            part, new = self._explain(before, after, handling)
+            # what was no line and no circle then is none now
+            part, new = self._explain(before, after, handling, carried=True)
             self.held[number] = part, before
             self._keep(new, before, after)
 
-    def _explain(self, before: int, after: int, handling: Handling) -> tuple[int, bool]:
+    def _explain(
+        self, before: int, after: int, handling: Handling, *, carried: bool = False
+    ) -> tuple[int, bool]:
         """The part that the hand held, -1: none that is known; and whether it is new."""
         if not handling.moved:
             nearest = self.looks[before].tree.query(handling.push.point)[1]
             return int(self.labels[before][nearest]), False
         if (part := find_moved_part(self, before, after, handling)) >= 0:
             return part, False
-        if handling.travel > TELLS and discover(self, before, after, handling):
+        if handling.travel > TELLS and discover(self, before, after, handling, carried=carried):
             return len(self.parts) - 1, True
         return -1, False

@@ -1,0 +1,109 @@
+"""Parts found twice: on one hinge, or where another one explains what was seen as well."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from palpate.identification.interactive.explanation import FURTHER, may_have_moved
+from palpate.identification.interactive.part import Part, is_same_hinge
+from palpate.identification.interactive.tree import FEWEST, PartTree
+
+NEAR, SHARED = 0.05, 0.3  # m between places of two parts, and share of one's where the other was
+LOOKS = 6  # that tell whether another part explains what was seen
+LOSS = 0.5  # of evidence, for each point of a part: less is lost where another one explains it
+
+
+def merge_same(tree: PartTree) -> None:
+    """Of parts that turn about one hinge on the same carrier keep the one that is known best.
+
+    They are one part, which went further than it was sought, or showed its other side. What stands
+    still may have two doors above each other on one hinge.
+    """
+    for number in reversed(range(len(tree.parts))):
+        part = tree.parts[number]
+        for other, one in enumerate(tree.parts[:number]):
+            if 0 <= part.parent == one.parent and _may_be_same(part, one):
+                known = min(part, one, key=lambda each: each.estimate.intervals[0])
+                known.ways = one.ways + part.ways
+                shown = {look for each in (part, one) for look in each.seen}
+                tree.remove(*((other, number) if known is part else (number, other)))
+                for look in shown:
+                    tree.find(tree.parts.index(known), look, beyond=FURTHER)
+                    tree.relabel(look)
+                known.settle(tree.estimate(known))
+                break
+
+
+def _may_be_same(part: Part, other: Part) -> bool:
+    """Whether two parts turn about one hinge, as well as both are known."""
+    turned, aside = np.add(part.estimate.intervals, other.estimate.intervals)
+    return part.screw.joint == "revolute" and is_same_hinge(
+        part.screw, other.screw, float(turned), float(aside)
+    )
+
+
+def drop_explained(tree: PartTree) -> None:
+    """Take out parts of which little is known where others explain what was seen of them as well.
+
+    Another one is where they were, and may only have been sought elsewhere (III-B d). So is what
+    carries them: where a hand took both, one of them may be taken for a part on itself.
+    """
+    for number in reversed(range(len(tree.parts))):
+        part = tree.parts[number]
+        others = [
+            other
+            for other, one in enumerate(tree.parts)
+            if other != number
+            and (other == part.parent or (one.parent == part.parent and _is_less_known(part, one)))
+        ]
+        if any(one.parent == number for one in tree.parts):
+            continue
+        for other in others:
+            if _were_alike(tree, number, other) and _explains(tree, other, number):
+                known = tree.parts[other]
+                tree.remove(number, other)
+                heir = tree.parts.index(known)
+                known.ways += [way for way in part.ways if may_have_moved(tree, heir, *way)]
+                for look in part.seen:
+                    tree.relabel(look)
+                break
+
+
+def _is_less_known(part: Part, other: Part) -> bool:
+    return part.provisional or len(part.ways) < min(2, len(other.ways))
+
+
+def _were_alike(tree: PartTree, part: int, other: int) -> bool:
+    """Whether a part was where another one was, in one look or another."""
+    swept = []
+    for number in (part, other):
+        one = tree.parts[number]
+        places = np.unique(np.round(one.positions, 1), return_index=True)[1]
+        poses = [tree.pose(number, int(look)) for look in places]
+        carried = [tree.pose(tree.parts[part].parent, int(look)).inverse for look in places]
+        swept.append(
+            np.concatenate(
+                [
+                    (back @ pose).at(one.support[0])
+                    for back, pose in zip(carried, poses, strict=True)
+                ]
+            )
+        )
+    distance = cKDTree(swept[1]).query(swept[0], distance_upper_bound=NEAR)[0]
+    return bool(np.mean(np.isfinite(distance)) > SHARED)
+
+
+def _explains(tree: PartTree, other: int, part: int) -> bool:
+    """Whether a part explains what was seen of another one; it is then where that was."""
+    own, one = tree.parts[part].seen, tree.parts[other]
+    shown = sorted(look for look, chosen in own.items() if len(chosen) >= FEWEST)
+    looks = shown[:: max(1, -(-len(shown) // LOOKS))]
+    kept = list(one.positions)
+    for look in looks:
+        if len(one.seen.get(look, ())) < FEWEST:
+            tree.find(other, look, beyond=FURTHER)
+    for look in looks:
+        given = tree.scores(look)[:, own[look]]
+        if np.mean(given[part + 1] - given[other + 1]) > LOSS:
+            one.positions = kept
+            return False
+    return True

@@ -1,11 +1,13 @@
 """A hand on a flap that moves its door as well: what is said of both, of one pull."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
 
 from palpate.identification.interactive.discovery import discover, on_moving_carrier
+from palpate.identification.interactive.duplicates import drop_explained
 from palpate.identification.interactive.explanation import (
     find_moved_part,
     joint_of_ways,
@@ -38,8 +40,7 @@ class Unsteady(Room):
 
 
 @pytest.fixture(scope="module")
-def known() -> tuple[Unsteady, Twin, Handling]:
-    """A twin that knows the door and the flap, and a pull that moves both."""
+def once() -> tuple[Unsteady, Twin, Handling]:
     room, twin = Unsteady(), Twin()
     room.at(0.0, 0.0)
     twin.look(room.look())
@@ -54,6 +55,13 @@ def known() -> tuple[Unsteady, Twin, Handling]:
         Push(way[0], along), twin.looks[-1], room.look(), np.linspace(0, 2, 60), way, 0.0 * way
     )
     return room, twin, handling
+
+
+@pytest.fixture
+def known(once) -> tuple[Unsteady, Twin, Handling]:
+    """A twin that knows the door and the flap, and a pull that moves both."""
+    room, twin, handling = once
+    return room, copy.deepcopy(twin), handling
 
 
 def test_where_both_joints_are_is_told_by_the_hand_alone(known) -> None:
@@ -167,3 +175,38 @@ def test_what_no_hand_has_moved_may_creep_but_does_not_jump() -> None:
             assert found > 0.3
         else:
             assert found == pytest.approx(expected, abs=0.03)
+
+
+def test_a_flap_that_was_found_twice_is_one_and_a_door_with_a_flap_is_two(known) -> None:
+    _, twin, _ = known
+    drop_explained(twin)
+    assert [part.parent for part in twin.parts] == [-1, 0]
+    flap = twin.parts[1]
+    # the same again, of which less is known; the flap has lost its points to it in one look
+    again = dataclasses.replace(flap, ways=[], seen=dict(flap.seen), positions=[*flap.positions])
+    look = flap.shown
+    flap.seen[look] = flap.seen[look][:0]
+    flap.positions[look] += 0.4
+    twin.parts.append(again)
+    drop_explained(twin)
+    assert len(twin.parts) == 2
+    assert twin.parts[1] is flap
+    assert flap.positions[look] == pytest.approx(again.positions[look], abs=0.05)
+
+
+def test_a_joint_of_which_nothing_is_known_goes_when_a_hand_goes_otherwise(known) -> None:
+    _, twin, handling = known
+    for spread, kept in ((1e-6, True), (4.0, False)):
+        seen = copy.deepcopy(twin)
+        flap = seen.parts[1]
+        flap.estimate = dataclasses.replace(flap.estimate, covariance=spread * np.eye(4))
+        assert seen._drop_refuted(len(seen.looks) - 1, handling) == (not kept)
+        assert (flap in seen.parts) == kept
+
+
+def test_a_line_through_two_ends_of_a_way_is_no_slide(known) -> None:
+    _, twin, _ = known
+    flap = twin.parts[1]
+    flap.ways = [(look, way[[0, 0, 0, -1, -1, -1]]) for look, way in flap.ways]
+    twin.refit(1)
+    assert flap.screw.joint == "revolute"

@@ -123,3 +123,17 @@ def test_a_part_is_worth_bringing_back_to_where_it_showed_what_may_move_on_it():
     found = active._hidden_tries(twin, 1 - more, random, guess, worth)
     assert found == {(0, (1.0, -1.0)[more]): pytest.approx(active.LATER * best[more])}
     assert not active._hidden_tries(twin, more, random, guess, worth)
+
+
+def test_a_strip_along_the_hinge_of_a_door_is_not_tried_again():
+    twin = twin_at([0.0])
+    cloud, door = twin.looks[0], door_of(twin, 0)
+    away = np.linalg.norm(cloud.points[door.members, :2] - DOOR.point[:2], axis=1)
+    strip = dataclasses.replace(door, part=-1, members=door.members[away < 0.05])
+    assert len(strip.members) > 3
+    assert active._is_at_hinge(twin, strip, cloud, 0)
+    assert not active._is_at_hinge(twin, dataclasses.replace(door, part=-1), cloud, 0)
+    assert not active._is_at_hinge(twin, dataclasses.replace(strip, part=0), cloud, 0)
+    low = cloud.points.copy()
+    low[:, 2] -= 2.0  # below the door
+    assert not active._is_at_hinge(twin, strip, dataclasses.replace(cloud, points=low), 0)

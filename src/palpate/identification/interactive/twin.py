@@ -7,7 +7,8 @@ carries it.
 
 import numpy as np
 
-from palpate.identification.interactive.discovery import CARRIED, TELLS, discover, reparent
+from palpate.identification.interactive.carriers import CARRIED, reparent
+from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
 from palpate.identification.interactive.explanation import (
     FURTHER,

@@ -6,7 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from palpate.identification.interactive.discovery import discover, on_moving_carrier
+from palpate.identification.interactive import discovery
+from palpate.identification.interactive.discovery import Discovery, discover, on_moving_carrier
 from palpate.identification.interactive.duplicates import drop_explained
 from palpate.identification.interactive.explanation import (
     find_moved_part,
@@ -212,3 +213,11 @@ def test_a_line_through_two_ends_of_a_way_is_no_slide(known) -> None:
     flap.seen = {}  # nothing else tells
     twin.refit(1)
     assert flap.screw.joint == "revolute"
+
+
+def test_nothing_is_hinged_on_a_part_of_which_a_look_shows_nothing(known) -> None:
+    _, twin, _ = known
+    look = len(twin.looks) - 1
+    twin.labels[look][:] = -1
+    new = Discovery(-1, twin.parts[1].estimate, [np.zeros(0, int), np.zeros(0, int)])
+    assert not discovery._is_hinged_on(twin, 0, look, look, new)

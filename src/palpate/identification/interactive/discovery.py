@@ -293,9 +293,11 @@ def _is_hinged_on(tree: PartTree, part: int, before: int, after: int, new: Disco
     """Whether a new part turns about a line on another one, the rest of which has stayed."""
     cloud, screw = tree.looks[before], new.estimate.screw
     own = np.flatnonzero(tree.labels[before] == part)
-    nearest = np.linalg.norm(np.cross(cloud.points[own] - screw.point, screw.axis), axis=1).min()
     rest = np.setdiff1d(own, new.masks[0])
-    if screw.joint != "revolute" or nearest > TOUCHES or len(rest) < FEWEST:
+    if screw.joint != "revolute" or len(rest) < FEWEST:
+        return False
+    away = np.linalg.norm(np.cross(cloud.points[own] - screw.point, screw.axis), axis=1)
+    if away.min() > TOUCHES:
         return False
     stayed = evidence(tree.looks[after], cloud.points[rest], cloud.normals[rest])
     return bool(np.mean(stayed) > OPEN)

@@ -149,6 +149,18 @@ def test_looks_have_one_to_four_images_and_the_truth_a_part_for_each_pixel():
         ApplianceWorld("oven", 0, views=5)
 
 
+def test_who_asks_for_the_truth_changes_nothing():
+    world = ApplianceWorld("microwave", 1)
+    world.reset(1, position=[0.6])
+    world.data.qvel[:] = 1.0
+    world.step(HandAction())
+    before = world.data.xpos.copy()  # as the last step began
+    truth = world.truth()
+    assert truth.position == pytest.approx(world.data.qpos[world.scene.addresses])
+    assert np.array_equal(world.data.xpos, before)
+    assert not np.array_equal(truth.origin, before[world.scene.bodies])
+
+
 def test_the_same_seed_gives_the_same_episode():
     looks = []
     for _ in range(2):

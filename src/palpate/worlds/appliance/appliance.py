@@ -1,5 +1,6 @@
 """An appliance before depth cameras, and a hand that presses on it or holds it at a point."""
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -176,7 +177,7 @@ class ApplianceWorld(World):
         return [image for image, _ in taken]
 
     def truth(self) -> ApplianceTruth:
-        data, scene = self.data, self.scene
+        data, scene = copy.copy(self.data), self.scene  # so that who looks changes nothing
         mujoco.mj_kinematics(self.model, data)
         return ApplianceTruth(
             scene.parts,

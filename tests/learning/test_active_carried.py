@@ -1,6 +1,7 @@
 """Where a hand pulls at what hangs on a door that goes as well."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
 from palpate.learning import active
 from palpate.learning.active import WORTHS
-from palpate.learning.movable_guess import load_guess
+from palpate.learning.movable_guess import MovableGuess, load_guess
 from palpate.numerics.pinhole import Pinhole
 from palpate.perception.clouds import cloud_of
 from palpate.perception.surfaces import surfaces
@@ -137,3 +138,49 @@ def test_a_strip_along_the_hinge_of_a_door_is_not_tried_again():
     low = cloud.points.copy()
     low[:, 2] -= 2.0  # below the door
     assert not active._is_at_hinge(twin, strip, dataclasses.replace(cloud, points=low), 0)
+
+
+class Even(MovableGuess):
+    """A guess that is as sure of every surface."""
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        return np.full(len(features), 0.9)
+
+
+def unknown_door() -> Twin:
+    """One that has seen the door, open, and knows nothing of it."""
+    twin = twin_at([0.0, 0.0])
+    twin.parts = []
+    twin.labels = [np.full(len(cloud.points), -1) for cloud in twin.looks]
+    return twin
+
+
+def tried(twin: Twin) -> list[tuple[float, Push]]:
+    """What it is worth to pull at the door and at the wall behind it."""
+    guess = load_guess()
+    even = Even(guess.mean, guess.deviation, guess.network)
+    return active._tries(twin, 1, np.random.default_rng(0), even, WORTHS["information"])
+
+
+def test_what_a_hand_took_and_no_joint_explained_is_taken_elsewhere_next():
+    twin = unknown_door()
+    first = max(tried(twin), key=lambda one: one[0])[1]
+    for held, far in ((-1, True), (0, False)):  # what moved a part that is known says nothing
+        twin.handled, twin.held = [pulled(twin, first.point, moved=True)], [(held, 0)]
+        near = [
+            (value, math.dist(push.point, first.point))
+            for value, push in tried(twin)
+            if abs(push.point[0] - first.point[0]) < 0.1
+        ]
+        assert (max(near)[1] > active.AROUND) == far
+
+
+def test_a_pull_that_tells_little_of_a_door_costs_the_wall_little_trust():
+    twin = unknown_door()
+    values = []
+    for way in ([0.0, 0.0, 1.0], OUT):  # along it, as hardly any door goes, and out
+        at_edge = pulled(twin, DOOR.point + np.array([0.0, 0.58, 0.0]), moved=False)
+        twin.handled = [dataclasses.replace(at_edge, push=Push(at_edge.push.point, np.array(way)))]
+        twin.held = [(-1, 0)]
+        values.append(min(tried(twin), key=lambda one: one[1].point[0])[0])
+    assert values[0] > 1.05 * values[1]

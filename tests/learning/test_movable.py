@@ -1,5 +1,7 @@
 """What is believed of a surface after pulls at it, against what the geometry says."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -21,15 +23,25 @@ def chance(belief, point, direction):
 
 def certain(hypothesis):
     """A belief in one hypothesis alone."""
-    belief = prior(0.4)
+    belief = prior(0.4, FRONT)
     return belief._replace(chances=np.eye(len(belief.chances))[hypothesis])
 
 
 def test_a_prior_is_a_distribution():
-    belief = prior(0.4).chances
+    belief = prior(0.4, FRONT).chances
     assert belief.sum() == pytest.approx(1.0)
     assert belief.min() >= 0.0
     assert 1.0 - belief[0] == pytest.approx(0.4)
+
+
+def test_a_hinge_is_likely_where_a_handle_has_a_long_lever():
+    handled = dataclasses.replace(FRONT, handles=LEFT_EDGE[None])
+    belief, plain = (prior(0.4, one).chances[1:] for one in (handled, FRONT))
+    of_edge = belief[:12].reshape(4, 3).sum(axis=1)  # right, lower, left, upper
+    assert of_edge[0] > 2.0 * of_edge[1] == pytest.approx(2.0 * of_edge[3])
+    assert of_edge[2] < 0.4 * of_edge[1]
+    assert belief.sum() == pytest.approx(plain.sum())
+    assert belief[12:21] == pytest.approx(plain[12:21])  # slides
 
 
 def test_a_hinge_goes_where_the_lever_is_long():
@@ -49,7 +61,7 @@ def test_a_slide_goes_along_itself_alone():
 
 
 def test_a_pull_that_failed_at_one_edge_leaves_the_other():
-    belief = posterior(prior(0.5), FRONT, [Pull(RIGHT_EDGE, OUT, False, 0.0, True)])
+    belief = posterior(prior(0.5, FRONT), FRONT, [Pull(RIGHT_EDGE, OUT, False, 0.0, True)])
     assert chance(belief, LEFT_EDGE, OUT) > 2.0 * chance(belief, RIGHT_EDGE, OUT)
     assert belief.chances[0] > 0.5
     assert belief.chances.sum() == pytest.approx(1.0)
@@ -58,7 +70,7 @@ def test_a_pull_that_failed_at_one_edge_leaves_the_other():
 def test_a_pull_that_failed_on_one_half_hardly_tells_of_the_other():
     """Two doors beside each other are one surface; each turns about its outer edge."""
     left, right = np.array([0, 0.07, 0.0]), np.array([0, -0.07, 0.0])
-    belief = posterior(prior(0.9), FRONT, [Pull(right, OUT, False, 0.0, True)] * 3)
+    belief = posterior(prior(0.9, FRONT), FRONT, [Pull(right, OUT, False, 0.0, True)] * 3)
     assert belief.chances[0] < 0.6
     assert chance(belief, left, OUT) > 3.0 * chance(belief, right, OUT)
 
@@ -84,7 +96,7 @@ def test_what_withstood_a_pull_moves_only_under_a_stronger_one():
 
 def test_what_gives_a_little_moves_rather_than_what_does_not():
     pulls = [Pull(np.zeros(3), OUT, False, travel, True) for travel in (0.004, 0.0)]
-    gave, still = (posterior(prior(0.2), FRONT, [pull]).chances[0] for pull in pulls)
+    gave, still = (posterior(prior(0.2, FRONT), FRONT, [pull]).chances[0] for pull in pulls)
     assert gave < 0.5 < 0.8 < still
 
 
@@ -92,15 +104,15 @@ def test_what_gives_a_little_and_withstands_every_pull_outwards_goes_back():
     """A drawer at the soft stop of its open end, which was pulled at all of its edges."""
     edges = LEFT_EDGE, RIGHT_EDGE, np.array([0.0, 0.0, 0.19]), np.array([0.0, 0.0, -0.19])
     pulls = [Pull(edge, OUT, False, 0.004, True) for edge in edges]
-    belief = posterior(prior(0.8), FRONT, pulls)
+    belief = posterior(prior(0.8, FRONT), FRONT, pulls)
     assert belief.chances[0] < 0.1
     assert chance(belief, np.zeros(3), IN) > 0.4
     assert all(chance(belief, edge, OUT) < 0.1 for edge in edges)
 
 
 def test_what_stopped_early_rather_goes_back():
-    ended = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, 0.2, True)])
-    further = posterior(prior(0.3), FRONT, [Pull(LEFT_EDGE, OUT, True, 0.3, False)])
+    ended = posterior(prior(0.3, FRONT), FRONT, [Pull(LEFT_EDGE, OUT, True, 0.2, True)])
+    further = posterior(prior(0.3, FRONT), FRONT, [Pull(LEFT_EDGE, OUT, True, 0.3, False)])
     assert ended.chances[0] < 0.2
     back = chance(ended, LEFT_EDGE, IN)
     assert back > chance(further, LEFT_EDGE, IN) > chance(ended, LEFT_EDGE, OUT)
@@ -111,7 +123,7 @@ def test_what_stopped_at_once_is_held_rather_than_at_its_end():
     """A lid that a latch held after a centimetre goes where the lever is longer."""
     middle = np.array([0.0, 0.05, 0.0])
     soon, late = (
-        posterior(prior(0.9), FRONT, [Pull(middle, OUT, True, travel, True)])
+        posterior(prior(0.9, FRONT), FRONT, [Pull(middle, OUT, True, travel, True)])
         for travel in (0.01, 0.2)
     )
     assert chance(soon, LEFT_EDGE, OUT) > 3.0 * chance(late, LEFT_EDGE, OUT)

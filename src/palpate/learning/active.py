@@ -31,6 +31,8 @@ JOINT = 15.0  # nats that a joint is worth which was not known
 FORCES = 4.0  # nats that are worth masses and what resists one way, where no long way went there
 LONG = 0.1  # m of a way that tells them
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
+UNEXPLAINED, AROUND = 0.4, 0.15  # the same, within as many m of where a hand took something that
+# no joint explained
 BESIDE = 0.05  # m from a surface at which a hand was still on it
 BEHIND = 0.03  # m
 FEWEST = 10  # points of a part that a hand can be put to
@@ -125,22 +127,29 @@ def _tries(
     cloud, every, before = _guess_surfaces(twin, look, random, guess)
     tried = [_pulls_at(twin, surface, cloud, look) for surface in every]
     # a guess that was wrong of this appliance is trusted less in the rest of it
-    failed = before * [len(pulls) + len(missed) > 0 for pulls, missed in tried]
+    after = [
+        movable.posterior(movable.prior(float(chance), surface), surface, pulls).chance
+        for surface, chance, (pulls, _) in zip(every, before, tried, strict=True)
+    ]
+    failed = np.maximum(before - after, 0.0)
     known = 1.0 + len(twin.parts)
     trust = known / (known + failed.sum() - failed)
     for surface, chance, (pulls, missed) in zip(every, trust * before, tried, strict=True):
         if part not in (None, surface.part) or _is_at_hinge(twin, surface, cloud, look):
             continue
-        belief = movable.posterior(movable.prior(float(chance)), surface, pulls)
+        belief = movable.posterior(movable.prior(float(chance), surface), surface, pulls)
         points, directions = _grips(cloud, surface)
         # where they were seen, not where the mean of all looks has them
         points = twin.looks[look].points[cloud.tree.query(points)[1]]
         force = _force_before_carrier(twin, surface.part, look, points, directions)
         goes = movable.moves(belief, surface, points, directions, force)
-        near = np.zeros(len(points))
+        value = worth.of_try(goes, surface, cloud)
         for point in missed:
-            near += np.linalg.norm(points - point, axis=1) < BESIDE
-        value = worth.of_try(goes, surface, cloud) * MISSED**near
+            value = value * MISSED ** (np.linalg.norm(points - point, axis=1) < BESIDE)
+        for pull in pulls:
+            if pull.moved:  # and nothing was found: it would be the same again
+                away = np.linalg.norm(points - pull.point, axis=1)
+                value = value * UNEXPLAINED ** (away < AROUND)
         best = int(np.argmax(value))
         found.append((float(value[best]), Push(points[best], directions[best])))
     return found

@@ -17,6 +17,9 @@ from palpate.perception.surfaces import Surface
 # Shares of the joints: each of four, of one, and each of two.
 HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
 JOINTS = 7
+# A hinge is as likely as this power of the lever that handles have about it, and a constant for
+# what is no handle, as the knobs of a panel beside a door.
+LEVER, LEAST_LEVER = 2.0, 0.1
 # Pieces of a surface, from one share of a side of its rectangle to another, and how many parts are
 # such a piece along either side; the others are all of their surface, 130 of 200 generated ones.
 SPANS = {(0.0, 0.5): 0.045, (0.5, 1.0): 0.045}
@@ -54,6 +57,11 @@ class Belief(NamedTuple):
     chances: Chances
     withstood: Chances
 
+    @property
+    def chance(self) -> float:
+        """Probability that the surface moves."""
+        return 1.0 - float(self.chances[0])
+
 
 class Pull(NamedTuple):
     """Where a hand pulled and which way, and what came of it: how far it got, and whether something
@@ -67,11 +75,20 @@ class Pull(NamedTuple):
     force: float = 1.0
 
 
-def prior(chance: float) -> Belief:
-    """Of standing still, and of each piece's joints and senses, given the probability to move."""
+def prior(chance: float, surface: Surface) -> Belief:
+    """Of standing still, and of each piece's joints and senses, given the probability to move.
+
+    A hinge is likely where handles have a long lever about it.
+    """
     joints = np.array([HINGE] * 4 + [ALONG_NORMAL] + [ALONG_SIDE] * 2)
     senses = np.array([SENSES_OUT] * 5 + [SENSES_SIDE] * 2)
-    moving = chance * (SIZES[:, None, None] * joints[:, None] * senses).ravel()
+    hinges = joints * np.ones((len(PIECES), 1))
+    if len(surface.handles):
+        out = np.broadcast_to(surface.normal, surface.handles.shape)
+        levers = _forces(surface, surface.handles, out).reshape(len(out), len(PIECES), JOINTS)
+        share = LEAST_LEVER + (levers[..., :4] ** LEVER).mean(axis=0)
+        hinges[:, :4] *= 4.0 * share / share.sum(axis=1, keepdims=True)
+    moving = chance * (SIZES[:, None, None] * hinges[..., None] * senses).ravel()
     chances = np.concatenate([[1.0 - moving.sum()], moving])
     return Belief(chances, np.zeros(len(chances)))
 

@@ -19,9 +19,23 @@ from palpate.identification.interactive.explanation import (
     labels_near,
 )
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import LEAST_MOTION, distinguishing_looks, evidence
+from palpate.identification.interactive.labels import (
+    HIDDEN,
+    LEAST_MOTION,
+    distinguishing_looks,
+    evidence,
+)
 from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge, support_of
-from palpate.identification.interactive.refinement import Estimate, refine, sighting, surprise
+from palpate.identification.interactive.refinement import (
+    MOMENTS,
+    Estimate,
+    misfit,
+    nearness,
+    patches_of,
+    refine,
+    sighting,
+    surprise,
+)
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.identification.interactive.tree import FEWEST, Candidate, PartTree
 
@@ -86,13 +100,11 @@ def _on_carrier(
     short = np.repeat(ends, 3, axis=0)
     followed = screws_of_way(on_moving_carrier(tree, before, after, carrier, way))[:1]
     found = _best(tree, before, after, carrier, short, followed)
-    if found is not None:
-        return found
     cloud = tree.looks[before]
     lost = tree.unexplained(Candidate(NOWHERE, before, after), before)
     lost &= np.linalg.norm(cloud.points - ends[0], axis=1) < AROUND
-    if lost.sum() < FEWEST:
-        return None
+    if lost.sum() < FEWEST or (found is not None and min(map(len, found.masks)) >= FEWEST):
+        return found
     points, normals = cloud.points[lost], cloud.normals[lost]
 
     def value(screw: Screw) -> float:
@@ -100,8 +112,10 @@ def _on_carrier(
         return float(np.sum(evidence(tree.looks[after], pose.at(points), pose.turned(normals))))
 
     best = sorted(_joining(*ends), key=value, reverse=True)[:TRIED]
-    found = _best(tree, before, after, carrier, short, best)
-    return found if found is not None and found.estimate.intervals[0] < UNSURE else None
+    joined = _best(tree, before, after, carrier, short, best)
+    if joined is not None and joined.estimate.intervals[0] < UNSURE:
+        return joined
+    return found
 
 
 def on_moving_carrier(
@@ -170,7 +184,30 @@ def _best(
             for look, mask in zip((before, after), masks, strict=True)
         ):
             found.append(Discovery(carrier, estimate, masks))
-    return min(found, key=lambda one: one.estimate.criterion, default=None)
+    return max(found, key=lambda one: _gain(tree, before, after, one, way), default=None)
+
+
+def _gain(
+    tree: PartTree, before: int, after: int, new: Discovery, way: Float[np.ndarray, "times 3"]
+) -> float:
+    """How much likelier two looks and a hand's way are with a new part than without (logarithm,
+    less that of Bayesian information for its numbers).
+
+    What is explained as well without it says nothing for it: a wall may slide in its plane.
+    """
+    estimate, back = new.estimate, tree.motion(new.carrier, after, before)
+    candidate, gain = _candidate(estimate, back, before, after), 0.0
+    for look in (before, after):
+        given = tree.scores(look, candidate)
+        more = given[-1] - given[:-1].max(axis=0)
+        other, pose = candidate.between(look)
+        fit = nearness(tree.looks[look], tree.looks[other], pose)
+        patch = patches_of(tree.looks[look].points)  # errors of neighbours are not independent
+        more = np.where(more > 0.0, more + fit, 0.0)
+        gain += float(np.sum(np.bincount(patch, more) / np.bincount(patch)))
+    numbers = 4.0 if estimate.screw.joint == "revolute" else 2.0
+    strays = misfit(estimate.screw, way) * 2.0 * len(way[:MOMENTS])
+    return gain - 0.5 * strays - 0.5 * numbers * math.log(max(estimate.independent, 2.0))
 
 
 def _candidate(estimate: Estimate, back: Pose, before: int, after: int) -> Candidate:
@@ -201,12 +238,17 @@ def insert(
     ways = [] if way is None else [(before, way)]
     guessed = new.carrier >= 0 and way is not None
     tree.parts.append(Part(parent, estimate, positions, seen, ways, support, guessed))
-    for look in reversed(range(before)):  # a pull that told nothing may have moved it, and far
-        tree.parts[number].positions[look] = tree.parts[number].positions[look + 1]
-        tree.find(number, look, beyond=FURTHER)
-    for look in range(after + 1, len(tree.looks)):
-        tree.parts[number].positions[look] = tree.parts[number].positions[look - 1]
-        tree.find(number, look)
+    for look, mask in seen.items():
+        tree.labels[look] = tree.labels[look].copy()
+        tree.labels[look][mask] = number
+    related = {number, *tree.carriers(number), *carried, *same}
+    strange = [other for other in range(number) if other not in related]
+    for look in (*reversed(range(before)), *range(after + 1, len(tree.looks))):
+        known, step = (before, 1) if look < before else (after, -1)
+        others = np.isin(tree.labels[look], strange) | tree.taken(number, look, known)
+        tree.parts[number].positions[look] = tree.parts[number].positions[look + step]
+        # a pull that told nothing may have moved it, and far
+        tree.find(number, look, others=others, beyond=FURTHER if look < before else None)
     for child in carried:
         if tree.parts[child].parent == parent:
             tree.parts[child].parent = number
@@ -229,6 +271,8 @@ def _relatives(
     labels, mask = tree.labels[before], np.zeros(len(tree.labels[before]), bool)
     mask[new.masks[0]] = True
     parent, carried, same = new.carrier, [], []
+    back = tree.motion(new.carrier, after, before)
+    gone = tree.scores(before, _candidate(new.estimate, back, before, after))[-1]
     for number, part in enumerate(tree.parts):
         own = labels == number
         if own.sum() < FEWEST or number == new.carrier:
@@ -237,7 +281,11 @@ def _relatives(
         little = part.longest_way < LITTLE or shared > WITHIN * mask.sum()
         if shared > WITHIN * own.sum() and little:
             same.append(number)
-        elif shared > WITHIN * own.sum() and mask.sum() > 1.2 * own.sum():
+        elif (
+            shared > WITHIN * own.sum()
+            and mask.sum() > 1.2 * own.sum()
+            and gone[own].mean() > HIDDEN
+        ):
             carried.append(number)  # all of it has moved, and more
         elif (
             new.carrier < 0

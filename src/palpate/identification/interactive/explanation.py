@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import LEAST_MOTION
+from palpate.identification.interactive.labels import FREE, LEAST_MOTION, evidence
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import Estimate, Way, misfit, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
@@ -19,6 +19,7 @@ MISFIT = 1.1  # of each of a hand's ways, for the joint that they say is theirs:
 SHORT = 0.05  # m that a hand went: a way so short fits many joints
 TOGETHER = 0.02  # of the travel: how far two joints may miss the hand, beside the metres below
 OPEN = -1.0  # of evidence, for each point: what has less is not where it is believed to be
+IN_THE_WAY = 0.05  # share of a part's points that cameras look through: hardly any where it is
 MOMENTS, STEPS = 25, 5  # of a hand's way, and of Gauss-Newton at each
 SMALL, DAMPED, MOST_STEP = 1e-5, 1e-5, 0.2  # rad or m, m^2, rad or m
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
@@ -101,16 +102,32 @@ def _follows_hand(tree: PartTree, part: int, before: int, after: int, handling: 
     start, alone = handling.points[:3].mean(axis=0), one.positions[after]
     gone = float(screw.position_of(start, handling.points)[-3:].mean())
     around = one.positions[before] + gone
-    tree.find(part, after, around, tree.unchanged(part, after))
+    tree.find(part, after, around, tree.taken(part, after, before))
     missed = abs(one.positions[after] - one.positions[before] - gone)
     arm = float(np.linalg.norm(screw.velocity(start)))
+    began, moved_back = one.positions[before], alone - gone
+    if missed * arm > EXPLAINED[0] and _may_have_been(tree, part, before, moved_back, start):
+        one.positions[before], one.positions[after], missed = moved_back, alone, 0.0
+        tree.relabel(before)
     own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
     if missed * arm < EXPLAINED[0] + 2.0 * EXPLAINED[1] * handling.travel and not any(
         tree.much_is_left(candidate, look, own) for look in (before, after)
     ):
         return True
-    one.positions[after] = alone
+    one.positions[before], one.positions[after] = began, alone
+    tree.relabel(before)
     return False
+
+
+def _may_have_been(
+    tree: PartTree, part: int, look: int, position: float, hand: Float[np.ndarray, "3"]
+) -> bool:
+    """Whether a part may have been elsewhere in a look than was believed: at the hand, and not
+    seen worse there, as of a door that is seen edge-on."""
+    one = tree.parts[part]
+    there, here = tree.seen_at(part, look, np.array([position, one.positions[look]]))
+    points = tree.pose(one.parent, look).at(one.screw.pose(position).at(one.support[0]))
+    return bool(there > here and np.linalg.norm(points - hand, axis=1).min() < BESIDE)
 
 
 def _by_two_joints(tree: PartTree, before: int, after: int, handling: Handling) -> int:
@@ -191,11 +208,20 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
             continue
         kept = one.estimate, one.positions
         one.settle(dataclasses.replace(joint, positions=np.array(one.positions_of(joint.screw))))
-        if _follows_hand(tree, part, before, after, handling):
+        if _follows_hand(tree, part, before, after, handling) and not _is_in_the_way(
+            tree, part, after
+        ):
             one.ways = ways
             return part
         one.estimate, one.positions = kept
     return -1
+
+
+def _is_in_the_way(tree: PartTree, part: int, look: int) -> bool:
+    """Whether cameras would have to look through a part where it is believed to be in a look."""
+    pose, (points, normals) = tree.pose(part, look), tree.parts[part].support
+    seen = evidence(tree.looks[look], pose.at(points), pose.turned(normals))
+    return bool(np.mean(seen == FREE) > IN_THE_WAY)
 
 
 def joint_of_ways(tree: PartTree, part: Part, ways: list[Way]) -> Estimate | None:

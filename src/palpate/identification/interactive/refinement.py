@@ -20,6 +20,7 @@ from palpate.perception.clouds import Cloud
 CREEP = 3e-3  # m by which a hand may have crept on its hold over `CREEP_TRAVEL`, as a random walk
 CREEP_TRAVEL = 0.3  # m
 HAND = 1e-3  # m, how well the hand is known to itself
+CARRIED = 4e-3  # m, how well the end of a way is known of which only the ends are
 ALIKE = 0.8  # cosine of the angle between normals of the same surface
 CUTOFF = 4.685  # standard deviations: Tukey's biweight, 95 % as efficient as least squares
 PATCH = 0.08  # m: the errors of points so near each other are not independent
@@ -208,7 +209,7 @@ def _add_pair(
     rows /= scale[:, None]
     weight = np.clip(1.0 - (standard / CUTOFF) ** 2, 0.0, None) ** 2
     sums.add(rows, standard, weight)
-    patches = _patches(source)
+    patches = patches_of(source)
     by_patch = np.zeros((patches.max() + 1, len(sums.slope)))
     np.add.at(by_patch, patches, (weight * standard)[:, None] * rows)
     sums.scatter += by_patch.T @ by_patch
@@ -263,12 +264,19 @@ def _whiten(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     way = way[np.unique(np.linspace(0, len(way) - 1, MOMENTS).astype(int))]
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
     walk = CREEP**2 / CREEP_TRAVEL * np.minimum.outer(gone, gone)
+    if is_of_two_ends(way):
+        walk += CARRIED**2 * np.minimum.outer(gone > 0.0, gone > 0.0)
     root = np.linalg.cholesky(walk + HAND**2 * np.eye(len(way)) + 1.0)
     base = screw.strays(way)
     varied = [screw.varied(STEP * one).strays(way) - base for one in np.eye(AXES)]
     white = np.linalg.solve(root, np.concatenate([base, *varied], axis=1))
     standard, *slopes = np.split(white, AXES + 1, axis=1)
     return np.stack([one.T.ravel() / STEP for one in slopes], axis=1), standard.T.ravel()
+
+
+def is_of_two_ends(way: Float[np.ndarray, "times 3"]) -> bool:
+    """Whether only the ends of a way are known, as what carries the part moved meanwhile."""
+    return len(np.unique(way, axis=0)) <= 2
 
 
 def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
@@ -317,10 +325,20 @@ def _subset(seen: Sighting | None, random: np.random.Generator) -> Int[np.ndarra
     return np.sort(random.choice(count, min(count, POINTS), replace=False))
 
 
-def _patches(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+def patches_of(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """The patch that each point is in."""
     cells = np.floor(points / PATCH).astype(int)
     return np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+
+
+def nearness(cloud: Cloud, other: Cloud, motion: Pose) -> Float[np.ndarray, " points"]:
+    """How near the surface of another look each point of a look is, once it has moved (logarithm of
+    Tukey's likelihood, over that of what is far away)."""
+    moved = motion.at(cloud.points)
+    index = other.tree.query(moved)[1]
+    away = np.vecdot(other.normals[index], moved - other.points[index])
+    scale = np.sqrt(cloud.deviation**2 + other.deviation[index] ** 2 + MODEL_ERROR**2)
+    return -0.5 * _biweight(away / scale)
 
 
 def _biweight(standard: np.ndarray) -> np.ndarray:

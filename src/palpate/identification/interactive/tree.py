@@ -4,12 +4,15 @@ All looks count for every joint, and every joint for the labels of all points.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from palpate.identification.interactive.averaging import average
 from palpate.identification.interactive.labels import (
+    AGREES,
+    LEAST_MOTION,
     ON,
     OTHERS,
     TELLING,
@@ -21,7 +24,13 @@ from palpate.identification.interactive.labels import (
     smooth_labels,
 )
 from palpate.identification.interactive.part import Part
-from palpate.identification.interactive.refinement import Estimate, Sighting, refine, sighting
+from palpate.identification.interactive.refinement import (
+    Estimate,
+    Sighting,
+    is_of_two_ends,
+    refine,
+    sighting,
+)
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.perception.clouds import Cloud
 
@@ -30,6 +39,9 @@ UNKNOWN = -1.0  # of evidence of each look: of a point that is of no part that i
 UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
+ALIGNED_WITHIN = 0.05, 0.05, 0.025, 0.025  # m from a part's points to a surface, each time nearer
+MET = 0.4  # share of its points that meet one
+IN_PLANE = 0.2  # of its motion, squared, along the normals of a part: less tells nothing
 TAKEN = 8e-3  # m that a carrier takes the end of a hand's way: less may be an error
 UNSEEN, NOT_HIDDEN = -0.35, 1.5  # the same, of a position in which hardly anything of it is seen
 HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
@@ -106,18 +118,29 @@ class PartTree:
         for part in self.parts:
             part.positions.append(part.positions[-1])
         self.labels.append(np.full(len(cloud.points), -1))
-        look = len(self.looks) - 1
+        look, placed = len(self.looks) - 1, []
         for part in self.ordered():
-            self.find(part, look, others=self.unchanged(part, look), creeps=still)
+            others = self.taken(part, look, look - 1, placed)
+            self.find(part, look, others=others, creeps=still)
+            placed.append(part)
         return look
 
-    def unchanged(self, part: int, look: int) -> Bool[np.ndarray, " points"]:
-        """Which points of a look are not a part's: the look before saw something else there."""
-        if not look:
-            return np.zeros(len(self.looks[look].points), bool)
-        cloud, earlier = self.looks[look], self.looks[look - 1]
-        same = evidence(earlier, cloud.points, cloud.normals) == ON
-        return same & (self.labels[look - 1][earlier.tree.query(cloud.points)[1]] != part)
+    def taken(
+        self, part: int, look: int, other: int, placed: Sequence[int] = ()
+    ) -> Bool[np.ndarray, " points"]:
+        """Which points of a look are not a part's: another look saw something else there, or
+        something of the parts that have been `placed`, which has gone there."""
+        found = np.zeros(len(self.looks[look].points), bool)
+        cloud, seen = self.looks[look], self.looks[other]
+        for label in (-1, *placed):
+            motion = self.motion(label, look, other)
+            if label >= 0 and motion.chord < LEAST_MOTION:
+                continue  # it is where it was
+            points = motion.at(cloud.points)
+            same = evidence(seen, points, motion.turned(cloud.normals)) == ON
+            was = self.labels[other][seen.tree.query(points)[1]]
+            found |= same & (was != part if label < 0 else was == label)
+        return found
 
     def find(
         self,
@@ -147,7 +170,11 @@ class PartTree:
         if around is not None:
             low, high = around - turn, around + turn
         tried = np.arange(low, high, step)
-        best = tried[self.seen_at(part, look, tried, others).argmax()]
+        seen = self.seen_at(part, look, tried, others)
+        if around is None:  # where it never was, it is only if it is seen there
+            strange = (tried < min(one.range[0], last) - step) | (tried > one.range[1] + step)
+            seen[strange & (seen < 0.0)] = -np.inf
+        best = tried[seen.argmax()]
         for _ in range(2):
             tried = np.linspace(best - step, best + step, 7)
             best = tried[self.seen_at(part, look, tried, others).argmax()]
@@ -158,7 +185,37 @@ class PartTree:
             ahead = -HAND_TELLS
         if there > here + ahead:
             one.positions[look] = float(best)
+        self._align(part, look, others)
         return float(max(there, here))
+
+    def _align(
+        self, part: int, look: int, others: Bool[np.ndarray, " points"] | None = None
+    ) -> None:
+        """Take a part, near where it is, to where its points meet the surface that was seen there,
+        along its normals: `evidence` is as good anywhere within the noise (Gauss-Newton)."""
+        one, cloud, screw = self.parts[part], self.looks[look], self.screw(part, look)
+        began = one.positions[look]
+        for reach in ALIGNED_WITHIN:
+            pose = self.pose(part, look)
+            points, normals = pose.at(one.support[0]), pose.turned(one.support[1])
+            distance, index = cloud.tree.query(points, distance_upper_bound=reach + cloud.error)
+            met = np.isfinite(distance)
+            index = np.where(met, index, 0)
+            met &= np.vecdot(cloud.normals[index], normals) > AGREES
+            if others is not None:
+                met &= ~others[index]
+            if met.mean() < MET:
+                break
+            points, index = points[met], index[met]
+            missed = np.vecdot(cloud.normals[index], cloud.points[index] - points)
+            velocity = screw.velocity(points)
+            slope = np.vecdot(cloud.normals[index], velocity)
+            if np.sum(slope**2) < IN_PLANE * np.sum(velocity**2):
+                break  # no normal says where it is
+            one.positions[look] += float(slope @ missed) / float(slope @ slope)
+        before, after = self.seen_at(part, look, np.array([began, one.positions[look]]), others)
+        if after < before:
+            one.positions[look] = began
 
     def seen_at(
         self,
@@ -291,7 +348,7 @@ class PartTree:
             part = self.parts[number]
             found = [self.estimate(part)]
             ways = [self.way_from(part.parent, *way) for way in part.ways]
-            whole = [way for way in ways if len(np.unique(way, axis=0)) > 2]  # of two ends: any
+            whole = [way for way in ways if not is_of_two_ends(way)]  # of two ends: any
             if number == last and len(ways) > 1 and whole:
                 longest = max(whole, key=lambda way: float(np.linalg.norm(way[-1] - way[0])))
                 found += [

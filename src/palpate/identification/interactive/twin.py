@@ -12,13 +12,17 @@ from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
 from palpate.identification.interactive.explanation import (
     FURTHER,
+    MISFIT,
     find_moved_part,
+    joint_of_ways,
     labels_near,
     may_have_moved,
 )
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import HIDDEN, evidence
-from palpate.identification.interactive.part import UNSURE
+from palpate.identification.interactive.part import UNSURE, Part
+from palpate.identification.interactive.refinement import is_of_two_ends, misfit
+from palpate.identification.interactive.screws import screws_of_way
 from palpate.identification.interactive.splitting import split
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
@@ -123,14 +127,30 @@ class Twin(PartTree):
                 reparent(self, number, int(steps.argmax()), new=len(self.parts) - 1)
 
     def _drop_guesses(self) -> None:
-        """Take out guessed parts but the last, which may explain what they did."""
+        """Take out parts that were guessed before the last one was found, which may explain what
+        they did: from one way alone, or from ways in which the last one, it turns out, took them
+        along."""
+        last, dropped = self.parts[-1], False
+        if any(self.parts[part.parent] is last for part in self.parts if part.parent >= 0):
+            for look in range(len(self.looks)):  # also among points that were taken for theirs
+                self.find(len(self.parts) - 1, look)
         for number in reversed(range(len(self.parts) - 1)):
             part = self.parts[number]
-            if part.provisional and len(part.ways) == 1:
+            guessed = part.provisional and len(part.ways) == 1
+            carrier = self.parts[part.parent] if part.parent >= 0 else None
+            if guessed or (carrier is last and self._was_carried(part)):
                 held = [index for index, (one, _) in enumerate(self.held) if one == number]
+                dropped |= not guessed
                 self.remove(number, part.parent)
                 for index in held:
                     self.held[index] = -1, self.held[index][1]
+        for look in range(len(self.looks)) if dropped else ():
+            self.relabel(look)
+
+    def _was_carried(self, part: Part) -> bool:
+        """Whether its carrier moved in all ways that a hand has taken a part."""
+        ways = [self.way_from(part.parent, *way) for way in part.ways]
+        return bool(ways) and all(map(is_of_two_ends, ways))
 
     def _drop_refuted(self, before: int, handling: Handling) -> bool:
         """Take out parts of whose joints next to nothing is known, if the hand was put to them and
@@ -170,6 +190,7 @@ class Twin(PartTree):
                     part.ways
                     and old not in self.carriers(number)
                     and all(may_have_moved(self, number, look, way) for look, way in part.ways)
+                    and joint_of_ways(self, known, [*known.ways, *part.ways]) is not None
                 ):
                     known.ways += part.ways
                     for look in range(len(self.looks)):
@@ -179,17 +200,25 @@ class Twin(PartTree):
 
     def _explain_earlier(self) -> None:
         """Explain what moved and was of no part, now that one more is known that may carry it."""
-        for number, handling in enumerate(self.handled):
-            held, before = self.held[number]
-            if held >= 0 or not handling.moved:
-                continue
-            after = before + 1
-            for look in (before, after):
-                self.relabel(look)
-            # what was no line and no circle then is none now
-            part, new = self._explain(before, after, handling, carried=True)
-            self.held[number] = part, before
-            self._keep(new, before, after)
+        for _ in self.handled:
+            count = len(self.parts)
+            for number, handling in enumerate(self.handled):
+                if self.held[number][0] < 0 and handling.moved:
+                    self._explain_again(number, handling)
+            if len(self.parts) <= count:
+                break
+
+    def _explain_again(self, number: int, handling: Handling) -> None:
+        """Explain one handling before the last, by its number."""
+        before = self.held[number][1]
+        after, way = before + 1, handling.points
+        for look in (before, after):
+            self.relabel(look)
+        # what is no line and no circle is of something on what moved as well
+        carried = min(misfit(one, way) for one in screws_of_way(way)) > MISFIT
+        part, new = self._explain(before, after, handling, carried=carried)
+        self.held[number] = part, before
+        self._keep(new, before, after)
 
     def _explain(
         self, before: int, after: int, handling: Handling, *, carried: bool = False

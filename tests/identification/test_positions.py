@@ -1,0 +1,124 @@
+"""Where parts are in looks: what shows it, what does not, and what a hand says of it."""
+
+import numpy as np
+import pytest
+
+from palpate.identification.interactive.explanation import find_moved_part
+from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.twin import Twin
+from rooms import DOOR, FLAP, Room
+
+pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
+
+
+class Notes(Twin):
+    """A twin that only writes down what a hand has done."""
+
+    def observe(self, handling: Handling) -> None:
+        self.handled.append(handling)
+
+
+def known_door(room: Room) -> Twin:
+    """A twin that has seen a hand open the door, to -0.5 rad."""
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.5, 0.0))
+    assert len(twin.parts) == 1
+    return twin
+
+
+@pytest.fixture
+def room() -> Room:
+    return Room()
+
+
+def test_what_another_part_has_gone_to_is_not_a_part_s(room) -> None:
+    twin = known_door(room)
+    sign = np.sign(twin.parts[0].positions[-1])
+    room.at(-0.9, 0.0)
+    look = twin.add_look(room.look())
+    assert sign * twin.parts[0].positions[look] == pytest.approx(0.9, abs=0.02)
+    screw, points = twin.screw(0, look), twin.looks[look].points
+    turned = np.arctan2(screw.point[0] - points[:, 0], screw.point[1] - points[:, 1])
+    high = (points[:, 2] > 0.4) & (points[:, 2] < 1.8)
+    of_door = high & (np.abs(turned - 0.9) < 0.05) & (points[:, 0] < -0.1)
+    assert of_door.sum() > 300
+    other = len(twin.parts)  # of which no label is
+    assert twin.taken(other, look, look - 1)[of_door].mean() < 0.1
+    assert twin.taken(other, look, look - 1, [0])[of_door].mean() > 0.8
+    assert twin.taken(0, look, look - 1)[of_door].mean() < 0.1
+
+
+def test_a_part_is_taken_to_the_middle_of_the_places_that_explain_it_as_well(room) -> None:
+    twin = known_door(room)
+    sign = np.sign(twin.parts[0].positions[-1])
+    for begun in (0.47, 0.5, 0.54):
+        room.at(-0.5, 0.0)
+        look = twin.add_look(room.look())
+        twin.parts[0].positions[look] = sign * begun
+        twin.find(0, look)
+        assert sign * twin.parts[0].positions[look] == pytest.approx(0.5, abs=0.012)
+
+
+def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(room) -> None:
+    twin = known_door(room)
+    part = twin.parts[0]
+    sign = np.sign(part.positions[-1])
+    room.at(-0.5, 1.3)  # a third of what was taken for the door is seen elsewhere
+    twin.look(room.look())
+    look = len(twin.looks) - 1
+    hidden = np.arange(-1.2, -0.6, 0.04)  # behind the wall
+    there = twin.seen_at(0, look, sign * hidden)
+    assert np.abs(there + 0.4).max() < 0.35
+    part.positions[look] = 0.0
+    twin.find(0, look, beyond=1.5)
+    assert sign * part.positions[look] == pytest.approx(0.5, abs=0.05)
+    room.at(-0.9, 0.0)  # it is found further than it ever was
+    look = twin.add_look(room.look())
+    assert sign * part.positions[look] == pytest.approx(0.9, abs=0.05)
+
+
+def test_where_a_hand_takes_a_part_from_corrects_where_it_was_believed_to_be(room) -> None:
+    twin, notes = known_door(room), Notes()
+    part = twin.parts[0]
+    sign = np.sign(part.positions[-1])
+    room.at(-0.75, 0.0)  # it has swung on since it was let go
+    twin.look(room.look())
+    notes.look(twin.looks[-1])
+    room.pull(notes, DOOR, (-0.75, 0.0), (-0.3, 0.0))
+    (handling,) = notes.handled
+    before = len(twin.looks) - 1
+    after = twin.add_look(handling.after)
+    part.positions[before] = sign * 0.5  # and the look before did not show it
+    twin.relabel(before)
+    assert find_moved_part(twin, before, after, handling) == 0
+    places = sign * np.array(part.positions)[[before, after]]
+    assert places == pytest.approx([0.75, 0.3], abs=0.03)
+    assert (twin.labels[before] == 0).sum() > 500
+
+
+def test_a_short_way_along_a_wall_is_not_the_slide_of_the_wall(room) -> None:
+    twin = Twin()
+    room.at(-1.5, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (-1.5, 0.0), (-1.4, 0.0))
+    (part,) = twin.parts
+    assert part.screw.joint == "revolute"
+    assert room.error(twin, 0, 0)[0] < 5.0
+    wall = twin.looks[0].points[:, 0] > 0.1
+    assert (twin.labels[0][wall] == 0).mean() < 0.05
+
+
+def test_a_pull_that_moved_two_joints_is_no_other_way_of_one_of_them(room) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, FLAP, (0.0, 0.0), (-0.5, 0.7))
+    room.pull(twin, DOOR, (-0.5, 0.7), (-0.1, 0.7))
+    assert [part.parent for part in twin.parts] == [-1, 0]
+    assert [held for held, _ in twin.held] == [1, 0]
+    for part in (0, 1):
+        turned, aside = room.error(twin, part, part)
+        assert turned < 5.0
+        assert aside < 3.0

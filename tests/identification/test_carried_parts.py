@@ -348,7 +348,7 @@ def test_what_is_known_to_be_another_part_does_not_show_where_a_part_is() -> Non
     known = refine(slide, np.zeros(2), [None, None], [(0, way)])
     tree.parts.append(Part(-1, known, [0.0, 0.0], {}, [(0, way)], (support, normals)))
     tree.parts[0].positions[0] = 1.0  # it has been there, so that it is sought there
-    tree.find(0, 1, others=tree.taken(0, 1, 0))
+    tree.find(0, 1, others=tree.points_of_others(0, 1, 0))
     assert tree.parts[0].positions[1] == 0.0
     tree.find(0, 1)
     assert tree.parts[0].positions[1] == pytest.approx(1.0, abs=0.05)

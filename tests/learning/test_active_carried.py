@@ -172,7 +172,7 @@ def test_what_a_hand_took_and_no_joint_explained_is_taken_elsewhere_next():
             for value, push in tried(twin)
             if abs(push.point[0] - first.point[0]) < 0.1
         ]
-        assert (max(near)[1] > active.AROUND) == far
+        assert (max(near)[1] > active.NEAR_IT) == far
 
 
 def test_a_pull_that_tells_little_of_a_door_costs_the_wall_little_trust():

@@ -31,8 +31,11 @@ JOINT = 15.0  # nats that a joint is worth which was not known
 FORCES = 4.0  # nats that are worth masses and what resists one way, where no long way went there
 LONG = 0.1  # m of a way that tells them
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
-UNEXPLAINED, AROUND = 0.4, 0.15  # the same, within as many m of where a hand took something that
-# no joint explained
+TRIED_BEFORE, NEAR_IT = (
+    0.4,
+    0.15,
+)  # what is left where a hand took something that no joint explained,
+# within as many m
 BESIDE = 0.05  # m from a surface at which a hand was still on it
 BEHIND = 0.03  # m
 FEWEST = 10  # points of a part that a hand can be put to
@@ -149,7 +152,7 @@ def _tries(
         for pull in pulls:
             if pull.moved:  # and nothing was found: it would be the same again
                 away = np.linalg.norm(points - pull.point, axis=1)
-                value = value * UNEXPLAINED ** (away < AROUND)
+                value = value * TRIED_BEFORE ** (away < NEAR_IT)
         best = int(np.argmax(value))
         found.append((float(value[best]), Push(points[best], directions[best])))
     return found

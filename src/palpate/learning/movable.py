@@ -17,8 +17,8 @@ from palpate.perception.surfaces import Surface
 # Shares of the joints: each of four, of one, and each of two.
 HINGE, ALONG_NORMAL, ALONG_SIDE = 0.15, 0.24, 0.08
 JOINTS = 7
-# A hinge is as likely as this power of the lever that handles have about it, and a constant for
-# what is no handle, as the knobs of a panel beside a door.
+# A hinge is as likely as this power of the lever that handles have about it. A constant is added,
+# as what stands off may be no handle: knobs of a panel beside a door.
 LEVER, LEAST_LEVER = 2.0, 0.1
 # Pieces of a surface, from one share of a side of its rectangle to another, and how many parts are
 # such a piece along either side; the others are all of their surface, 130 of 200 generated ones.

@@ -191,7 +191,7 @@ def _gain(
     tree: PartTree, before: int, after: int, new: Discovery, way: Float[np.ndarray, "times 3"]
 ) -> float:
     """How much likelier two looks and a hand's way are with a new part than without (logarithm,
-    less that of Bayesian information for its numbers).
+    less what its numbers cost by the Bayesian information criterion).
 
     What is explained as well without it says nothing for it: a wall may slide in its plane.
     """
@@ -206,7 +206,7 @@ def _gain(
         more = np.where(more > 0.0, more + fit, 0.0)
         gain += float(np.sum(np.bincount(patch, more) / np.bincount(patch)))
     numbers = 4.0 if estimate.screw.joint == "revolute" else 2.0
-    strays = misfit(estimate.screw, way) * 2.0 * len(way[:MOMENTS])
+    strays = misfit(estimate.screw, way) * 2.0 * min(len(way), MOMENTS)
     return gain - 0.5 * strays - 0.5 * numbers * math.log(max(estimate.independent, 2.0))
 
 
@@ -239,13 +239,13 @@ def insert(
     guessed = new.carrier >= 0 and way is not None
     tree.parts.append(Part(parent, estimate, positions, seen, ways, support, guessed))
     for look, mask in seen.items():
-        tree.labels[look] = tree.labels[look].copy()
+        tree.labels[look] = np.where(np.isin(tree.labels[look], same), number, tree.labels[look])
         tree.labels[look][mask] = number
-    related = {number, *tree.carriers(number), *carried, *same}
+    related = {*tree.carriers(number), *carried, *same}
     strange = [other for other in range(number) if other not in related]
     for look in (*reversed(range(before)), *range(after + 1, len(tree.looks))):
         known, step = (before, 1) if look < before else (after, -1)
-        others = np.isin(tree.labels[look], strange) | tree.taken(number, look, known)
+        others = np.isin(tree.labels[look], strange) | tree.points_of_others(number, look, known)
         tree.parts[number].positions[look] = tree.parts[number].positions[look + step]
         # a pull that told nothing may have moved it, and far
         tree.find(number, look, others=others, beyond=FURTHER if look < before else None)

@@ -96,13 +96,14 @@ def _by_way(tree: PartTree, before: int, after: int, handling: Handling) -> int:
 def _follows_hand(tree: PartTree, part: int, before: int, after: int, handling: Handling) -> bool:
     """Whether a look shows a part where a hand has taken it, and nothing else has moved.
 
-    It is there from now on, or where it was found without the hand.
+    It is there from now on, or where it was found without the hand. Where the hand says that it
+    began elsewhere than was believed, and it is seen better there, it did. If not, nothing changes.
     """
-    screw, one = tree.screw(part, before), tree.parts[part]
+    screw, one, labels = tree.screw(part, before), tree.parts[part], tree.labels[before]
     start, alone = handling.points[:3].mean(axis=0), one.positions[after]
     gone = float(screw.position_of(start, handling.points)[-3:].mean())
     around = one.positions[before] + gone
-    tree.find(part, after, around, tree.taken(part, after, before))
+    tree.find(part, after, around, tree.points_of_others(part, after, before))
     missed = abs(one.positions[after] - one.positions[before] - gone)
     arm = float(np.linalg.norm(screw.velocity(start)))
     began, moved_back = one.positions[before], alone - gone
@@ -115,15 +116,15 @@ def _follows_hand(tree: PartTree, part: int, before: int, after: int, handling: 
     ):
         return True
     one.positions[before], one.positions[after] = began, alone
-    tree.relabel(before)
+    tree.put_labels(before, labels)
     return False
 
 
 def _may_have_been(
     tree: PartTree, part: int, look: int, position: float, hand: Float[np.ndarray, "3"]
 ) -> bool:
-    """Whether a part may have been elsewhere in a look than was believed: at the hand, and not
-    seen worse there, as of a door that is seen edge-on."""
+    """Whether a part may have been at another position (rad or m) in a look than was believed: at
+    the hand (m), and seen better there."""
     one = tree.parts[part]
     there, here = tree.seen_at(part, look, np.array([position, one.positions[look]]))
     points = tree.pose(one.parent, look).at(one.screw.pose(position).at(one.support[0]))
@@ -206,7 +207,7 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
         # two joints that move at once may do as one, elsewhere
         if joint is None or one.estimate.refutes(joint.screw):
             continue
-        kept = one.estimate, one.positions
+        kept, labels = (one.estimate, one.positions), tree.labels[before]
         one.settle(dataclasses.replace(joint, positions=np.array(one.positions_of(joint.screw))))
         if _follows_hand(tree, part, before, after, handling) and not _is_in_the_way(
             tree, part, after
@@ -214,6 +215,7 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
             one.ways = ways
             return part
         one.estimate, one.positions = kept
+        tree.put_labels(before, labels)
     return -1
 
 

@@ -20,7 +20,7 @@ from palpate.perception.clouds import Cloud
 CREEP = 3e-3  # m by which a hand may have crept on its hold over `CREEP_TRAVEL`, as a random walk
 CREEP_TRAVEL = 0.3  # m
 HAND = 1e-3  # m, how well the hand is known to itself
-CARRIED = 4e-3  # m, how well the end of a way is known of which only the ends are
+END_ERROR = 4e-3  # m, of the end of a way in which what carries the part moved as well
 ALIKE = 0.8  # cosine of the angle between normals of the same surface
 CUTOFF = 4.685  # standard deviations: Tukey's biweight, 95 % as efficient as least squares
 PATCH = 0.08  # m: the errors of points so near each other are not independent
@@ -241,7 +241,8 @@ def _add_travel(
     rows, start = np.zeros((1, len(sums.slope))), way[:3].mean(axis=0)
     gone = positions[before + 1] - positions[before]
     travel = float(np.linalg.norm(way[-1] - way[0]))
-    scale = math.hypot(HAND, CREEP * math.sqrt(travel / CREEP_TRAVEL))
+    carried = END_ERROR if is_of_two_ends(way) else 0.0
+    scale = math.hypot(HAND, CREEP * math.sqrt(travel / CREEP_TRAVEL), carried)
 
     def error(screw: Screw) -> float:
         went = float(screw.position_of(start, way)[-3:].mean())
@@ -265,7 +266,7 @@ def _whiten(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
     walk = CREEP**2 / CREEP_TRAVEL * np.minimum.outer(gone, gone)
     if is_of_two_ends(way):
-        walk += CARRIED**2 * np.minimum.outer(gone > 0.0, gone > 0.0)
+        walk += END_ERROR**2 * np.minimum.outer(gone > 0.0, gone > 0.0)
     root = np.linalg.cholesky(walk + HAND**2 * np.eye(len(way)) + 1.0)
     base = screw.strays(way)
     varied = [screw.varied(STEP * one).strays(way) - base for one in np.eye(AXES)]
@@ -276,7 +277,7 @@ def _whiten(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def is_of_two_ends(way: Float[np.ndarray, "times 3"]) -> bool:
     """Whether only the ends of a way are known, as what carries the part moved meanwhile."""
-    return len(np.unique(way, axis=0)) <= 2
+    return len(np.unique(np.round(way, 9), axis=0)) <= 2
 
 
 def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
@@ -326,19 +327,20 @@ def _subset(seen: Sighting | None, random: np.random.Generator) -> Int[np.ndarra
 
 
 def patches_of(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """The patch that each point is in."""
+    """The number of the cube of `PATCH` m that each point is in."""
     cells = np.floor(points / PATCH).astype(int)
     return np.unique(cells, axis=0, return_inverse=True)[1].ravel()
 
 
 def nearness(cloud: Cloud, other: Cloud, motion: Pose) -> Float[np.ndarray, " points"]:
     """How near the surface of another look each point of a look is, once it has moved (logarithm of
-    Tukey's likelihood, over that of what is far away)."""
+    Tukey's likelihood, over that of what is far away or meets nothing)."""
     moved = motion.at(cloud.points)
-    index = other.tree.query(moved)[1]
+    distance, index = other.tree.query(moved)
     away = np.vecdot(other.normals[index], moved - other.points[index])
     scale = np.sqrt(cloud.deviation**2 + other.deviation[index] ** 2 + MODEL_ERROR**2)
-    return -0.5 * _biweight(away / scale)
+    met = distance < NEAR[0] + 3.0 * other.error
+    return np.where(met, -0.5 * _biweight(away / scale), 0.0)
 
 
 def _biweight(standard: np.ndarray) -> np.ndarray:

@@ -39,9 +39,10 @@ UNKNOWN = -1.0  # of evidence of each look: of a point that is of no part that i
 UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
-ALIGNED_WITHIN = 0.05, 0.05, 0.025, 0.025  # m from a part's points to a surface, each time nearer
-MET = 0.4  # share of its points that meet one
-IN_PLANE = 0.2  # of its motion, squared, along the normals of a part: less tells nothing
+REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that they are to meet
+LEAST_MET = 0.4  # share of its points that meet one
+ALONG_NORMALS = 0.2  # least share of its squared motion that is along normals: they tell how far
+FARTHEST = 0.15  # rad or m that it is moved so
 TAKEN = 8e-3  # m that a carrier takes the end of a hand's way: less may be an error
 UNSEEN, NOT_HIDDEN = -0.35, 1.5  # the same, of a position in which hardly anything of it is seen
 HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
@@ -120,25 +121,26 @@ class PartTree:
         self.labels.append(np.full(len(cloud.points), -1))
         look, placed = len(self.looks) - 1, []
         for part in self.ordered():
-            others = self.taken(part, look, look - 1, placed)
+            others = self.points_of_others(part, look, look - 1, placed)
             self.find(part, look, others=others, creeps=still)
             placed.append(part)
         return look
 
-    def taken(
-        self, part: int, look: int, other: int, placed: Sequence[int] = ()
+    def points_of_others(
+        self, part: int, look: int, reference: int, placed: Sequence[int] = ()
     ) -> Bool[np.ndarray, " points"]:
-        """Which points of a look are not a part's: another look saw something else there, or
-        something of the parts that have been `placed`, which has gone there."""
+        """Which points of a look are not a part's: a look for `reference` saw something else there,
+        or one of the parts whose numbers are in `placed`, which has gone there."""
         found = np.zeros(len(self.looks[look].points), bool)
-        cloud, seen = self.looks[look], self.looks[other]
+        cloud, seen = self.looks[look], self.looks[reference]
         for label in (-1, *placed):
-            motion = self.motion(label, look, other)
-            if label >= 0 and motion.chord < LEAST_MOTION:
+            motion = self.motion(label, look, reference)
+            gone = max(motion.chord, float(np.linalg.norm(motion.origin)))
+            if label >= 0 and gone < LEAST_MOTION:
                 continue  # it is where it was
             points = motion.at(cloud.points)
             same = evidence(seen, points, motion.turned(cloud.normals)) == ON
-            was = self.labels[other][seen.tree.query(points)[1]]
+            was = self.labels[reference][seen.tree.query(points)[1]]
             found |= same & (was != part if label < 0 else was == label)
         return found
 
@@ -151,9 +153,10 @@ class PartTree:
         beyond: float | None = None,
         creeps: bool = False,
     ) -> float:
-        """Where a part is in a look: where it was, unless another position is clearly better.
+        """Where a part is in a look: where it was, unless another position is clearly better, and
+        there where its points meet what was seen. Where it never was it is only if it is seen.
 
-        Returns the evidence of the look, for each point, for the likeliest position of all.
+        Returns the evidence of the look, for each point, for the likeliest position that was tried.
 
         `around` is where a hand has taken it: there it is, unless it clearly has not moved. What
         closes flush with another surface is as well seen where it was, when it has gone. Points
@@ -172,7 +175,7 @@ class PartTree:
         tried = np.arange(low, high, step)
         seen = self.seen_at(part, look, tried, others)
         if around is None:  # where it never was, it is only if it is seen there
-            strange = (tried < min(one.range[0], last) - step) | (tried > one.range[1] + step)
+            strange = (tried < one.range[0] - step) | (tried > one.range[1] + step)
             seen[strange & (seen < 0.0)] = -np.inf
         best = tried[seen.argmax()]
         for _ in range(2):
@@ -192,10 +195,13 @@ class PartTree:
         self, part: int, look: int, others: Bool[np.ndarray, " points"] | None = None
     ) -> None:
         """Take a part, near where it is, to where its points meet the surface that was seen there,
-        along its normals: `evidence` is as good anywhere within the noise (Gauss-Newton)."""
+        along its normals: `evidence` is as good anywhere within the noise (Gauss-Newton).
+
+        Points of `others` are not met.
+        """
         one, cloud, screw = self.parts[part], self.looks[look], self.screw(part, look)
         began = one.positions[look]
-        for reach in ALIGNED_WITHIN:
+        for reach in REACHES:
             pose = self.pose(part, look)
             points, normals = pose.at(one.support[0]), pose.turned(one.support[1])
             distance, index = cloud.tree.query(points, distance_upper_bound=reach + cloud.error)
@@ -204,15 +210,16 @@ class PartTree:
             met &= np.vecdot(cloud.normals[index], normals) > AGREES
             if others is not None:
                 met &= ~others[index]
-            if met.mean() < MET:
+            if met.mean() < LEAST_MET:
                 break
             points, index = points[met], index[met]
             missed = np.vecdot(cloud.normals[index], cloud.points[index] - points)
             velocity = screw.velocity(points)
             slope = np.vecdot(cloud.normals[index], velocity)
-            if np.sum(slope**2) < IN_PLANE * np.sum(velocity**2):
+            if slope @ slope <= ALONG_NORMALS * np.sum(velocity**2):
                 break  # no normal says where it is
-            one.positions[look] += float(slope @ missed) / float(slope @ slope)
+            there = one.positions[look] + float(slope @ missed) / float(slope @ slope)
+            one.positions[look] = float(np.clip(there, began - FARTHEST, began + FARTHEST))
         before, after = self.seen_at(part, look, np.array([began, one.positions[look]]), others)
         if after < before:
             one.positions[look] = began
@@ -332,9 +339,13 @@ class PartTree:
 
     def relabel(self, look: int) -> None:
         """Say anew which part each point of a look is of."""
-        self.labels[look] = self.probabilities(look).argmax(axis=0) - 1
+        self.put_labels(look, self.probabilities(look).argmax(axis=0) - 1)
+
+    def put_labels(self, look: int, labels: Int[np.ndarray, " points"]) -> None:
+        """Say which part each point of a look is of."""
+        self.labels[look] = labels
         for number, part in enumerate(self.parts):
-            part.seen[look] = np.flatnonzero(self.labels[look] == number)
+            part.seen[look] = np.flatnonzero(labels == number)
 
     # --- joints -------------------------------------------------------------------------------
 

@@ -51,9 +51,8 @@ class Twin(PartTree):
         if part < 0 and handling.moved and self._drop_refuted(before, handling):
             part, new = self._explain(before, after, handling)
         self.held.append((part, before))
-        count = len(self.parts)
-        self._keep(new, before, after)
-        if new and len(self.parts) == count:
+        new = self._keep(new, before, after)
+        if new:
             self._put_back(before, after)
             self._take_from_carrier(before)
         self._hang(before, after)
@@ -127,24 +126,24 @@ class Twin(PartTree):
                 reparent(self, number, int(steps.argmax()), new=len(self.parts) - 1)
 
     def _drop_guesses(self) -> None:
-        """Take out parts that were guessed before the last one was found, which may explain what
-        they did: from one way alone, or from ways in which the last one, it turns out, took them
-        along."""
-        last, dropped = self.parts[-1], False
-        if any(self.parts[part.parent] is last for part in self.parts if part.parent >= 0):
-            for look in range(len(self.looks)):  # also among points that were taken for theirs
-                self.find(len(self.parts) - 1, look)
-        for number in reversed(range(len(self.parts) - 1)):
+        """Take out parts that the last one may explain: those guessed from one way, and those on
+        the last one that a hand only took while that moved as well, it turns out."""
+        last = len(self.parts) - 1
+        on_last = [number for number, part in enumerate(self.parts) if part.parent == last]
+        kept = list(self.parts[last].positions)
+        for look in range(len(self.looks)) if on_last else ():
+            self.find(last, look)  # also among points that were taken for theirs
+        carried = [number for number in on_last if self._was_carried(self.parts[number])]
+        if not carried:
+            self.parts[last].positions = kept
+        for number in reversed(range(last)):
             part = self.parts[number]
-            guessed = part.provisional and len(part.ways) == 1
-            carrier = self.parts[part.parent] if part.parent >= 0 else None
-            if guessed or (carrier is last and self._was_carried(part)):
+            if number in carried or (part.provisional and len(part.ways) == 1):
                 held = [index for index, (one, _) in enumerate(self.held) if one == number]
-                dropped |= not guessed
                 self.remove(number, part.parent)
                 for index in held:
                     self.held[index] = -1, self.held[index][1]
-        for look in range(len(self.looks)) if dropped else ():
+        for look in range(len(self.looks)) if carried else ():
             self.relabel(look)
 
     def _was_carried(self, part: Part) -> bool:
@@ -172,13 +171,20 @@ class Twin(PartTree):
             if anywhere and not part.ways:
                 self.remove(number, part.parent)
 
-    def _keep(self, new: bool, before: int, after: int) -> None:
-        """Say anew what two looks show; a new part that explains nothing vanishes (III-B d)."""
+    def _keep(self, new: bool, before: int, after: int) -> bool:
+        """Say anew what two looks show; a new part that explains nothing vanishes (III-B d).
+
+        Whether there is a new part.
+        """
         for look in (before, after):
             self.relabel(look)
         number = len(self.parts) - 1
         if new and max((self.labels[look] == number).sum() for look in (before, after)) < FEWEST:
             self.remove(number, self.parts[number].parent)
+            # what carries it was not held: that pull is not explained
+            self.held = [(-1 if look == before else held, look) for held, look in self.held]
+            return False
+        return new
 
     def _merge(self) -> None:
         """Parts whose ways were all those of another one, which was there, are that one."""
@@ -209,7 +215,7 @@ class Twin(PartTree):
                 break
 
     def _explain_again(self, number: int, handling: Handling) -> None:
-        """Explain one handling before the last, by its number."""
+        """Explain one handling anew, by its number."""
         before = self.held[number][1]
         after, way = before + 1, handling.points
         for look in (before, after):

@@ -8,7 +8,7 @@ from palpate.identification.interactive import twin as twin_module
 from palpate.identification.interactive.explanation import find_moved_part
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.twin import Twin
-from rooms import DOOR, FLAP, Room
+from rooms import DOOR, Room
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
@@ -186,17 +186,3 @@ def test_a_short_way_along_a_wall_is_not_the_slide_of_the_wall(room) -> None:
     assert room.error(twin, 0, 0)[0] < 5.0
     wall = twin.looks[0].points[:, 0] > 0.1
     assert (twin.labels[0][wall] == 0).mean() < 0.05
-
-
-def test_a_pull_that_moved_two_joints_is_no_other_way_of_one_of_them(room) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, FLAP, (0.0, 0.0), (-0.5, 0.7))
-    room.pull(twin, DOOR, (-0.5, 0.7), (-0.1, 0.7))
-    assert [part.parent for part in twin.parts] == [-1, 0]
-    assert [held for held, _ in twin.held] == [1, 0]
-    for part in (0, 1):
-        turned, aside = room.error(twin, part, part)
-        assert turned < 5.0
-        assert aside < 3.0

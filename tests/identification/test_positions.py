@@ -76,7 +76,7 @@ def test_where_a_known_door_has_gone_no_other_part_is_seen(room) -> None:
     assert of_door.sum() > 300
     other = len(twin.parts)  # of which no label is
     assert twin.points_of_others(other, look, look - 1)[of_door].mean() < 0.1
-    assert twin.points_of_others(other, look, look - 1, [0])[of_door].mean() > 0.8
+    assert twin.has_gone_to(0, look, look - 1)[of_door].mean() > 0.8
     assert twin.points_of_others(0, look, look - 1)[of_door].mean() < 0.1
 
 
@@ -92,7 +92,7 @@ def test_where_a_known_drawer_has_gone_no_other_part_is_seen() -> None:
     front = (points[:, 0] < -0.4) & (points[:, 2] > 1.32) & (points[:, 2] < 1.68)
     assert front.sum() > 300
     assert twin.points_of_others(1, look, look - 1)[front].mean() < 0.1
-    assert twin.points_of_others(1, look, look - 1, [0])[front].mean() > 0.8
+    assert twin.has_gone_to(0, look, look - 1)[front].mean() > 0.8
 
 
 def test_a_new_part_that_explains_nothing_leaves_all_as_it_was(room, monkeypatch) -> None:

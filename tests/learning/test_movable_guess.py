@@ -9,6 +9,8 @@ from palpate.experiments.appliance.movable_surfaces import area_under_curve, log
 from palpate.learning.movable_guess import FURTHEST, fit_guess, load_guess
 from palpate.perception.surface_features import FEATURES
 
+pytestmark = pytest.mark.optimised
+
 
 @pytest.fixture(scope="module")
 def ring():

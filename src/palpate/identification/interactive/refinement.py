@@ -277,7 +277,8 @@ def _whiten(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def is_of_two_ends(way: Float[np.ndarray, "times 3"]) -> bool:
     """Whether only the ends of a way are known, as what carries the part moved meanwhile."""
-    return len(np.unique(np.round(way, 9), axis=0)) <= 2
+    way = np.round(way, 9)
+    return bool(np.all(np.all(way == way[0], axis=1) | np.all(way == way[-1], axis=1)))
 
 
 def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
@@ -336,10 +337,12 @@ def nearness(cloud: Cloud, other: Cloud, motion: Pose) -> Float[np.ndarray, " po
     """How near the surface of another look each point of a look is, once it has moved (logarithm of
     Tukey's likelihood, over that of what is far away or meets nothing)."""
     moved = motion.at(cloud.points)
-    distance, index = other.tree.query(moved)
+    reach = NEAR[0] + 3.0 * other.error
+    distance, index = other.tree.query(moved, distance_upper_bound=reach)
+    met = np.isfinite(distance)
+    index = np.where(met, index, 0)
     away = np.vecdot(other.normals[index], moved - other.points[index])
     scale = np.sqrt(cloud.deviation**2 + other.deviation[index] ** 2 + MODEL_ERROR**2)
-    met = distance < NEAR[0] + 3.0 * other.error
     return np.where(met, -0.5 * _biweight(away / scale), 0.0)
 
 

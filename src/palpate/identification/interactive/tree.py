@@ -4,7 +4,6 @@ All looks count for every joint, and every joint for the labels of all points.
 """
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,6 +36,7 @@ from palpate.perception.clouds import Cloud
 FEWEST = 40  # points of a part in a look
 UNKNOWN = -1.0  # of evidence of each look: of a point that is of no part that is known
 UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
+NOTHING = -2  # in the place of a label: nothing was seen there
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
 REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that they are to meet
@@ -119,29 +119,37 @@ class PartTree:
         for part in self.parts:
             part.positions.append(part.positions[-1])
         self.labels.append(np.full(len(cloud.points), -1))
-        look, placed = len(self.looks) - 1, []
+        look = len(self.looks) - 1
+        if not self.parts:
+            return look
+        stood, gone = self._labels_in(look - 1, look, -1), np.zeros(len(cloud.points), bool)
         for part in self.ordered():
-            others = self.points_of_others(part, look, look - 1, placed)
+            others = gone | ((stood != part) & (stood != NOTHING))
             self.find(part, look, others=others, creeps=still)
-            placed.append(part)
+            gone |= self.has_gone_to(part, look, look - 1)
         return look
 
-    def points_of_others(
-        self, part: int, look: int, reference: int, placed: Sequence[int] = ()
-    ) -> Bool[np.ndarray, " points"]:
-        """Which points of a look are not a part's: a look for `reference` saw something else there,
-        or one of the parts whose numbers are in `placed`, which has gone there."""
-        found = np.zeros(len(self.looks[look].points), bool)
+    def points_of_others(self, part: int, look: int, reference: int) -> Bool[np.ndarray, " points"]:
+        """Which points of a look are not a part's: a look for `reference` saw something else."""
+        stood = self._labels_in(reference, look, -1)
+        return (stood != part) & (stood != NOTHING)
+
+    def has_gone_to(self, part: int, look: int, reference: int) -> Bool[np.ndarray, " points"]:
+        """Which points of a look another one saw on a part, which has moved from there."""
+        motion = self.motion(part, look, reference)
+        if max(motion.chord, float(np.linalg.norm(motion.origin))) < LEAST_MOTION:
+            return np.zeros(len(self.looks[look].points), bool)  # it is where it was
+        return self._labels_in(reference, look, part) == part
+
+    def _labels_in(self, reference: int, look: int, part: int) -> Int[np.ndarray, " points"]:
+        """What a look for `reference` saw where points of a look were, if they moved with a part
+        (-1: not at all): its labels, `NOTHING` where it saw no such surface."""
         cloud, seen = self.looks[look], self.looks[reference]
-        for label in (-1, *placed):
-            motion = self.motion(label, look, reference)
-            gone = max(motion.chord, float(np.linalg.norm(motion.origin)))
-            if label >= 0 and gone < LEAST_MOTION:
-                continue  # it is where it was
-            points = motion.at(cloud.points)
-            same = evidence(seen, points, motion.turned(cloud.normals)) == ON
-            was = self.labels[reference][seen.tree.query(points)[1]]
-            found |= same & (was != part if label < 0 else was == label)
+        motion = self.motion(part, look, reference)
+        points = motion.at(cloud.points)
+        same = np.flatnonzero(evidence(seen, points, motion.turned(cloud.normals)) == ON)
+        found = np.full(len(points), NOTHING)
+        found[same] = self.labels[reference][seen.tree.query(points[same])[1]]
         return found
 
     def find(

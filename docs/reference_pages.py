@@ -63,7 +63,7 @@ STAGES = {
         "identification.regression.gaussian_process",
     ],
     "learning": [
-        "learning.active",
+        *("learning.active", "learning.repeats"),
         *("learning.movable", "learning.movable_guess"),
         *("learning.self_supervised", "learning.closed_loop", "learning.dagger"),
         *("learning.loss_monitor", "networks.policy", "networks.controller", "networks.channels"),

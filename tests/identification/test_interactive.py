@@ -14,8 +14,9 @@ from palpate.identification.interactive.labels import evidence, smooth_labels
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.twin import Twin
-from palpate.learning.active import CHOICES, FORCES, WORTHS, Repeat, _tries
+from palpate.learning.active import CHOICES, WORTHS, _tries
 from palpate.learning.movable_guess import MovableGuess, load_guess
+from palpate.learning.repeats import FORCES, Repeat
 from palpate.models.articulated.assembly import assemble
 from palpate.models.articulated.urdf import read_urdf, write_urdf
 from palpate.perception.clouds import Cloud, cloud_of

@@ -186,3 +186,28 @@ def test_a_short_way_along_a_wall_is_not_the_slide_of_the_wall(room) -> None:
     assert room.error(twin, 0, 0)[0] < 5.0
     wall = twin.looks[0].points[:, 0] > 0.1
     assert (twin.labels[0][wall] == 0).mean() < 0.05
+
+
+def test_a_part_is_described_where_its_joint_says_that_it_was(room) -> None:
+    twin = known_door(room)
+    part, shown = twin.parts[0], [0, len(twin.looks) - 1]
+    points, normals = part.support
+    part.support = points + 0.05 * normals, normals
+
+    def seen() -> list[float]:
+        return [
+            float(twin.seen_at(0, at, np.array(part.positions[at : at + 1]))[0]) for at in shown
+        ]
+
+    assert max(seen()) < 0.0
+    twin.refit(-1)
+    assert min(seen()) > 0.7
+
+
+def test_a_part_that_no_look_shows_keeps_its_description(room) -> None:
+    twin = known_door(room)
+    part = twin.parts[0]
+    kept = part.support
+    part.seen = {look: chosen[:5] for look, chosen in part.seen.items()}
+    twin.describe(0)
+    assert part.support is kept

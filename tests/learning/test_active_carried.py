@@ -15,6 +15,7 @@ from palpate.identification.interactive.twin import Twin
 from palpate.learning import active
 from palpate.learning.active import WORTHS
 from palpate.learning.movable_guess import MovableGuess, load_guess
+from palpate.learning.repeats import VAIN, count_vain_pulls, repeats
 from palpate.numerics.pinhole import Pinhole
 from palpate.perception.clouds import cloud_of
 from palpate.perception.surfaces import surfaces
@@ -184,3 +185,49 @@ def test_a_pull_that_tells_little_of_a_door_costs_the_wall_little_trust():
         twin.held = [(-1, 0)]
         values.append(min(tried(twin), key=lambda one: one[1].point[0])[0])
     assert values[0] > 1.05 * values[1]
+
+
+@pytest.mark.parametrize("sideways", [False, True])
+def test_what_a_hand_took_away_and_is_back_may_go_the_same_way_again(sideways):
+    twin = unknown_door()
+    point = DOOR.point + np.array([0.0, 0.3, 0.1])
+    way = DOOR.axis if sideways else OUT
+    short = pulled(twin, point, moved=True)
+    short = dataclasses.replace(
+        short, push=Push(point, way), points=point + np.linspace(0.0, 0.15, 10)[:, None] * way
+    )
+    twin.handled, twin.held = [short], [(-1, 0)]
+    every = surfaces(twin.looks[1], twin.labels[1], np.random.default_rng(0))
+    door = max((one for one in every if one.centre[0] > -0.15), key=lambda one: one.area)
+    ((pull,), _) = active._pulls_at(twin, door, twin.looks[1], 1)
+    # what slid along is still there: it may be at its end
+    assert pull.moved
+    assert pull.ended == sideways
+
+
+@pytest.mark.parametrize(("held", "length", "count"), [(-1, 0.015, 2), (0, 0.015, 0), (-1, 0.2, 0)])
+def test_short_pulls_of_which_nothing_is_found_make_others_that_way_worth_less(held, length, count):
+    twin, point = twin_at([0.0]), DOOR.point + np.array([0.0, 0.6, 0.4])
+    one = pulled(twin, point, moved=True)
+    one = dataclasses.replace(one, points=point + np.linspace(0.0, length, 10)[:, None] * OUT)
+
+    def values() -> tuple[np.ndarray, np.ndarray]:
+        pulls = repeats(twin, 0, np.random.default_rng(0), WORTHS["information"].of_repeat, {})
+        ways = np.array([push.direction for _, push in pulls])
+        return np.array([value for value, _ in pulls]), np.sign(ways @ OUT)
+
+    before, ways = values()
+    twin.handled, twin.held = 2 * [one], 2 * [(held, 0)]
+    after, _ = values()
+    assert sorted(ways) == [-1.0, 1.0]
+    if count:  # else other things are known of the door, and of how it ends
+        assert after == pytest.approx(before * VAIN ** (count * (ways > 0.0)))
+    signs = {sign: count_vain_pulls(twin, 0, sign) for sign in (-1.0, 1.0)}
+    opens = float(np.sign(DOOR.velocity(point) @ OUT))
+    assert signs == {opens: count, -opens: 0}
+    if held == -1:  # so are tries of what is on it
+        guess, worth = load_guess(), WORTHS["information"]
+        now = active._tries(twin, 0, np.random.default_rng(0), guess, worth, 0)
+        twin.handled, twin.held = [], []
+        first = active._tries(twin, 0, np.random.default_rng(0), guess, worth, 0)
+        assert (max(one for one, _ in now) < max(one for one, _ in first)) == bool(count)

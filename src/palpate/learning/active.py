@@ -10,37 +10,37 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Push
-from palpate.identification.interactive.part import Part
-from palpate.identification.interactive.refinement import way_information
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
 from palpate.learning import movable
 from palpate.learning.movable_guess import MovableGuess, load_guess
+from palpate.learning.repeats import (
+    BESIDE,
+    REACH,
+    VAIN,
+    Repeat,
+    count_vain_pulls,
+    information_of_repeat,
+    loss_of_repeat,
+    repeats,
+    room,
+)
 from palpate.perception.clouds import Cloud
 from palpate.perception.surface_features import features_of
 from palpate.perception.surfaces import STANDS_OFF, Surface, surfaces
 
 JOINT = 15.0  # nats that a joint is worth which was not known
-FORCES = 4.0  # nats that are worth masses and what resists one way, where no long way went there
-LONG = 0.1  # m of a way that tells them
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
-TRIED_BEFORE, NEAR_IT = (
-    0.4,
-    0.15,
-)  # what is left where a hand took something that no joint explained,
-# within as many m
-BESIDE = 0.05  # m from a surface at which a hand was still on it
+# What is left where a hand took something that no joint explained, within as many m.
+TRIED_BEFORE, NEAR_IT = 0.4, 0.15
 BEHIND = 0.03  # m
-FEWEST = 10  # points of a part that a hand can be put to
-REACH = 0.3  # m that a hand goes
-UNKNOWN = 0.3  # of its reach that a hand is expected to take a part beyond where it was seen
 GRIPS = 0.12, 0.38, 0.5, 0.62, 0.88  # shares of a surface's sides at which a hand takes hold
 ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an end
 GIVES = 0.17  # share of a hand's force at which a part goes where its lever is longest, as a rule
@@ -55,29 +55,6 @@ _GUESSED: WeakKeyDictionary[Cloud, tuple[MovableGuess, np.ndarray, Guessed]] = W
 
 Choice = Callable[[Twin, np.random.Generator], Push]
 Points = Float[np.ndarray, "n 3"]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Repeat:
-    """A pull that takes a part by its joint, as it is now, with a hand that begins at `point`.
-
-    `felt` long ways of hands went the same way before. `points` are some of the part's, and `share`
-    is its own of the cloud.
-    """
-
-    part: Part
-    screw: Screw
-    gone: float  # rad or m
-    point: Float[np.ndarray, "3"]
-    felt: int
-    points: Points
-    share: float
-
-    @property
-    def way(self) -> Float[np.ndarray, "25 3"]:
-        """Of the hand, m."""
-        gone = np.linspace(0.0, self.gone, 25)
-        return np.array([self.screw.pose(one).at(self.point[None])[0] for one in gone])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +78,7 @@ def choose_best(
     guess = load_guess() if guess is None else guess
     tries = _tries(twin, look, random, guess, worth)
     hidden = _hidden_tries(twin, look, random, guess, worth)
-    options = [*tries, *_repeats(twin, look, random, worth, hidden)]
+    options = [*tries, *repeats(twin, look, random, worth.of_repeat, hidden)]
     if not options:  # nothing flat is large enough
         return at_random(twin, random)
     return max(options, key=lambda one: one[0])[1]
@@ -153,6 +130,12 @@ def _tries(
             if pull.moved:  # and nothing was found: it would be the same again
                 away = np.linalg.norm(points - pull.point, axis=1)
                 value = value * TRIED_BEFORE ** (away < NEAR_IT)
+        if surface.part >= 0:
+            for sign in (-1.0, 1.0):
+                along = sign * np.sum(
+                    twin.screw(surface.part, look).velocity(points) * directions, axis=1
+                )
+                value = value * VAIN ** (count_vain_pulls(twin, surface.part, sign) * (along > 0.0))
         best = int(np.argmax(value))
         found.append((float(value[best]), Push(points[best], directions[best])))
     return found
@@ -225,7 +208,7 @@ def _force_before_carrier(
     along = np.sum(screw.velocity(points) * directions, axis=1) / lever
     for sign in (-1.0, 1.0):
         ahead = sign * along > GIVES
-        if _room(twin, part, look, sign, REACH / lever) > BLOCKED:
+        if room(twin, part, look, sign, REACH / lever) > BLOCKED:
             force[ahead] = GIVES / np.abs(along[ahead])
     return force
 
@@ -281,7 +264,8 @@ def _pulls_at(
             motion.turned(one.push.direction[None])[0],
             moved=one.moved,
             travel=one.travel,
-            ended=one.travel < ENDED * one.push.travel,
+            ended=one.travel < ENDED * one.push.travel
+            and not (one.moved and _has_left(one.points, surface)),
         )
         if carried:
             force = _force_before_carrier(
@@ -290,6 +274,11 @@ def _pulls_at(
             pull = pull._replace(moved=False, travel=0.0, ended=True, force=float(force[0]))
         pulls.append(pull)
     return pulls, missed
+
+
+def _has_left(way: Float[np.ndarray, "times 3"], surface: Surface) -> bool:
+    """Whether a hand took away what a surface is at: it is there again, and may go as it went."""
+    return abs(float((way[-1] - way[0]) @ surface.normal)) > STANDS_OFF[1]
 
 
 def _at(point: Float[np.ndarray, "3"], surface: Surface, cloud: Cloud) -> bool:
@@ -306,74 +295,10 @@ def _at(point: Float[np.ndarray, "3"], surface: Surface, cloud: Cloud) -> bool:
     return bool(away < max(BESIDE, 1.55 * spacing))
 
 
-def _repeats(
-    twin: Twin,
-    look: int,
-    random: np.random.Generator,
-    worth: Worth,
-    hidden: Mapping[tuple[int, float], float],
-) -> list[tuple[float, Push]]:
-    """Of every part that is known, the pulls either way that would tell of its joint and forces,
-    and bring back what is hidden."""
-    cloud, found = twin.looks[look], []
-    for number, part in enumerate(twin.parts):
-        members = np.flatnonzero(twin.labels[look] == number)
-        if len(members) < FEWEST:
-            continue
-        screw = twin.screw(number, look)
-        options = cloud.points[random.choice(members, min(len(members), 40), replace=False)]
-        point, reach = options[0], REACH
-        if screw.joint == "revolute":
-            arms = np.linalg.norm(np.cross(options - screw.point, screw.axis), axis=1)
-            furthest = np.argsort(arms)[int(0.85 * len(arms))]
-            point, reach = options[furthest], REACH / max(float(arms[furthest]), 0.1)
-        along, share = screw.velocity(point), len(members) / len(cloud.points)
-        ways = [twin.way_from(part.parent, *way) for way in part.ways]
-        gone = [
-            float(part.screw.position_of(way[0], way[-1:])[0])
-            for way in ways
-            if math.dist(way[0], way[-1]) > LONG
-        ]
-        for sign in (-1.0, 1.0):
-            go = sign * min(reach, _room(twin, number, look, sign, reach))
-            felt = sum(one * sign > 0.0 for one in gone)
-            value = worth.of_repeat(Repeat(part, screw, go, point, felt, options, share))
-            value += hidden.get((number, sign), 0.0)
-            found.append((value, Push(point, sign * along / np.linalg.norm(along))))
-    return found
-
-
-def _room(twin: Twin, number: int, look: int, sign: float, reach: float) -> float:
-    """How far (rad or m) a part is expected to go one way: as far as it was seen, and some more
-    where nobody has felt an end."""
-    part = twin.parts[number]
-    here = part.positions[look]
-    seen = max(sign * (end - here) for end in part.range)
-    for one, (held, before) in zip(twin.handled, twin.held, strict=True):
-        if held != number or one.moved or not one.held:
-            continue
-        way = float(one.push.direction @ twin.screw(number, before).velocity(one.push.point))
-        if way * sign > 0.0:
-            return min(seen, max(sign * (part.positions[before] - here), 0.0))
-    return seen + UNKNOWN * reach
-
-
 def _information_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray:
     """Nats: of whether it moves, and of a joint if it does."""
     inner = np.clip(goes, 1e-9, 1.0 - 1e-9)
     return goes * JOINT - inner * np.log(inner) - (1.0 - inner) * np.log(1.0 - inner)
-
-
-def _information_of_repeat(pull: Repeat) -> float:
-    """Nats by which a joint's four numbers become more certain from one more way of a hand.
-
-    To them comes what a long way tells of masses and of what resists, less each time.
-    """
-    way = pull.way
-    before = np.linalg.inv(pull.part.estimate.covariance + 1e-10 * np.eye(4))
-    more = way_information(pull.screw, way)
-    gain = float(0.5 * (np.linalg.slogdet(before + more)[1] - np.linalg.slogdet(before)[1]))
-    return gain + FORCES / (1.0 + pull.felt) ** 2 * (math.dist(way[0], way[-1]) > LONG)
 
 
 def _loss_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray:
@@ -381,20 +306,9 @@ def _loss_of_try(goes: np.ndarray, surface: Surface, cloud: Cloud) -> np.ndarray
     return goes * len(surface.members) / len(cloud.points) * REACH**2
 
 
-def _loss_of_repeat(pull: Repeat) -> float:
-    """Mean square (m^2) by which the cloud is missed, as uncertain as the part's joint is."""
-    there, step = pull.screw.pose(pull.gone).at(pull.points), 1e-5
-    slopes = np.stack([
-        (pull.screw.varied(one).pose(pull.gone).at(pull.points) - there) / step
-        for one in step * np.eye(4)
-    ])  # fmt: skip
-    squares = np.einsum("ink,ij,jnk->n", slopes, pull.part.estimate.covariance, slopes)
-    return pull.share * float(squares.mean())
-
-
 WORTHS = {
-    "information": Worth(_information_of_try, _information_of_repeat),
-    "loss": Worth(_loss_of_try, _loss_of_repeat),
+    "information": Worth(_information_of_try, information_of_repeat),
+    "loss": Worth(_loss_of_try, loss_of_repeat),
 }
 CHOICES: dict[str, Choice] = {
     name: functools.partial(choose_best, worth=worth) for name, worth in WORTHS.items()

@@ -12,6 +12,9 @@ from palpate.perception.clouds import Cloud
 
 SUPPORT = 200  # points of a look that a position is looked for with
 UNSURE = 45.0  # deg: a part whose axis is less known than so is shown by no two looks
+# deg: how well the direction of an axis is known, and shares of the points of the best look that
+# another one has to show to describe a part whose axis is, or is not: its points may not be its own
+KNOWN, SHARES = 3.0, (0.1, 0.3)
 LIKE = 0.95  # cosine of the angle between an edge and the axis that is estimated from it
 HINGE = 0.05  # m between the axes of what turns about one hinge
 
@@ -55,6 +58,19 @@ class Part:
     def range(self) -> tuple[float, float]:
         """The least and the greatest position that was seen."""
         return min(self.positions), max(self.positions)
+
+    def looks_that_describe(self, fewest: int) -> list[int]:
+        """The look that shows most of it, and those at both ends of its range, which may show its
+        other side; of those that show at least `fewest` of its points, and enough beside the most.
+        """
+        most = max(map(len, self.seen.values()), default=0)
+        share = SHARES[0 if self.estimate.intervals[0] < KNOWN else 1]
+        shown = [one for one, own in self.seen.items() if len(own) >= max(fewest, share * most)]
+        if not shown:
+            return []
+        at = self.positions
+        ends = min(shown, key=lambda look: at[look]), max(shown, key=lambda look: at[look])
+        return sorted({max(shown, key=lambda look: len(self.seen[look])), *ends})
 
     def settle(self, estimate: Estimate) -> None:
         """Take an estimate of its joint, and of where it was in each look."""

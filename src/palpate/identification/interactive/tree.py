@@ -22,7 +22,7 @@ from palpate.identification.interactive.labels import (
     scores,
     smooth_labels,
 )
-from palpate.identification.interactive.part import Part
+from palpate.identification.interactive.part import Part, support_of
 from palpate.identification.interactive.refinement import (
     Estimate,
     Sighting,
@@ -376,6 +376,19 @@ class PartTree:
                     if screw.joint != part.screw.joint
                 ]
             part.settle(min(found, key=lambda one: one.criterion))
+            self.describe(number)
+
+    def describe(self, number: int) -> None:
+        """Take a part's points anew from the looks that show it best, where its joint now says that
+        it was: as it was found, it is a little elsewhere."""
+        part = self.parts[number]
+        if not (looks := part.looks_that_describe(FEWEST)):
+            return
+        part.support = support_of(
+            [self.looks[look] for look in looks],
+            [part.seen[look] for look in looks],
+            [self.pose(number, look).inverse for look in looks],
+        )
 
     def estimate(self, part: Part, screw: Screw | None = None) -> Estimate:
         """A part's joint from all looks and ways, beginning with what it is, or with another."""

@@ -1,4 +1,7 @@
-"""Pulls at a part that is known, by its joint: what one more way of a hand would tell of it."""
+"""Pulls at a part that is known, by its joint: what one more way of a hand would tell of it.
+
+In nats, or as the loss that SAGCI rewards (Eqn. 14); see `palpate.learning.active`.
+"""
 
 import dataclasses
 import math

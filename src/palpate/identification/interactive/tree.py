@@ -39,6 +39,7 @@ UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 NOTHING = -2  # in the place of a label: nothing was seen there
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
+THICK = 0.03  # m from one side of a part to the other
 REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that they are to meet
 LEAST_MET = 0.4  # share of its points that meet one
 ALONG_NORMALS = 0.2  # least share of its squared motion that is along normals: they tell how far
@@ -382,13 +383,26 @@ class PartTree:
         """Take a part's points anew from the looks that show it best, where its joint now says that
         it was: as it was found, it is a little elsewhere."""
         part = self.parts[number]
-        if not (looks := part.looks_that_describe(FEWEST)):
+        own = {look: self._own_points(number, look) for look in part.looks_that_describe(FEWEST)}
+        if not (looks := [look for look, chosen in own.items() if len(chosen) >= FEWEST]):
             return
         part.support = support_of(
             [self.looks[look] for look in looks],
-            [part.seen[look] for look in looks],
+            [own[look] for look in looks],
             [self.pose(number, look).inverse for look in looks],
         )
+
+    def _own_points(self, number: int, look: int) -> Int[np.ndarray, " _"]:
+        """The points of a look that are a part's, less those of what it carries, which may have
+        been found since and do not show where the part is: of both sides of that."""
+        own, cloud = self.parts[number].seen[look], self.looks[look]
+        for child, part in enumerate(self.parts):
+            if part.parent == number and part.seen:
+                best = max(part.seen, key=lambda other: len(part.seen[other]))
+                points = self.motion(child, look, best).at(cloud.points[own])
+                away, nearest = self.looks[best].tree.query(points)
+                own = own[(away > THICK) | (self.labels[best][nearest] != child)]
+        return own
 
     def estimate(self, part: Part, screw: Screw | None = None) -> Estimate:
         """A part's joint from all looks and ways, beginning with what it is, or with another."""

@@ -54,7 +54,8 @@ class Twin(PartTree):
         new = self._keep(new, before, after)
         if new:
             self._put_back(before, after)
-            self._take_from_carrier(before)
+            if (carrier := self.parts[-1].parent) >= 0:
+                self.describe(carrier)  # what the new part owns no longer shows where that is
         self._hang(before, after)
         if new:
             self._drop_guesses()
@@ -100,17 +101,6 @@ class Twin(PartTree):
         if moved:
             for look in (before, after):
                 self.relabel(look)
-
-    def _take_from_carrier(self, before: int) -> None:
-        """What the last part turned out to own no longer shows where its carrier is."""
-        carrier = self.parts[-1].parent
-        if carrier < 0:
-            return
-        one, cloud = self.parts[carrier], self.looks[before]
-        nearest = cloud.tree.query(self.pose(carrier, before).at(one.support[0]))[1]
-        kept = self.labels[before][nearest] != len(self.parts) - 1
-        if kept.sum() >= FEWEST:
-            one.support = one.support[0][kept], one.support[1][kept]
 
     def _hang(self, before: int, after: int) -> None:
         """Hang on each part that has moved what it carries."""

@@ -48,6 +48,7 @@ STAGES = {
         *("identification.posterior.diagnostics", "identification.posterior.files"),
         "identification.posterior.settled",
         *("identification.interactive.twin", "identification.interactive.tree"),
+        "identification.interactive.kinematics",
         *("identification.interactive.explanation", "identification.interactive.discovery"),
         *("identification.interactive.shape", "identification.interactive.registration"),
         *("identification.interactive.handling", "identification.interactive.splitting"),

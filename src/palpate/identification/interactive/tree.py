@@ -1,4 +1,4 @@
-"""Parts that carry each other: their joints, where they are in each look, which points they own.
+"""What looks tell of parts that carry each other: their positions, their points and their joints.
 
 All looks count for every joint, and every joint for the labels of all points.
 """
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from palpate.identification.interactive.averaging import average
+from palpate.identification.interactive.kinematics import Kinematics
 from palpate.identification.interactive.labels import (
     AGREES,
     LEAST_MOTION,
@@ -44,9 +45,9 @@ REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that
 LEAST_MET = 0.4  # share of its points that meet one
 ALONG_NORMALS = 0.2  # least share of its squared motion that is along normals: they tell how far
 FARTHEST = 0.15  # rad or m that it is moved so
-TAKEN = 8e-3  # m that a carrier takes the end of a hand's way: less may be an error
-UNSEEN, NOT_HIDDEN = -0.35, 1.5  # the same, of a position in which hardly anything of it is seen
-HAND_TELLS = 0.5  # the same: how much worse one may be that a hand's way says
+# of evidence, and as `NOT_MOVED`: of a position in which hardly anything of it is seen
+UNSEEN, NOT_HIDDEN = -0.35, 1.5
+HAND_TELLS = 0.5  # of evidence, for each point: how much worse one may be that a hand's way says
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,48 +65,8 @@ class Candidate:
         return self.first, self.motion.inverse
 
 
-class PartTree:
-    """What a twin believes; `labels` of points are numbers of parts, -1 of what stands still."""
-
-    def __init__(self) -> None:
-        self.looks: list[Cloud] = []
-        self.parts: list[Part] = []
-        self.labels: list[Int[np.ndarray, " points"]] = []  # of each look
-
-    # --- kinematics ---------------------------------------------------------------------------
-
-    def pose(self, part: int, look: int) -> Pose:
-        """How a part has moved in a look since it was described."""
-        if part < 0:
-            return NOWHERE
-        one = self.parts[part]
-        return self.pose(one.parent, look) @ one.screw.pose(one.positions[look])
-
-    def motion(self, part: int, first: int, second: int) -> Pose:
-        """How a part has moved from one look to another."""
-        return self.pose(part, second) @ self.pose(part, first).inverse
-
-    def screw(self, part: int, look: int) -> Screw:
-        """A part's joint where it was in a look."""
-        return self.parts[part].screw.moved(self.pose(self.parts[part].parent, look))
-
-    def carriers(self, part: int) -> list[int]:
-        """What carries a part, one after the other."""
-        found = []
-        while (part := self.parts[part].parent) >= 0:
-            found.append(part)
-        return found
-
-    def ordered(self) -> list[int]:
-        """Parts from root to leaf."""
-        found: list[int] = []
-        while len(found) < len(self.parts):
-            found += [
-                part
-                for part, one in enumerate(self.parts)
-                if part not in found and (one.parent < 0 or one.parent in found)
-            ]
-        return found
+class PartTree(Kinematics):
+    """What a twin believes of joints, positions and points, from all of its looks."""
 
     # --- looks --------------------------------------------------------------------------------
 
@@ -248,22 +209,6 @@ class PartTree:
         normals = np.concatenate([pose.turned(one.support[1]) for pose in poses])
         found = evidence(self.looks[look], points, normals, others)
         return found.reshape(len(poses), len(one.support[0])).mean(axis=1)
-
-    def way_from(
-        self, part: int, look: int, way: Float[np.ndarray, "times 3"]
-    ) -> Float[np.ndarray, "_ 3"]:
-        """A hand's way after a look as if a part had not moved since it was described (-1: as it
-        was).
-
-        Where the part moved meanwhile, only the way's ends are known so, three times each.
-        """
-        back, end = self.pose(part, look).inverse, way[-3:].mean(axis=0)
-        if part < 0:
-            return way
-        ended = self.motion(part, look + 1, look).at(end[None])[0]
-        if np.linalg.norm(ended - end) < TAKEN:
-            return back.at(way)
-        return back.at(np.repeat([way[:3].mean(axis=0), ended], 3, axis=0))
 
     def averaged(self, look: int) -> Cloud:
         """A look made less noisy by all others, as how its parts have moved is known."""
@@ -414,18 +359,3 @@ class PartTree:
         positions = part.positions if screw is None else part.positions_of(screw)
         ways = [(look, self.way_from(part.parent, look, way)) for look, way in part.ways]
         return refine(screw or part.screw, np.array(positions), seen, ways)
-
-    def remove(self, part: int, heir: int) -> None:
-        """Take a part out; what it carries and what was found of it goes to its heir, -1: none."""
-        moved = self.renumbering(part, heir)
-        del self.parts[part]
-        for one in self.parts:
-            one.parent = int(moved[one.parent + 1])
-        self.labels = [moved[labels + 1] for labels in self.labels]
-
-    def renumbering(self, part: int, heir: int) -> Int[np.ndarray, " labels"]:
-        """By label, from -1 on: the new one, once a part is taken out."""
-        moved = np.arange(-1, len(self.parts))
-        moved[part + 1] = heir
-        moved[moved > part] -= 1
-        return moved

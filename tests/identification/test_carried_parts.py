@@ -139,6 +139,19 @@ def test_a_flap_that_swings_along_is_found_though_the_hand_is_on_the_door(room) 
     assert room.error(twin, 1, 1)[0] < 2.0
 
 
+@pytest.mark.parametrize(("door", "flap"), [(-0.9, 0.5), (-0.6, 0.6)])
+def test_one_pull_at_a_flap_tells_of_both_when_nothing_is_known(room, door, flap) -> None:
+    twin = Twin()
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, FLAP, (0.0, 0.0), (door, flap))
+    assert [part.parent for part in twin.parts] == [-1, 0]
+    assert twin.held == [(1, 0)]
+    for part, (turned, gone) in enumerate(((4.0, door), (10.0, flap))):
+        assert room.error(twin, part, part)[0] < turned
+        assert abs(twin.parts[part].positions[1]) == pytest.approx(abs(gone), abs=0.05)
+
+
 def test_a_door_that_is_elsewhere_than_was_believed_is_no_flap(room) -> None:
     twin = Twin()
     room.at(0.0, 0.0)

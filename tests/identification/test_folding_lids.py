@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from palpate.identification.interactive import twin as twin_module
+from palpate.identification.interactive.duplicates import drop_explained
 from palpate.identification.interactive.explanation import find_moved_part
 from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.part import support_of
+from palpate.identification.interactive.splitting import split_off_base
+from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import ANYWHERE, Twin
 from rooms import Room
 
@@ -29,6 +33,15 @@ LID = """
   </worldbody>
 </mujoco>
 """
+# The same with walls that its lid hides, on a floor.
+DEEP = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size="3 3 .01"/>
+    <geom type="box" size=".35 .6 .02" pos="0 0 .1"/>
+    <geom type="box" size=".02 .6 .34" pos=".35 0 .45"/>
+    <geom type="box" size=".02 .6 .34" pos="-.37 0 .45"/>
+""" + LID[LID.index("    <body") :]
 LEAF = 2
 
 
@@ -70,6 +83,20 @@ def test_a_leaf_is_found_on_its_lid_though_both_look_like_one(chest, turn) -> No
     assert np.diff(leaf)[-2] == pytest.approx(turn, abs=0.05)
 
 
+def test_a_leaf_that_a_hand_has_felt_by_itself_is_not_explained_away_by_its_lid(chest) -> None:
+    twin = opened(chest)
+    whole = twin.parts[0].seen[0]  # of both leaves, before they are told from each other
+    chest.pull(twin, LEAF, (0.05, 0.0), (0.05, 0.6))
+    assert twin.was_felt_by_itself(1)
+    twin.parts[0].support = support_of([twin.looks[0]], [whole], [twin.pose(0, 0).inverse])
+    drop_explained(twin)
+    assert [part.parent for part in twin.parts] == [-1, 0]
+    twin.parts[1].ways = []
+    assert not twin.was_felt_by_itself(1)
+    drop_explained(twin)
+    assert [part.parent for part in twin.parts] == [-1]
+
+
 def test_a_pull_that_folds_a_known_lid_does_not_mistake_its_joint(chest) -> None:
     twin = opened(chest)
     chest.pull(twin, LEAF, (0.05, 0.0), (0.3, -0.5))
@@ -93,6 +120,15 @@ def test_a_joint_of_which_nothing_is_known_is_not_kept_unless_a_hand_has_held_it
                 twin.parts = [changed]
                 twin._drop_unknown()
                 assert bool(twin.parts) == (kept or bool(ways))
+
+
+@pytest.mark.parametrize(("lid", "leaf"), [(1.2, 0.0), (1.2, 0.2)])
+def test_an_inner_wall_that_an_open_lid_bares_is_no_lid_that_turned_inwards(lid, leaf) -> None:
+    chest, looks = Chest(DEEP), PartTree()
+    for state in ((0.0, 0.0), (lid, leaf)):
+        chest.at(*state)
+        looks.add_look(chest.look())
+    assert not split_off_base(looks, 0, 1)
 
 
 class Notes(Twin):

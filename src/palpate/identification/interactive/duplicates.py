@@ -58,7 +58,11 @@ def drop_explained(tree: PartTree) -> None:
         if any(one.parent == number for one in tree.parts):
             continue
         for other in others:
-            if _were_alike(tree, number, other) and _explains(tree, other, number):
+            if (
+                not (other == part.parent and tree.was_felt_by_itself(number))
+                and _were_alike(tree, number, other)
+                and _explains(tree, other, number)
+            ):
                 known = tree.parts[other]
                 tree.remove(number, other)
                 heir = tree.parts.index(known)

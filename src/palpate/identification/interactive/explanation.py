@@ -8,12 +8,18 @@ from jaxtyping import Float
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import FREE, LEAST_MOTION, evidence
 from palpate.identification.interactive.part import Part
-from palpate.identification.interactive.refinement import Estimate, Way, misfit, refine, surprise
+from palpate.identification.interactive.refinement import (
+    SURPRISE,
+    Estimate,
+    Way,
+    misfit,
+    refine,
+    surprise,
+)
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
 from palpate.identification.interactive.tree import NOT_MOVED, Candidate, PartTree
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
-SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
 FURTHER = 1.5  # rad or m that a part may have been beyond where it was seen
 MISFIT = 1.1  # of each of a hand's ways, for the joint that they say is theirs: at most .91 of 85
 SHORT = 0.05  # m that a hand went: a way so short fits many joints

@@ -35,6 +35,7 @@ REFUTED = 4.0  # 90 % intervals from a joint: what is further away is another on
 FEWEST = 20  # points that say anything
 LEAST = 1e-3  # rad or m between two places
 ROUNDS, COARSE = 8, 3  # of Gauss-Newton, and those first ones that look further
+SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
 NEAR = 0.025, 0.05  # m beside noise, from a point to its surface: late and early
 MOMENTS = 25  # of a hand's way
 STEP = 1e-5  # of differences

@@ -1,8 +1,9 @@
-"""Parts on parts that clouds alone show: what has gone otherwise than its carrier, as a flap does.
+"""Parts that clouds alone show: what has gone otherwise than its carrier, as a flap does.
 
 A hand that pulls at a flap of a door moves both, by no line and no circle. But once the joint of
 the door is known, a flat piece of it that is in the open wherever that joint has taken it has moved
-by itself, about one of its edges (the mask that shrank: SAGCI, Eqn. 13).
+by itself, about one of its edges (the mask that shrank: SAGCI, Eqn. 13). Where nothing is known of
+the door either, that is found in the same way, as a part of what stood still.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from palpate.identification.interactive.discovery import Discovery, insert
 from palpate.identification.interactive.duplicates import merge_same
 from palpate.identification.interactive.explanation import FURTHER
-from palpate.identification.interactive.labels import ON, TOLERANCE, evidence
+from palpate.identification.interactive.labels import HIDDEN, ON, TOLERANCE, evidence
 from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge
 from palpate.identification.interactive.refinement import NEAR, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
@@ -26,9 +27,10 @@ from palpate.perception.surfaces import Surface, surfaces
 MOVED = 0.15  # rad or m that a carrier has moved between two looks, or a part on it
 STRANGE = 0.35  # share of a piece's points that no known motion explains
 MEETS = 0.6  # share of a piece's points that meet a surface where the joint takes it
+SOME = 0.25  # the same, of what stood still: its hinge is not at its edge, and it may fold
 GAIN = 1.0  # of evidence, for each point: how much better a joint on a carrier explains a piece
 POINTS = 120  # of a piece, by which it is tried
-TURNS = np.arange(-2.2, 2.21, 0.1)  # rad
+TURNS, FINER = np.arange(-2.2, 2.21, 0.1), np.linspace(-0.075, 0.075, 7)  # rad
 TRIED = 3  # of the options, the best
 LEAST_EVIDENCE = 500.0  # of evidence, of all points and looks
 SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enough
@@ -68,6 +70,9 @@ class Option:
         return float(sum(self.gains.values()))
 
 
+Options = dict[tuple[int, int, int], list[Option]]  # by look, piece and carrier
+
+
 def split(tree: PartTree, looks: list[int]) -> bool:
     """Whether some looks show a part on a known one that is not known yet; it is the last then.
 
@@ -78,9 +83,25 @@ def split(tree: PartTree, looks: list[int]) -> bool:
     places = np.array([one.positions for one in tree.parts])
     _, distinct = np.unique(np.round(places / MOVED), axis=1, return_index=True)
     pairs = [(one, int(other)) for one in looks for other in distinct if other not in looks]
-    found: dict[tuple[int, int, int], list[Option]] = {}
+    found: Options = {}
     for look, other in [*pairs, *(pair[::-1] for pair in pairs)]:
         _add_options(tree, look, other, found)
+    return _insert_best(tree, found)
+
+
+def split_off_base(tree: PartTree, before: int, after: int) -> bool:
+    """Whether two looks show that what stood still before has turned about one of its edges; it is
+    the last part then. For a pull that told nothing, as at a flap of a door that is not known."""
+    found: Options = {}
+    for look, other in ((before, after), (after, before)):
+        if pieces := _pieces(tree.looks[look]):
+            known = _evidence_of_pieces(tree, look, other, pieces)
+            _try_edges(tree, look, other, pieces, known, [-1], found)
+    return _insert_best(tree, found)
+
+
+def _insert_best(tree: PartTree, found: Options) -> bool:
+    """Whether one of some hinges is that of a part; it is the last then."""
     options = [one for each in found.values() for one in each if one.gain > LEAST_EVIDENCE]
     options.sort(key=lambda option: -option.gain)
     return any(_insert(tree, option) for option in options[:TRIED])
@@ -98,11 +119,8 @@ def _pieces(cloud: Cloud) -> list[Piece]:
     return _SOUGHT[cloud]
 
 
-def _add_options(
-    tree: PartTree, look: int, other: int, found: dict[tuple[int, int, int], list[Option]]
-) -> None:
-    """Hinges, by look, piece and carrier, of what another look does not show where known parts have
-    gone."""
+def _add_options(tree: PartTree, look: int, other: int, found: Options) -> None:
+    """Hinges on known parts of what another look does not show where those have gone."""
     moved = [
         number
         for number, part in enumerate(tree.parts)
@@ -124,6 +142,20 @@ def _add_options(
             for one, each in zip(pieces, known, strict=True)
         )
     ]
+    _try_edges(tree, look, other, pieces, known, carriers, found)
+
+
+def _try_edges(
+    tree: PartTree,
+    look: int,
+    other: int,
+    pieces: list[Piece],
+    known: list[Float[np.ndarray, "labels n"]],
+    carriers: list[int],
+    found: Options,
+) -> None:
+    """Hold hinges at the edges of pieces, on each of some carriers (-1: what stands still), against
+    another look, if that does not show the pieces where something `known` has gone."""
     strange = [
         number
         for number, each in enumerate(known)
@@ -131,7 +163,9 @@ def _add_options(
     ]
     if not carriers or not strange:
         return
-    others = _find_explained(tree, other, look)
+    others, cloud = _find_explained(tree, other, look), tree.looks[other]
+    # an inner wall that a lid has bared is where the lid would be, had it turned inwards
+    stood = others | (evidence(tree.looks[look], cloud.points, cloud.normals) >= HIDDEN)
     for number in strange:
         best = float(known[number].mean(axis=1).max())
         for carrier in carriers:
@@ -141,11 +175,11 @@ def _add_options(
                     Option(look, pieces[number], carrier, screw)
                     for screw in _edges(pieces[number].surface)
                     # about the carrier's own hinge it would be beside the carrier, not on it
-                    if not is_same_hinge(screw, tree.screw(carrier, look))
+                    if carrier < 0 or not is_same_hinge(screw, tree.screw(carrier, look))
                 ],
             )
             for option in options:
-                _compare(tree, option, other, best, others)
+                _compare(tree, option, other, best, stood if carrier < 0 else others)
 
 
 def _is_sure(part: Part) -> bool:
@@ -202,19 +236,24 @@ def _compare(
 
     Points of that look that are of `others` are not the piece's.
     """
-    piece = option.piece
+    piece, there = option.piece, tree.looks[other]
     cloud = tree.looks[option.look]
     points, normals = cloud.points[piece.members], cloud.normals[piece.members]
     carried = tree.motion(option.carrier, option.look, other)
-    poses = [carried @ option.screw.pose(float(turn)) for turn in TURNS]
-    moved = np.concatenate([pose.at(points) for pose in poses])
-    turned = np.concatenate([pose.turned(normals) for pose in poses])
-    each = evidence(tree.looks[other], moved, turned, others).reshape(len(poses), len(points))
-    best = int(each.mean(axis=1).argmax())
-    better = float(each[best].mean()) - known
-    turned_by = abs(float(TURNS[best]))
-    if better > GAIN and np.mean(each[best] == ON) > MEETS and turned_by > MOVED:
-        option.turns[other] = float(TURNS[best])
+
+    def hold(turns: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " points"]]:
+        """The best of some turns, and the evidence of each point for it."""
+        poses = [carried @ option.screw.pose(float(turn)) for turn in turns]
+        moved = np.concatenate([pose.at(points) for pose in poses])
+        turned = np.concatenate([pose.turned(normals) for pose in poses])
+        each = evidence(there, moved, turned, others).reshape(len(poses), len(points))
+        best = int(each.mean(axis=1).argmax())
+        return float(turns[best]), each[best]
+
+    turn, each = hold(hold(TURNS)[0] + FINER)  # far from a hinge a step is eight centimetres
+    better, least = float(each.mean()) - known, MEETS if option.carrier >= 0 else SOME
+    if better > GAIN and np.mean(each == ON) > least and abs(turn) > MOVED:
+        option.turns[other] = turn
         option.gains[other] = better * len(piece.surface.members)
 
 
@@ -242,7 +281,8 @@ def _discovery(tree: PartTree, option: Option, first: int, second: int) -> Disco
 def _insert(tree: PartTree, option: Option) -> bool:
     """Put a part into the tree, and keep it if it has points of its own and its carrier as well."""
     look, size = option.look, len(option.piece.surface.members)
-    if size > LARGEST * np.sum(tree.labels[look] == option.carrier):
+    on_part = option.carrier >= 0  # of what stands still there may be as little as one likes
+    if on_part and size > LARGEST * np.sum(tree.labels[look] == option.carrier):
         return False
     first, second = sorted((look, max(option.gains, key=lambda one: option.gains[one])))
     new = _discovery(tree, option, first, second)
@@ -262,7 +302,9 @@ def _insert(tree: PartTree, option: Option) -> bool:
         tree.relabel(at)
         taken += int(np.sum(tree.labels[at][carrier] == number))
         whole += int(carrier.sum())
-    refused = taken > MOST * whole or max(len(part.seen[at]) for at in before) < FEWEST
+    refused = (on_part and taken > MOST * whole) or max(
+        len(part.seen[at]) for at in before
+    ) < FEWEST
     estimate = tree.estimate(part)
     refused |= len(part.seen[look]) > GROWN * size or estimate.intervals[0] > UNSURE
     if refused and number == count:  # else it has replaced another

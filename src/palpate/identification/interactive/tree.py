@@ -25,11 +25,13 @@ from palpate.identification.interactive.labels import (
 )
 from palpate.identification.interactive.part import Part, support_of
 from palpate.identification.interactive.refinement import (
+    SURPRISE,
     Estimate,
     Sighting,
     is_of_two_ends,
     refine,
     sighting,
+    surprise,
 )
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.perception.clouds import Cloud
@@ -338,16 +340,29 @@ class PartTree(Kinematics):
         )
 
     def _own_points(self, number: int, look: int) -> Int[np.ndarray, " _"]:
-        """The points of a look that are a part's, less those of what it carries, which may have
-        been found since and do not show where the part is: of both sides of that."""
+        """The points of a look that are a part's, less those of both sides of what it carries and a
+        hand has felt, which may have been found since and do not show where the part is."""
         own, cloud = self.parts[number].seen[look], self.looks[look]
         for child, part in enumerate(self.parts):
-            if part.parent == number and part.seen:
+            if part.parent == number and part.seen and self.was_felt_by_itself(child):
                 best = max(part.seen, key=lambda other: len(part.seen[other]))
                 points = self.motion(child, look, best).at(cloud.points[own])
                 away, nearest = self.looks[best].tree.query(points)
                 own = own[(away > THICK) | (self.labels[best][nearest] != child)]
         return own
+
+    def was_felt_by_itself(self, number: int) -> bool:
+        """Whether a hand has gone with a part, while what carries it stood, as the joint of that
+        does not go."""
+        part = self.parts[number]
+        if part.parent < 0:
+            return bool(part.ways)
+        carrier = self.parts[part.parent]
+        return any(
+            not is_of_two_ends(self.way_from(part.parent, look, way))
+            and surprise(carrier.estimate, self.way_from(carrier.parent, look, way)) > SURPRISE
+            for look, way in part.ways
+        )
 
     def estimate(self, part: Part, screw: Screw | None = None) -> Estimate:
         """A part's joint from all looks and ways, beginning with what it is, or with another."""

@@ -23,7 +23,7 @@ from palpate.identification.interactive.labels import HIDDEN, evidence
 from palpate.identification.interactive.part import UNSURE, Part
 from palpate.identification.interactive.refinement import is_of_two_ends, misfit
 from palpate.identification.interactive.screws import screws_of_way
-from palpate.identification.interactive.splitting import split
+from palpate.identification.interactive.splitting import split, split_off_base
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.perception.clouds import Cloud
 
@@ -54,8 +54,7 @@ class Twin(PartTree):
         new = self._keep(new, before, after)
         if new:
             self._put_back(before, after)
-            if (carrier := self.parts[-1].parent) >= 0:
-                self.describe(carrier)  # what the new part owns no longer shows where that is
+            self._take_from_carrier(before)
         self._hang(before, after)
         if new:
             self._drop_guesses()
@@ -64,6 +63,9 @@ class Twin(PartTree):
             self._hang(before, after)
         self.refit(self.held[-1][0] if handling.moved else -1)
         self._merge()
+        if handling.moved and self.held[-1][0] < 0 and split_off_base(self, before, after):
+            self._explain_earlier()
+            self.refit(-1)
         # where nothing has moved, another look only has other noise
         if any(one.moved for one in self.handled[-2:]) and split(self, [before, after]):
             self._explain_earlier()
@@ -101,6 +103,17 @@ class Twin(PartTree):
         if moved:
             for look in (before, after):
                 self.relabel(look)
+
+    def _take_from_carrier(self, before: int) -> None:
+        """What the last part turned out to own no longer shows where its carrier is."""
+        carrier = self.parts[-1].parent
+        if carrier < 0:
+            return
+        one, cloud = self.parts[carrier], self.looks[before]
+        nearest = cloud.tree.query(self.pose(carrier, before).at(one.support[0]))[1]
+        kept = self.labels[before][nearest] != len(self.parts) - 1
+        if kept.sum() >= FEWEST:
+            one.support = one.support[0][kept], one.support[1][kept]
 
     def _hang(self, before: int, after: int) -> None:
         """Hang on each part that has moved what it carries."""

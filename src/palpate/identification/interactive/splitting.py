@@ -164,8 +164,8 @@ def _try_edges(
     if not carriers or not strange:
         return
     others, cloud = _find_explained(tree, other, look), tree.looks[other]
-    # an inner wall that a lid has bared is where the lid would be, had it turned inwards
-    stood = others | (evidence(tree.looks[look], cloud.points, cloud.normals) >= HIDDEN)
+    if -1 in carriers:  # an inner wall that a lid bares is where the lid had turned inwards
+        others |= evidence(tree.looks[look], cloud.points, cloud.normals) >= HIDDEN
     for number in strange:
         best = float(known[number].mean(axis=1).max())
         for carrier in carriers:
@@ -179,7 +179,7 @@ def _try_edges(
                 ],
             )
             for option in options:
-                _compare(tree, option, other, best, stood if carrier < 0 else others)
+                _compare(tree, option, other, best, others)
 
 
 def _is_sure(part: Part) -> bool:
@@ -302,9 +302,8 @@ def _insert(tree: PartTree, option: Option) -> bool:
         tree.relabel(at)
         taken += int(np.sum(tree.labels[at][carrier] == number))
         whole += int(carrier.sum())
-    refused = (on_part and taken > MOST * whole) or max(
-        len(part.seen[at]) for at in before
-    ) < FEWEST
+    refused = max(len(part.seen[at]) for at in before) < FEWEST
+    refused |= on_part and taken > MOST * whole
     estimate = tree.estimate(part)
     refused |= len(part.seen[look]) > GROWN * size or estimate.intervals[0] > UNSURE
     if refused and number == count:  # else it has replaced another

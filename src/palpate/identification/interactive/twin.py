@@ -62,6 +62,9 @@ class Twin(PartTree):
             self._explain_earlier()
             self._hang(before, after)
         self.refit(self.held[-1][0] if handling.moved else -1)
+        if handling.moved and not new and self._is_first_way():
+            self._explain_earlier()
+            self.refit(-1)
         self._merge()
         if handling.moved and self.held[-1][0] < 0 and split_off_base(self, before, after):
             self._explain_earlier()
@@ -84,6 +87,12 @@ class Twin(PartTree):
         moved = self.renumbering(part, heir)
         self.held = [(int(moved[held + 1]), look) for held, look in self.held]
         super().remove(part, heir)
+
+    def _is_first_way(self) -> bool:
+        """Whether the hand has just held, for the first time, a part that clouds alone had shown:
+        its joint was hardly known until now."""
+        part = self.held[-1][0]
+        return part >= 0 and len(self.parts[part].ways) == 1
 
     def _put_back(self, before: int, after: int) -> None:
         """Put back what was taken for moved as it is like the last part where that has gone.

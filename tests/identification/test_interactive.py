@@ -142,7 +142,7 @@ def test_an_action_is_kept_although_it_takes_a_part_out(handled):
     _, seen, handling, _ = handled
 
     class Merging(Twin):
-        def _explain(self, before, after, handling):
+        def _explain(self, before, after, handling, **_):
             self.held = list(self.held)  # as a part that is taken out does
             return -1, False
 

@@ -150,7 +150,7 @@ def _try_edges(
     look: int,
     other: int,
     pieces: list[Piece],
-    known: list[Float[np.ndarray, "labels n"]],
+    known: list[Float[np.ndarray, "labels _"]],
     carriers: list[int],
     found: Options,
 ) -> None:
@@ -190,7 +190,7 @@ def _is_sure(part: Part) -> bool:
 
 def _evidence_of_pieces(
     tree: PartTree, look: int, other: int, pieces: list[Piece]
-) -> list[Float[np.ndarray, "labels n"]]:
+) -> list[Float[np.ndarray, "labels _"]]:
     """The evidence of another look for each piece's points, if they went with each label."""
     motions = [tree.motion(part, look, other) for part in range(-1, len(tree.parts))]
     chosen = np.concatenate([one.members for one in pieces])

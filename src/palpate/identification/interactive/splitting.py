@@ -27,7 +27,8 @@ from palpate.perception.surfaces import Surface, surfaces
 MOVED = 0.15  # rad or m that a carrier has moved between two looks, or a part on it
 STRANGE = 0.35  # share of a piece's points that no known motion explains
 MEETS = 0.6  # share of a piece's points that meet a surface where the joint takes it
-SOME = 0.25  # the same, of what stood still: its hinge is not at its edge, and it may fold
+# the same, of what stood still: its hinge is not quite at its edge, and it may fold
+PARTLY_MEETS = 0.25
 GAIN = 1.0  # of evidence, for each point: how much better a joint on a carrier explains a piece
 POINTS = 120  # of a piece, by which it is tried
 TURNS, FINER = np.arange(-2.2, 2.21, 0.1), np.linspace(-0.075, 0.075, 7)  # rad
@@ -251,7 +252,7 @@ def _compare(
         return float(turns[best]), each[best]
 
     turn, each = hold(hold(TURNS)[0] + FINER)  # far from a hinge a step is eight centimetres
-    better, least = float(each.mean()) - known, MEETS if option.carrier >= 0 else SOME
+    better, least = float(each.mean()) - known, MEETS if option.carrier >= 0 else PARTLY_MEETS
     if better > GAIN and np.mean(each == ON) > least and abs(turn) > MOVED:
         option.turns[other] = turn
         option.gains[other] = better * len(piece.surface.members)

@@ -353,7 +353,7 @@ class PartTree(Kinematics):
 
     def was_felt_by_itself(self, number: int) -> bool:
         """Whether a hand has gone with a part, while what carries it stood, as the joint of that
-        does not go."""
+        does not go; or at all, if it hangs on what stands still."""
         part = self.parts[number]
         if part.parent < 0:
             return bool(part.ways)

@@ -120,7 +120,7 @@ STAGES = {
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),
         *("perception.rope.marker_observer", "perception.clouds", "perception.surfaces"),
-        *("perception.surface_features", "perception.point_files"),
+        *("perception.visibility", "perception.surface_features", "perception.point_files"),
     ],
     "trials": [
         *("trials.trial", "trials.controller", "trials.audit", "trials.adversaries"),

@@ -116,10 +116,10 @@ def test_what_faces_a_camera_and_is_not_seen_is_missing():
     cloud = cloud_of([DepthImage(0.0, CAMERA, depth)])
     away = np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     inside = np.tile([0.0, 0.0, 1.0], (3, 1))  # one that faces the camera, and two that do not
-    assert cloud.missing(inside, away).tolist() == [True, False, False]
+    assert cloud.visibility.missing(inside, away).tolist() == [True, False, False]
     edge = CAMERA.back_project(
         np.array([[60.0, 60.0], [20.0, 20.0], [120.0, 60.0]]), np.full(3, 1.5)
     )
-    assert not cloud.missing(edge, np.tile(away[0], (3, 1))).any()
+    assert not cloud.visibility.missing(edge, np.tile(away[0], (3, 1))).any()
     beside = np.array([[3.0, 0.0, 1.0]])  # outside the picture, nobody knows
-    assert not cloud.missing(beside, away[:1]).any()
+    assert not cloud.visibility.missing(beside, away[:1]).any()

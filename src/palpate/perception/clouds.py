@@ -1,8 +1,8 @@
-"""Depth images as one cloud of points with normals, and what can be said of points that are not it.
+"""Depth images as one cloud of points with normals.
 
 A look is one or more depth images of one moment. Its cloud has a point for each cell of a grid in
-space, the mean of the pixels in it, which is less noisy than they are. Whether a point of space is
-on a surface, in front of one (free) or behind (hidden) is looked up in the images.
+space, the mean of the pixels in it, which is less noisy than they are. What can be said of other
+points of space is looked up in the images.
 """
 
 import dataclasses
@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from palpate.errors import PalpateError
 from palpate.numerics.pinhole import DepthImage
+from palpate.perception.visibility import Visibility, noise_at
 
 CELL = 0.012  # m, of the grid
 LARGE = 0.8  # m: of what is smaller, cells are smaller, down to half of that
@@ -28,9 +28,6 @@ WIDE = 1.5  # of the noise: how wide cells are at least
 SPLIT = 3.0  # of the noise, between depths of pixels side by side: two surfaces
 NEIGHBOURS = 24  # that give a normal
 NEAREST = 10  # points that are a point's neighbours
-AROUND = 5  # pixels, of the square in which nothing is seen where nothing is
-FACING = 0.5  # cosine between a normal and the way to a camera that sees the surface for sure
-NOISE = 1.2e-3, 1.9e-3  # m: at 0.4 m, and its growth with the square of what is further
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,9 +43,7 @@ class Cloud:
     deviation: Float[np.ndarray, " points"]
     source: Int[np.ndarray, "points 3"]
     images: Sequence[DepthImage]
-    nearest: Sequence[Float[np.ndarray, "_ _"]]  # depth in each pixel's neighbourhood
-    furthest: Sequence[Float[np.ndarray, "_ _"]]
-    blank: Sequence[Bool[np.ndarray, "_ _"]]  # around which nothing was seen
+    visibility: Visibility
     tree: cKDTree
 
     @functools.cached_property
@@ -82,71 +77,9 @@ class Cloud:
         tolerance: float,
         normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Whether each point is on a surface that was seen, and whether it is in the open.
-
-        In the open is what some camera looks through at what is behind it. Neither: hidden, or
-        where no camera looks. `tolerance` is in standard deviations of depth. Points of surfaces
-        have `normals`, towards whoever saw them, and an error along these like the points of this
-        look: a camera that sees the surface edge-on looks past such a point. They are in the open
-        if they would be without it as well.
-        """
-        on, free = np.zeros(len(points), bool), np.zeros(len(points), bool)
-        for image, near, far in zip(self.images, self.nearest, self.furthest, strict=True):
-            inside, row, column, depth = _pixels(image, points)
-            least, most = near[row, column], far[row, column]
-            room = tolerance * noise_at(depth)
-            on |= inside & (depth > least - room) & (depth < most + room)
-            before = inside & (depth < least - room)
-            if normals is not None:
-                some = np.flatnonzero(before)
-                back = points[some] - tolerance * self.error * _across(image, points, normals, some)
-                inside, row, column, depth = _pixels(image, back)
-                before[some] = inside & (depth < near[row, column] - tolerance * noise_at(depth))
-            free |= before
-        return on & ~free, free
-
-    def missing(
-        self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-    ) -> Bool[np.ndarray, " n"]:
-        """Whether a camera that a surface would have faced at a point saw nothing around there."""
-        found = np.zeros(len(points), bool)
-        for image, blank in zip(self.images, self.blank, strict=True):
-            inside, row, column, _ = _pixels(image, points)
-            toward = np.asarray(image.pinhole.position) - points
-            facing = np.vecdot(normals, toward) > FACING * np.sqrt(np.vecdot(toward, toward))
-            found |= inside & facing & blank[row, column]
-        return found
-
-
-def _pixels(
-    image: DepthImage, points: Float[np.ndarray, "n 3"]
-) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"], np.ndarray]:
-    """Whether points are in an image; row and column of each, 0 of others, and depth (m)."""
-    pixels, depth = image.pinhole.project(points)
-    inside = depth > 0.05
-    pixels = np.where(inside[:, None], pixels, -1.0)
-    column, row = np.rint(pixels).astype(int).T
-    inside &= (column >= 0) & (row >= 0)
-    inside &= (column < image.pinhole.width) & (row < image.pinhole.height)
-    return inside, np.where(inside, row, 0), np.where(inside, column, 0), depth
-
-
-def _across(
-    image: DepthImage,
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    chosen: Int[np.ndarray, " m"],
-) -> Float[np.ndarray, "m 3"]:
-    """Of the normals of chosen points what is across the way to the camera."""
-    toward = np.asarray(image.pinhole.position) - points[chosen]
-    normals = normals[chosen]
-    along = np.vecdot(normals, toward) / np.vecdot(toward, toward)
-    return normals - along[:, None] * toward
-
-
-def noise_at(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Standard deviation (m) of a depth (m) as depth cameras have it, Nguyen et al. 2012, eq. 4."""
-    return np.asarray(NOISE[0] + NOISE[1] * np.maximum(depth - 0.4, 0.0) ** 2)
+        """See `Visibility.surfaces`: points with normals have an error like those of this look."""
+        error = 0.0 if normals is None else self.error
+        return self.visibility.surfaces(points, tolerance, normals, error)
 
 
 def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
@@ -155,21 +88,14 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
     Raises `PalpateError` where too little was seen.
     """
     seen, depths, counts, source = [], [], [], []
-    nearest, furthest, blank = [], [], []
+    visibility = Visibility(images)
     for number, image in enumerate(images):
-        depth = np.where(image.depth > 0.0, image.depth, np.nan)
-        near = minimum_filter(np.where(np.isfinite(depth), depth, np.inf), 3)
-        far = maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
-        blank.append(~maximum_filter(np.isfinite(depth), AROUND))
-        row, column = np.nonzero(np.isfinite(depth) & (far - near < EDGE * near))
-        pixels, measured, count, first = _blocks(image, row, column, depth[row, column])
+        row, column = visibility.even_pixels(number, EDGE)
+        pixels, measured, count, first = _blocks(image, row, column, image.depth[row, column])
         seen.append(image.pinhole.back_project(pixels, measured))
         depths.append(measured)
         counts.append(count)
         source.append(np.stack([np.full(len(first), number), row[first], column[first]], axis=1))
-        # where nothing was seen, nothing is said
-        nearest.append(np.where(np.isfinite(depth), near, -np.inf))
-        furthest.append(np.where(np.isfinite(depth), far, -np.inf))
     points, depth, weight = (np.concatenate(each) for each in (seen, depths, counts))
     above = points[:, 2] > _floor(points) + FLOOR + 2.0 * noise_at(depth)
     if (high := int(weight[above].sum())) < FEWEST:
@@ -195,10 +121,7 @@ def cloud_of(images: Sequence[DepthImage], *, cell: float = CELL) -> Cloud:
     normals, kept = _normals(points, tree, centres[sources[:, 0]])
     points, normals, sources = points[kept], normals[kept], sources[kept]
     deviation = deviation[kept] / np.sqrt(np.minimum(count[kept], 9))
-    return Cloud(
-        points, normals, deviation, sources, list(images), nearest, furthest, blank,
-        cKDTree(points),
-    )  # fmt: skip
+    return Cloud(points, normals, deviation, sources, list(images), visibility, cKDTree(points))
 
 
 def _blocks(

@@ -20,7 +20,7 @@ ON, FREE, HIDDEN, MISSING = 0.9, -2.9, -0.4, -1.5
 TOLERANCE = 3.0  # standard deviations of depth
 AGREES = 0.7  # cosine of the angle between the normals of what is the same surface
 SMOOTH = 0.45  # how much likelier neighbours on one surface are of one part (logarithm)
-ROUNDS = 40
+ROUNDS, SETTLED = 40, 1e-3  # at most, and until no probability changes by more
 STANDS = 1.0  # how much likelier a point is to stand still, before anything is seen (logarithm)
 OF_SURFACE = 1.5  # the same, to be of what its surface is of: more than `ON` against `HIDDEN`
 SURE = 2.0  # of scores: how much better than all others the label of a sure point is
@@ -66,7 +66,7 @@ def evidence(
     unseen = ~free
     unseen[met] = False  # at an edge, or of another surface: says little
     rest = np.flatnonzero(unseen)
-    found[rest[cloud.missing(points[rest], normals[rest])]] = MISSING
+    found[rest[cloud.visibility.missing(points[rest], normals[rest])]] = MISSING
     return found
 
 
@@ -211,7 +211,10 @@ def smooth_labels(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels poin
     chance = _softmax(given)
     for _ in range(ROUNDS):
         # label by label: the product of all at once lies the other way in memory, slow to reduce
+        last = chance
         chance = _softmax(given + SMOOTH * np.stack([cloud.surface_graph @ one for one in chance]))
+        if np.abs(chance - last).max() < SETTLED:
+            break
     return chance
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from palpate.errors import PalpateError
 from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.hindsight import reconsider
 from palpate.identification.interactive.registration import exact_poses
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import DepthImage, Pinhole
@@ -109,6 +110,7 @@ def twin_of(recording: Recording) -> ApplianceTwin:
         twin.observe(_handling(trial, before, after))
         if released:
             twin.look(released[0])
+    twin = reconsider(twin)
     known = dynamics_of(twin)
     about = {**recording.provenance, "parts": len(twin.parts)}
     return ApplianceTwin(known.recording.trials, about, twin, known)

@@ -4,7 +4,9 @@ import dataclasses
 
 import numpy as np
 
+from palpate.identification.interactive.labels import HIDDEN, evidence
 from palpate.identification.interactive.part import Part
+from palpate.identification.interactive.screws import Pose
 from palpate.identification.interactive.tree import FEWEST, PartTree
 
 SEEN = 0.2  # of evidence, for each point: less is no difference
@@ -86,3 +88,18 @@ def _share_beside(tree: PartTree, part: int, carrier: int, look: int) -> float:
     near = np.unique(np.concatenate([np.array(one, int) for one in [[], *around]]))
     beside = labels[near][labels[near] != part]
     return float(np.mean(beside == carrier)) if len(beside) else 0.0
+
+
+def find_beside(tree: PartTree, part: int, before: int, after: int, back: Pose) -> None:
+    """Say where a part is in the look after, if something else has gone there as well, which comes
+    `back` so: where it was before, unless that is in the open or it is seen elsewhere by itself.
+
+    It may only have been taken for moved as it is like the other where that has gone: points that
+    the other may have there are none of the part's.
+    """
+    one, cloud = tree.parts[part], tree.looks[after]
+    if tree.seen_at(part, after, np.array([one.positions[before]]))[0] < HIDDEN:
+        return
+    other = evidence(tree.looks[before], back.at(cloud.points), back.turned(cloud.normals))
+    one.positions[after] = one.positions[before]
+    tree.find(part, after, others=other >= HIDDEN)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
-from palpate.identification.interactive.carriers import TOUCHES
+from palpate.identification.interactive.carriers import STILLER, TOUCHES, find_beside
 from palpate.identification.interactive.explanation import (
     FURTHER,
     OPEN,
@@ -52,11 +52,13 @@ SETTLED = 2  # ways of a hand that agree: the joint of a part is what they say
 
 @dataclasses.dataclass(frozen=True)
 class Discovery:
-    """A joint on a `carrier` where that was in the look before, and the points of both looks."""
+    """A joint on a `carrier` where that was in the look before, the points of both looks, and how
+    much likelier those are with it than without (logarithm)."""
 
     carrier: int
     estimate: Estimate
     masks: list[Int[np.ndarray, " _"]]
+    gain: float = 0.0
 
 
 def discover(
@@ -79,10 +81,14 @@ def discover(
             found = dataclasses.replace(found, carrier=others[0])
         else:
             found = None  # both have moved, and their way looks like a circle
-    if found is None:
-        near = [one for one in labels_near(tree, before, handling.push.point) if one >= 0]
-        options = (_on_carrier(tree, before, after, carrier, way) for carrier in near)
-        found = next((one for one in options if one is not None), None)
+    if found is None or found.carrier < 0:
+        # what it is on need not reach to the hand: a flap hangs by its far edge
+        near = labels_near(tree, before, handling.push.point, math.inf)
+        options = (_on_carrier(tree, before, after, one, way) for one in near if one >= 0)
+        other = next((one for one in options if one is not None), None)
+        # a way of two joints may look like a circle
+        if found is None or (other is not None and _is_better(tree, before, after, other, found)):
+            found = other
     if found is not None:
         insert(tree, before, after, found, way)
     return found is not None
@@ -116,6 +122,19 @@ def _on_carrier(
     if joined is not None and joined.estimate.intervals[0] < UNSURE:
         return joined
     return found
+
+
+def _is_better(
+    tree: PartTree, before: int, after: int, on_carrier: Discovery, alone: Discovery
+) -> bool:
+    """Whether a part on a carrier explains more than one alone, beside which that has moved too."""
+    part = tree.parts[on_carrier.carrier]
+    there = part.positions[after]
+    motion = _candidate(alone.estimate, NOWHERE, before, after).motion
+    find_beside(tree, on_carrier.carrier, before, after, motion.inverse)
+    moved = abs(part.positions[after] - part.positions[before]) > STILLER
+    part.positions[after] = there
+    return moved and on_carrier.gain > alone.gain
 
 
 def on_moving_carrier(
@@ -183,19 +202,24 @@ def _best(
             tree.much_is_left(candidate, look, len(mask))
             for look, mask in zip((before, after), masks, strict=True)
         ):
-            found.append(Discovery(carrier, estimate, masks))
-    return max(found, key=lambda one: _gain(tree, before, after, one, way), default=None)
+            gain = _gain(tree, before, after, estimate, back, way)
+            found.append(Discovery(carrier, estimate, masks, gain))
+    return max(found, key=lambda one: one.gain, default=None)
 
 
 def _gain(
-    tree: PartTree, before: int, after: int, new: Discovery, way: Float[np.ndarray, "times 3"]
+    tree: PartTree,
+    before: int,
+    after: int,
+    estimate: Estimate,
+    back: Pose,
+    way: Float[np.ndarray, "times 3"],
 ) -> float:
     """How much likelier two looks and a hand's way are with a new part than without (logarithm,
     less what its numbers cost by the Bayesian information criterion).
 
     What is explained as well without it says nothing for it: a wall may slide in its plane.
     """
-    estimate, back = new.estimate, tree.motion(new.carrier, after, before)
     candidate, gain = _candidate(estimate, back, before, after), 0.0
     for look in (before, after):
         given = tree.scores(look, candidate)

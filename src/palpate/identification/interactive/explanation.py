@@ -61,18 +61,19 @@ def may_have_moved(tree: PartTree, part: int, look: int, way: Float[np.ndarray, 
     return bool(moved > stood)
 
 
-def labels_near(tree: PartTree, look: int, point: np.ndarray) -> list[int]:
-    """The labels of what a hand at a point may have hold of, the nearest first.
+def labels_near(tree: PartTree, look: int, point: np.ndarray, reach: float = BESIDE) -> list[int]:
+    """The labels of what is within reach (m) of a point, as a hand may have hold of, the nearest
+    first.
 
     Parts that are there, though a camera hardly sees them, come last.
     """
     labels, cloud = tree.labels[look], tree.looks[look]
-    chosen = np.array(cloud.tree.query_ball_point(point, BESIDE), int)
+    chosen = np.array(cloud.tree.query_ball_point(point, reach), int)
     away = np.linalg.norm(cloud.points[chosen] - point, axis=1)
     found = labels[chosen[np.argsort(away)]].tolist()
     for number, part in enumerate(tree.parts):
         pose = tree.pose(number, look)
-        if np.linalg.norm(pose.at(part.support[0]) - point, axis=1).min() < BESIDE:
+        if np.linalg.norm(pose.at(part.support[0]) - point, axis=1).min() < reach:
             found.append(number)
     return list(dict.fromkeys(found))
 

@@ -7,7 +7,7 @@ carries it.
 
 import numpy as np
 
-from palpate.identification.interactive.carriers import CARRIED, reparent
+from palpate.identification.interactive.carriers import CARRIED, find_beside, reparent
 from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
 from palpate.identification.interactive.explanation import (
@@ -19,8 +19,7 @@ from palpate.identification.interactive.explanation import (
     may_have_moved,
 )
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import HIDDEN, evidence
-from palpate.identification.interactive.part import UNSURE, Part
+from palpate.identification.interactive.part import KNOWN, UNSURE, Part
 from palpate.identification.interactive.refinement import is_of_two_ends, misfit
 from palpate.identification.interactive.screws import screws_of_way
 from palpate.identification.interactive.splitting import split, split_off_base
@@ -79,8 +78,15 @@ class Twin(PartTree):
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""
-        still = bool(self.handled) and not self.handled[-1].moved
-        self.relabel(self.add_look(cloud, still=still))
+        moved = bool(self.handled) and self.handled[-1].moved
+        look = self.add_look(cloud, still=bool(self.handled) and not moved)
+        self.relabel(look)
+        # what was found by two looks is not known well before there is a third
+        if moved and any(part.estimate.intervals[0] > KNOWN for part in self.parts):
+            before = self.held[-1][1]
+            for earlier in (before, before + 1):
+                self.relabel(earlier)
+            self.refit(-1)
 
     def remove(self, part: int, heir: int) -> None:
         """See `PartTree.remove`."""
@@ -95,19 +101,12 @@ class Twin(PartTree):
         return part >= 0 and len(self.parts[part].ways) == 1
 
     def _put_back(self, before: int, after: int) -> None:
-        """Put back what was taken for moved as it is like the last part where that has gone.
-
-        Points that the last part may have had there are its own, now that it is known.
-        """
-        cloud, back = self.looks[after], self.motion(len(self.parts) - 1, after, before)
-        seen = evidence(self.looks[before], back.at(cloud.points), back.turned(cloud.normals))
-        own = seen >= HIDDEN
-        moved = False
+        """Put back what was taken for moved as it is like the last part where that has gone."""
+        last, moved = len(self.parts) - 1, False
         for number, part in enumerate(self.parts[:-1]):
             there = part.positions[after]
             if abs(there - part.positions[before]) > CARRIED:
-                part.positions[after] = part.positions[before]
-                self.find(number, after, others=own)
+                find_beside(self, number, before, after, self.motion(last, after, before))
                 moved |= abs(part.positions[after] - there) > CARRIED
         if moved:
             for look in (before, after):

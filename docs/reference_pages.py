@@ -54,6 +54,7 @@ STAGES = {
         *("identification.interactive.handling", "identification.interactive.splitting"),
         *("identification.interactive.averaging", "identification.interactive.duplicates"),
         *("identification.interactive.carriers", "identification.interactive.hindsight"),
+        "identification.interactive.insertion",
         *("identification.interactive.screws", "identification.interactive.labels"),
         *("identification.interactive.refinement", "identification.interactive.description"),
         *("identification.interactive.resistance", "identification.interactive.dynamics"),

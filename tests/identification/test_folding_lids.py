@@ -42,11 +42,11 @@ DEEP = """
     <geom type="box" size=".02 .6 .34" pos=".35 0 .45"/>
     <geom type="box" size=".02 .6 .34" pos="-.37 0 .45"/>
 """ + LID[LID.index("    <body") :]
-LEAF = 2
+CHEST_LID, LEAF = 1, 2
 
 
 class Chest(Room):
-    """A chest with a folding lid, and a hand at the far edge of its leaf."""
+    """A chest with a folding lid, and a hand at the far edge of that or of its leaf."""
 
     def place(self, body: int) -> np.ndarray:
         return np.array([-0.3, 0.1, 0.01])
@@ -81,6 +81,53 @@ def test_a_leaf_is_found_on_its_lid_though_both_look_like_one(chest, turn) -> No
     lid, leaf = np.array([part.positions for part in twin.parts])
     np.testing.assert_allclose(lid[2:] - lid[0], [lid[1], 0.05, 0.05, 0.05, 0.05], atol=0.05)
     assert np.diff(leaf)[-2] == pytest.approx(turn, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("start", "leaf", "lid", "scene"),
+    [(0.0, -0.73, 0.57, LID), (0.0, -0.73, 0.66, DEEP), (1.14, -0.34, -0.65, LID)],
+)
+def test_a_leaf_that_was_found_before_its_lid_hangs_on_it(start, leaf, lid, scene) -> None:
+    chest, twin = Chest(scene), Twin()
+    chest.at(start, 0.0)
+    twin.look(chest.look())
+    chest.pull(twin, LEAF, (start, 0.0), (start, leaf))
+    chest.pull(twin, CHEST_LID, (start, leaf), (start + lid, leaf))
+    # what went with the leaf as well is none of its points, nor the leaf a piece of the lid
+    first, second = twin.ordered()
+    assert [twin.parts[part].parent for part in (first, second)] == [-1, first]
+    assert [part for part, _ in twin.held] == [second, first]
+    gone = np.abs(np.diff(twin.parts[first].positions))
+    np.testing.assert_allclose(gone, [0.0, 0.0, abs(lid), 0.0], atol=0.07)
+    for joint, part in enumerate((first, second)):
+        turned, aside = chest.error(twin, part, joint)
+        assert turned < 3.0
+        assert aside < 4.0
+
+
+def test_two_known_joints_that_are_a_little_off_explain_a_pull_of_both(chest) -> None:
+    twin = opened(chest)
+    chest.pull(twin, LEAF, (0.05, 0.0), (0.05, 0.6))
+    lid, leaf = twin.parts
+    off = leaf.screw.varied(np.array([0.0, 0.0, 0.03, 0.03]))
+    leaf.estimate = dataclasses.replace(leaf.estimate, screw=off)
+    chest.pull(twin, LEAF, (0.05, 0.6), (0.5, 0.1))
+    assert twin.held[-1][0] == 1
+    assert len(leaf.ways) == 2
+    assert abs(lid.positions[-1] - lid.positions[0]) == pytest.approx(0.5, abs=0.06)
+
+
+def test_a_part_of_which_nothing_is_seen_is_kept_if_it_carries_another(chest, monkeypatch) -> None:
+    twin = opened(chest)
+    chest.pull(twin, LEAF, (0.05, 0.0), (0.05, 0.6))
+    twin.parts.reverse()  # the lid was found last
+    twin.parts[0].parent, twin.held = 1, [(1, 0), (1, 2), (0, 4)]
+    monkeypatch.setattr(twin_module, "FEWEST", 10**6)
+    assert twin._keep(True, 4, 5)
+    assert len(twin.parts) == 2
+    twin.parts[0].parent = -1
+    assert not twin._keep(True, 4, 5)
+    assert len(twin.parts) == 1
 
 
 def test_a_leaf_that_a_hand_has_felt_by_itself_is_not_explained_away_by_its_lid(chest) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.identification.interactive import discovery
-from palpate.identification.interactive.discovery import Discovery, discover, on_moving_carrier
+from palpate.identification.interactive.discovery import discover, on_moving_carrier
 from palpate.identification.interactive.duplicates import drop_explained
 from palpate.identification.interactive.explanation import (
     find_moved_part,
@@ -15,6 +15,7 @@ from palpate.identification.interactive.explanation import (
     two_positions,
 )
 from palpate.identification.interactive.handling import Handling, Push
+from palpate.identification.interactive.insertion import Discovery
 from palpate.identification.interactive.labels import distinguishing_looks
 from palpate.identification.interactive.refinement import misfit
 from palpate.identification.interactive.screws import screws_of_way

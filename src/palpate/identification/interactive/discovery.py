@@ -9,23 +9,27 @@ import dataclasses
 import math
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from palpate.identification.interactive.carriers import STILLER, TOUCHES, find_beside
 from palpate.identification.interactive.explanation import (
-    FURTHER,
     OPEN,
     joint_of_ways,
     labels_near,
 )
 from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.insertion import (
+    WITHIN,
+    Discovery,
+    candidate_of,
+    insert,
+    relatives,
+)
 from palpate.identification.interactive.labels import (
-    HIDDEN,
     LEAST_MOTION,
-    distinguishing_looks,
     evidence,
 )
-from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge, support_of
+from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge
 from palpate.identification.interactive.refinement import (
     MOMENTS,
     Estimate,
@@ -40,25 +44,12 @@ from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, scre
 from palpate.identification.interactive.tree import FEWEST, Candidate, PartTree
 
 TELLS = 0.03  # m that a hand has to go to tell of a joint that is not known
-WITHIN = 0.6  # share of a part's points that make it a part of another
-LITTLE = 0.05  # m that a hand has taken a part: too little was known of it to know it again
 STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see `surprise`)
 AROUND = 0.3  # m from a hand to the points by which a joint on a carrier is sought
 TURNS, ARMS = 12, (0.0, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7)  # directions, and m
 TRIED = 3  # of those joints, the best, which are refined
 ROUNDS = 4  # of a joint and of what has moved with it, each from the other
 SETTLED = 2  # ways of a hand that agree: the joint of a part is what they say
-
-
-@dataclasses.dataclass(frozen=True)
-class Discovery:
-    """A joint on a `carrier` where that was in the look before, the points of both looks, and how
-    much likelier those are with it than without (logarithm)."""
-
-    carrier: int
-    estimate: Estimate
-    masks: list[Int[np.ndarray, " _"]]
-    gain: float = 0.0
 
 
 def discover(
@@ -130,7 +121,7 @@ def _is_better(
     """Whether a part on a carrier explains more than one alone, beside which that has moved too."""
     part = tree.parts[on_carrier.carrier]
     there = part.positions[after]
-    motion = _candidate(alone.estimate, NOWHERE, before, after).motion
+    motion = candidate_of(alone.estimate, NOWHERE, before, after).motion
     find_beside(tree, on_carrier.carrier, before, after, motion.inverse)
     moved = abs(part.positions[after] - part.positions[before]) > STILLER
     part.positions[after] = there
@@ -183,7 +174,7 @@ def _best(
         estimate = Estimate(screw, np.array([0.0, gone]), np.eye(4), 0.0, 0.0)
         masks: list[np.ndarray] = []
         for _ in range(ROUNDS):
-            candidate = _candidate(estimate, back, before, after)
+            candidate = candidate_of(estimate, back, before, after)
             masks = [
                 np.flatnonzero(tree.probabilities(look, candidate).argmax(0) == len(tree.parts) + 1)
                 for look in (before, after)
@@ -197,7 +188,7 @@ def _best(
             estimate = refine(estimate.screw, estimate.positions, seen, [(0, way)])
         if max(map(len, masks)) < FEWEST or surprise(estimate, way) > STRANGE:
             continue
-        candidate = _candidate(estimate, back, before, after)
+        candidate = candidate_of(estimate, back, before, after)
         if not any(
             tree.much_is_left(candidate, look, len(mask))
             for look, mask in zip((before, after), masks, strict=True)
@@ -220,7 +211,7 @@ def _gain(
 
     What is explained as well without it says nothing for it: a wall may slide in its plane.
     """
-    candidate, gain = _candidate(estimate, back, before, after), 0.0
+    candidate, gain = candidate_of(estimate, back, before, after), 0.0
     for look in (before, after):
         given = tree.scores(look, candidate)
         more = given[-1] - given[:-1].max(axis=0)
@@ -232,92 +223,6 @@ def _gain(
     numbers = 4.0 if estimate.screw.joint == "revolute" else 2.0
     strays = misfit(estimate.screw, way) * 2.0 * min(len(way), MOMENTS)
     return gain - 0.5 * strays - 0.5 * numbers * math.log(max(estimate.independent, 2.0))
-
-
-def _candidate(estimate: Estimate, back: Pose, before: int, after: int) -> Candidate:
-    gone = float(estimate.positions[1] - estimate.positions[0])
-    return Candidate(back.inverse @ estimate.screw.pose(gone), before, after)
-
-
-def insert(
-    tree: PartTree,
-    before: int,
-    after: int,
-    new: Discovery,
-    way: Float[np.ndarray, "times 3"] | None = None,
-) -> None:
-    """Put a new part where it belongs in the tree, with the way of the hand that took it."""
-    parent, carried, same = _relatives(tree, before, after, new)
-    number = len(tree.parts)
-    back = tree.pose(parent, before).inverse
-    screw = new.estimate.screw.moved(back)
-    positions = [0.0] * len(tree.looks)
-    positions[after] = float(new.estimate.positions[1] - new.estimate.positions[0])
-    # a carrier that is found by its overlap alone has not moved: the whole way was the part's
-    there = tree.pose(parent, after) if new.carrier >= 0 else back.inverse
-    poses = back, (there @ screw.pose(positions[after])).inverse
-    support = support_of((tree.looks[before], tree.looks[after]), new.masks, poses)
-    estimate = dataclasses.replace(new.estimate, screw=screw)
-    seen = {before: new.masks[0], after: new.masks[1]}
-    ways = [] if way is None else [(before, way)]
-    guessed = new.carrier >= 0 and way is not None
-    tree.parts.append(Part(parent, estimate, positions, seen, ways, support, guessed))
-    for look, mask in seen.items():
-        tree.labels[look] = np.where(np.isin(tree.labels[look], same), number, tree.labels[look])
-        tree.labels[look][mask] = number
-    related = {*tree.carriers(number), *carried, *same}
-    strange = [other for other in range(number) if other not in related]
-    for look in (*reversed(range(before)), *range(after + 1, len(tree.looks))):
-        known, step = (before, 1) if look < before else (after, -1)
-        others = np.isin(tree.labels[look], strange) | tree.points_of_others(number, look, known)
-        tree.parts[number].positions[look] = tree.parts[number].positions[look + step]
-        # a pull that told nothing may have moved it, and far
-        tree.find(number, look, others=others, beyond=FURTHER if look < before else None)
-    for child in carried:
-        if tree.parts[child].parent == parent:
-            tree.parts[child].parent = number
-            tree.parts[child].positions[after] = tree.parts[child].positions[before]
-    # what carries the carrier stays: a part cannot hang on what hangs on it
-    above = tree.carriers(number)
-    for old in sorted(set(same).difference(above), reverse=True):
-        tree.parts[number].ways += tree.parts[old].ways
-        if tree.parts[old].parent == parent:
-            again = np.array(tree.parts[old].positions_of(estimate.screw))
-            tree.parts[number].positions[:before] = (again[:before] - again[before]).tolist()
-        tree.remove(old, number)
-        number -= 1
-
-
-def _relatives(
-    tree: PartTree, before: int, after: int, new: Discovery
-) -> tuple[int, list[int], list[int]]:
-    """What carries a new part, the parts that it carries, and those that are a piece of it."""
-    labels, mask = tree.labels[before], np.zeros(len(tree.labels[before]), bool)
-    mask[new.masks[0]] = True
-    parent, carried, same = new.carrier, [], []
-    back = tree.motion(new.carrier, after, before)
-    gone = tree.scores(before, _candidate(new.estimate, back, before, after))[-1]
-    for number, part in enumerate(tree.parts):
-        own = labels == number
-        if own.sum() < FEWEST or number == new.carrier:
-            continue
-        shared = (mask & own).sum()
-        little = part.longest_way < LITTLE or shared > WITHIN * mask.sum()
-        if shared > WITHIN * own.sum() and little:
-            same.append(number)
-        elif (
-            shared > WITHIN * own.sum()
-            and mask.sum() > 1.2 * own.sum()
-            and gone[own].mean() > HIDDEN
-        ):
-            carried.append(number)  # all of it has moved, and more
-        elif (
-            new.carrier < 0
-            and shared > WITHIN * mask.sum()
-            and _carries(tree, number, before, after, new.masks[0])
-        ):
-            parent = number
-    return parent, carried, same
 
 
 def _parts_that_contradict(
@@ -335,7 +240,7 @@ def _parts_that_contradict(
     pieces = [one for one in held if one >= 0 and np.sum(taken == one) >= WITHIN * len(taken)]
     return [
         number
-        for number in {*pieces, *_relatives(tree, before, after, new)[2]}
+        for number in {*pieces, *relatives(tree, before, after, new)[2]}
         if len(ways := tree.parts[number].ways) >= SETTLED
         and joint_of_ways(tree, tree.parts[number], [*ways, (before, way)]) is None
     ]
@@ -373,21 +278,3 @@ def _is_hinged_on(tree: PartTree, part: int, before: int, after: int, new: Disco
         return False
     stayed = evidence(tree.looks[after], cloud.points[rest], cloud.normals[rest])
     return bool(np.mean(stayed) > OPEN)
-
-
-def _carries(
-    tree: PartTree, part: int, before: int, after: int, mask: Int[np.ndarray, " _"]
-) -> bool:
-    """Whether these points of a look went where a part went, rather than stood still.
-
-    Where no look tells, what was taken for a piece of the part is.
-    """
-    cloud, places = tree.looks[before], np.array([one.positions for one in tree.parts])
-    points, normals = cloud.points[mask], cloud.normals[mask]
-    gain = 0.0
-    for look in distinguishing_looks(places, before):
-        pose = tree.motion(part, before, look)
-        if look != after and abs(places[part, look] - places[part, before]) > LEAST_MOTION:
-            gone = evidence(tree.looks[look], pose.at(points), pose.turned(normals))
-            gain += float(np.sum(gone - evidence(tree.looks[look], points, normals)))
-    return gain >= 0.0

@@ -1,6 +1,7 @@
 """Which of the parts that are known a hand has moved."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -149,21 +150,44 @@ def _by_two_joints(tree: PartTree, before: int, after: int, handling: Handling) 
             continue
         both = tree.parts[carrier], tree.parts[part]
         kept = [one.positions[after] for one in both]
-        for one, end in zip(both, ends, strict=True):
-            one.positions[after] = end
-        seen = [
-            float(tree.seen_at(number, after, np.array([end]))[0])
-            for number, end in zip((carrier, part), ends, strict=True)
-        ]
         own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
-        if min(seen) > OPEN and not any(
-            tree.much_is_left(candidate, look, own) for look in (before, after)
-        ):
+        _place(both, ends, after)
+        seen = _are_seen_near(tree, (carrier, part), before, after, handling)
+        if not seen:
+            _place(both, ends, after)
+            seen = _are_seen(tree, (carrier, part), after)
+        if seen and not any(tree.much_is_left(candidate, look, own) for look in (before, after)):
             both[1].ways.append((before, handling.points))
             return part
-        for one, place in zip(both, kept, strict=True):
-            one.positions[after] = place
+        _place(both, kept, after)
     return -1
+
+
+def _place(parts: Sequence[Part], positions: Sequence[float], look: int) -> None:
+    """Say where parts are in a look (rad or m)."""
+    for part, position in zip(parts, positions, strict=True):
+        part.positions[look] = position
+
+
+def _are_seen(tree: PartTree, parts: tuple[int, int], look: int) -> bool:
+    """Whether no camera looks through parts where they are believed to be."""
+    return all(
+        tree.seen_at(part, look, np.array([tree.parts[part].positions[look]]))[0] > OPEN
+        for part in parts
+    )
+
+
+def _are_seen_near(
+    tree: PartTree, parts: tuple[int, int], before: int, after: int, handling: Handling
+) -> bool:
+    """The same of a carrier and a part on it, which are taken to where they are seen, as joints are
+    a little off; if the hand is then about where the part has gone."""
+    for part in parts:
+        tree.find(part, after, around=tree.parts[part].positions[after])
+    start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
+    missed = np.linalg.norm(tree.motion(parts[1], before, after).at(start[None])[0] - end)
+    near = missed < EXPLAINED[0] + EXPLAINED[1] * handling.travel
+    return bool(near) and _are_seen(tree, parts, after)
 
 
 def two_positions(

@@ -13,9 +13,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from palpate.identification.interactive.discovery import Discovery, insert
 from palpate.identification.interactive.duplicates import merge_same
 from palpate.identification.interactive.explanation import FURTHER
+from palpate.identification.interactive.insertion import Discovery, insert
 from palpate.identification.interactive.labels import HIDDEN, ON, TOLERANCE, evidence
 from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge
 from palpate.identification.interactive.refinement import NEAR, refine, sighting

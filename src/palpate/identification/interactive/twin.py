@@ -183,14 +183,17 @@ class Twin(PartTree):
                 self.remove(number, part.parent)
 
     def _keep(self, new: bool, before: int, after: int) -> bool:
-        """Say anew what two looks show; a new part that explains nothing vanishes (III-B d).
+        """Say anew what two looks show; a new part that explains and carries nothing vanishes
+        (III-B d).
 
         Whether there is a new part.
         """
         for look in (before, after):
             self.relabel(look)
         number = len(self.parts) - 1
-        if new and max((self.labels[look] == number).sum() for look in (before, after)) < FEWEST:
+        carries = any(part.parent == number for part in self.parts)
+        seen = max((self.labels[look] == number).sum() for look in (before, after))
+        if new and seen < FEWEST and not carries:
             self.remove(number, self.parts[number].parent)
             # what carries it was not held: that pull is not explained
             self.held = [(-1 if look == before else held, look) for held, look in self.held]

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from palpate.identification.interactive.carriers import STILLER, TOUCHES, find_beside
+from palpate.identification.interactive.carriers import CARRIED, TOUCHES, find_beside
 from palpate.identification.interactive.explanation import (
     OPEN,
     joint_of_ways,
@@ -118,12 +118,13 @@ def _on_carrier(
 def _is_better(
     tree: PartTree, before: int, after: int, on_carrier: Discovery, alone: Discovery
 ) -> bool:
-    """Whether a part on a carrier explains more than one alone, beside which that has moved too."""
+    """Whether a part on a carrier explains more than one alone, beside which that has moved too,
+    and further than one may creep that was let go."""
     part = tree.parts[on_carrier.carrier]
     there = part.positions[after]
     motion = candidate_of(alone.estimate, NOWHERE, before, after).motion
     find_beside(tree, on_carrier.carrier, before, after, motion.inverse)
-    moved = abs(part.positions[after] - part.positions[before]) > STILLER
+    moved = abs(part.positions[after] - part.positions[before]) > CARRIED
     part.positions[after] = there
     return moved and on_carrier.gain > alone.gain
 

@@ -11,7 +11,6 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from palpate.identification.interactive.carriers import CARRIED, TOUCHES, find_beside
 from palpate.identification.interactive.explanation import (
     OPEN,
     joint_of_ways,
@@ -19,9 +18,12 @@ from palpate.identification.interactive.explanation import (
 )
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import (
+    CARRIED,
+    TOUCHES,
     WITHIN,
     Discovery,
     candidate_of,
+    find_beside,
     insert,
     relatives,
 )

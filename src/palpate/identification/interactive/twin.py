@@ -7,7 +7,6 @@ carries it.
 
 import numpy as np
 
-from palpate.identification.interactive.carriers import CARRIED, find_beside, reparent
 from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
 from palpate.identification.interactive.explanation import (
@@ -19,6 +18,7 @@ from palpate.identification.interactive.explanation import (
     may_have_moved,
 )
 from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.insertion import CARRIED, find_beside, reparent
 from palpate.identification.interactive.part import KNOWN, UNSURE, Part
 from palpate.identification.interactive.refinement import is_of_two_ends, misfit
 from palpate.identification.interactive.screws import screws_of_way

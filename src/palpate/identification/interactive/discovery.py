@@ -76,11 +76,13 @@ def discover(
             found = None  # both have moved, and their way looks like a circle
     if found is None or found.carrier < 0:
         # what it is on need not reach to the hand: a flap hangs by its far edge
-        near = labels_near(tree, before, handling.push.point, math.inf)
-        options = (_on_carrier(tree, before, after, one, way) for one in near if one >= 0)
+        near = [one for one in labels_near(tree, before, handling.push.point, math.inf) if one >= 0]
+        # a way of two joints may look like a circle: what has moved beside it may carry it
+        if found is not None:
+            near = [one for one in near if _moves_beside(tree, before, after, one, found)]
+        options = (_on_carrier(tree, before, after, one, way) for one in near)
         other = next((one for one in options if one is not None), None)
-        # a way of two joints may look like a circle
-        if found is None or (other is not None and _is_better(tree, before, after, other, found)):
+        if found is None or (other is not None and other.gain > found.gain):
             found = other
     if found is not None:
         insert(tree, before, after, found, way)
@@ -117,18 +119,18 @@ def _on_carrier(
     return found
 
 
-def _is_better(
-    tree: PartTree, before: int, after: int, on_carrier: Discovery, alone: Discovery
-) -> bool:
-    """Whether a part on a carrier explains more than one alone, beside which that has moved too,
-    and further than one may creep that was let go."""
-    part = tree.parts[on_carrier.carrier]
-    there = part.positions[after]
+def _moves_beside(tree: PartTree, before: int, after: int, number: int, alone: Discovery) -> bool:
+    """Whether a part has moved as well as one that is taken to be on nothing that moved, and
+    further than what was let go may creep."""
+    part = tree.parts[number]
+    there, began = part.positions[after], part.positions[before]
+    if abs(there - began) <= CARRIED:
+        return False
     motion = candidate_of(alone.estimate, NOWHERE, before, after).motion
-    find_beside(tree, on_carrier.carrier, before, after, motion.inverse)
-    moved = abs(part.positions[after] - part.positions[before]) > CARRIED
+    find_beside(tree, number, before, after, motion.inverse)
+    moved = abs(part.positions[after] - began) > CARRIED
     part.positions[after] = there
-    return moved and on_carrier.gain > alone.gain
+    return moved
 
 
 def on_moving_carrier(

@@ -25,11 +25,11 @@ def reconsider(twin: Twin) -> Twin:
 
     Nothing is tried where all pulls are explained.
     """
-    moved = any(
+    unexplained = any(
         handling.moved and part < 0
         for handling, (part, _) in zip(twin.handled, twin.held, strict=True)
     )
-    if not moved:
+    if not unexplained:
         return twin
     other = explain_backwards(twin)
     return other if explained(other) > explained(twin) + BETTER else twin

@@ -64,7 +64,7 @@ def insert(
     # a carrier that is found by its overlap alone has not moved: the whole way was the part's
     there = tree.pose(parent, after) if new.carrier >= 0 else back.inverse
     poses = back, (there @ screw.pose(positions[after])).inverse
-    masks = _without(tree, before, after, new, carried)
+    masks = _own_masks(tree, before, after, new, carried)
     support = support_of((tree.looks[before], tree.looks[after]), masks, poses)
     estimate = dataclasses.replace(new.estimate, screw=screw)
     seen = {before: masks[0], after: masks[1]}
@@ -97,7 +97,7 @@ def insert(
         number -= 1
 
 
-def _without(
+def _own_masks(
     tree: PartTree, before: int, after: int, new: Discovery, carried: list[int]
 ) -> list[Int[np.ndarray, " _"]]:
     """The points of both looks that went with a new part, less those of parts that it carries, if

@@ -163,6 +163,13 @@ def test_looks_differ_though_where_a_carrier_was_is_not_quite_known() -> None:
     assert {0, 2, 3} & set(chosen)
 
 
+def test_a_look_is_held_against_more_than_one_in_which_a_part_has_gone_as_far() -> None:
+    door = np.array([0.0, 0.0, 0.6, 1.1, 1.8, 0.0, 1.5])
+    chosen = distinguishing_looks(door[None], 0)
+    assert set(chosen) == {2, 3, 4, 6}  # and none in which nothing has moved
+    assert distinguishing_looks(np.zeros((1, 3)), 0) == [2]
+
+
 def test_what_no_hand_has_moved_may_creep_but_does_not_jump() -> None:
     room, twin = Room(), Twin()
     room.at(0.0, 0.0)

@@ -1,4 +1,4 @@
-"""All that was done explained once more, from the last to the first, if a pull was not explained.
+"""All that was done explained once more, from the last to the first, if not all was explained.
 
 Which part a pull is of depends on what is known by then: a pull that moved two joints tells little
 before one of them is known. Backwards in time other pulls come first. Both accounts are of the same
@@ -8,14 +8,20 @@ looks and ways, so that how well they explain those compares them.
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import scores
-from palpate.identification.interactive.screws import NOWHERE
+from palpate.identification.interactive.labels import HIDDEN, evidence
+from palpate.identification.interactive.screws import Pose
 from palpate.identification.interactive.twin import Twin
+from palpate.perception.clouds import Cloud
 
-POINTS = 200  # of each look that accounts are compared by, about
-OF_PART = 0.02  # of evidence, for each point: what a part has to explain at least
+POINTS = 100  # of each look that accounts are compared by, about
+# of evidence, for each point: what is hidden where it has gone is nearly as likely as what is seen
+# there, as a part that opens hides much and bares more
+CONCEALED = 0.6
+OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
+ENOUGH = 0.78  # the same: less than nearly all is explained
 BETTER = 0.03  # the same: how much more the account backwards has to explain
 
 
@@ -23,32 +29,52 @@ def reconsider(twin: Twin) -> Twin:
     """The twin, or what is believed of the same looks and handlings when they are taken from the
     last to the first, if that explains more of what was seen.
 
-    Nothing is tried where all pulls are explained.
+    Nothing is tried where all pulls are explained, and nearly all that was seen.
     """
-    unexplained = any(
-        handling.moved and part < 0
-        for handling, (part, _) in zip(twin.handled, twin.held, strict=True)
-    )
-    if not unexplained:
+    known = explained(twin)
+    if known > ENOUGH and not _share_unexplained(twin):
         return twin
     other = explain_backwards(twin)
-    return other if explained(other) > explained(twin) + BETTER else twin
+    return other if explained(other) > known + BETTER else twin
 
 
 def explained(twin: Twin) -> float:
     """How much likelier the likeliest label of a point makes another look (logarithm), the mean of
-    points and pairs of looks, less what the parts cost."""
-    count, found = len(twin.looks), []
+    points and pairs of looks, less what parts and unexplained pulls cost."""
+    found, parts = [], range(-1, len(twin.parts))
     for look, cloud in enumerate(twin.looks):
-        others = [one for one in range(count) if one != look]
-        motions = [
-            [twin.motion(part, look, one) for one in others] for part in range(len(twin.parts))
-        ]
         chosen = slice(None, None, max(1, len(cloud.points) // POINTS))
-        clouds = [twin.looks[one] for one in others]
-        given = scores(cloud, clouds, [[NOWHERE] * len(others), *motions], chosen)
-        found.append(float(given.max(axis=0).mean()) / max(len(others), 1))
-    return float(np.mean(found)) - OF_PART * len(twin.parts)
+        points, normals = cloud.points[chosen], cloud.normals[chosen]
+        total = np.zeros((len(parts), len(points)))
+        for other, seen in enumerate(twin.looks):
+            if other != look:
+                motions = [twin.motion(part, look, other) for part in parts]
+                total += _evidence_of_motions(seen, points, normals, motions)
+        found.append(float(total.max(axis=0).mean()) / max(len(twin.looks) - 1, 1))
+    cost = OF_PART * len(twin.parts) + OF_PULLS * _share_unexplained(twin)
+    return float(np.mean(found)) - cost
+
+
+def _evidence_of_motions(
+    seen: Cloud,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    motions: list[Pose],
+) -> Float[np.ndarray, "motions n"]:
+    """The evidence of a look for points, as each motion takes them there."""
+    # at once, as each by itself takes as long as many
+    moved = np.concatenate([pose.at(points) for pose in motions])
+    turned = np.concatenate([pose.turned(normals) for pose in motions])
+    found = evidence(seen, moved, turned).reshape(len(motions), len(points))
+    return np.where(found == HIDDEN, CONCEALED, found)
+
+
+def _share_unexplained(twin: Twin) -> float:
+    """The share of the pulls that moved something which are of no part that is known."""
+    held = [
+        part for handling, (part, _) in zip(twin.handled, twin.held, strict=True) if handling.moved
+    ]
+    return float(np.mean(np.array(held) < 0)) if held else 0.0
 
 
 def explain_backwards(twin: Twin) -> Twin:
@@ -65,7 +91,10 @@ def explain_backwards(twin: Twin) -> Twin:
             other.look(look)
         else:
             other.observe(_backwards(handling))
-    return _in_order_of(other, twin)
+    other = _in_order_of(other, twin)
+    for look in range(len(other.looks)):
+        other.relabel(look)  # those that came first tell of what was found after
+    return other
 
 
 def _backwards(handling: Handling) -> Handling:

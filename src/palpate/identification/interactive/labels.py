@@ -151,7 +151,10 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
         gain[[look, *chosen]] = -1.0
         best = int(np.argmax(gain))
         if gain[best] < LEAST_MOTION:
-            break
+            if not covered.any():
+                break
+            covered[:] = 0.0  # once more by others, as one look alone is noisy
+            continue
         chosen.append(best)
         covered = np.maximum(covered, value[..., best])
     return chosen or [other for other in range(count) if other != look][-1:]

@@ -35,6 +35,7 @@ MOST_OF_HEIGHT = 1.5  # of evidence, of each look: what the height of its surfac
 
 OTHERS = 6  # looks that a look is held against
 LEAST_MOTION = 0.02  # rad or m: less is none
+DIFFERENT = 0.1  # rad or m: looks between which all parts have moved less show the same
 HARDLY = 3.0  # times as far as one part another one moves alone: where it was is not quite known
 TELLING = 0.3  # rad or m of a part: to be further away tells no more
 
@@ -154,6 +155,8 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
             if not covered.any():
                 break
             covered[:] = 0.0  # once more by others, as one look alone is noisy
+            same = np.abs(places[:, None] - places[:, chosen, None]).max(axis=0) < DIFFERENT
+            value[..., same.any(axis=0)] = 0.0
             continue
         chosen.append(best)
         covered = np.maximum(covered, value[..., best])

@@ -138,7 +138,8 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
     """The looks that tell labels from each other: where one has moved and the other has not.
 
     `places` are positions of joints, rad or m. What has moved may have shown another side: then
-    only a look in which the others would have had to be seen says that it is none of them.
+    only a look in which the others would have had to be seen says that it is none of them. Once all
+    are told apart, looks that show other states still are added, `OTHERS` in all at most.
     """
     count = places.shape[1]
     moved = np.minimum(np.abs(places - places[:, look, None]), TELLING)

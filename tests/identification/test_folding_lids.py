@@ -84,11 +84,19 @@ def test_a_leaf_is_found_on_its_lid_though_both_look_like_one(chest, turn) -> No
 
 
 @pytest.mark.parametrize(
-    ("start", "leaf", "lid", "scene"),
-    [(0.0, -0.73, 0.57, LID), (0.0, -0.73, 0.66, DEEP), (1.14, -0.34, -0.65, LID)],
+    ("start", "leaf", "lid", "scene", "seed"),
+    [
+        (0.0, -0.73, 0.57, LID, 0),
+        (0.0, -0.73, 0.57, LID, 1),
+        (0.0, -0.73, 0.66, DEEP, 0),
+        (0.0, -0.73, 0.66, DEEP, 1),
+        (0.0, -0.73, 0.66, DEEP, 3),
+        (1.14, -0.34, -0.65, LID, 0),
+    ],
 )
-def test_a_leaf_that_was_found_before_its_lid_hangs_on_it(start, leaf, lid, scene) -> None:
+def test_a_leaf_that_was_found_before_its_lid_hangs_on_it(start, leaf, lid, scene, seed) -> None:
     chest, twin = Chest(scene), Twin()
+    chest.random = np.random.default_rng(seed)
     chest.at(start, 0.0)
     twin.look(chest.look())
     chest.pull(twin, LEAF, (start, 0.0), (start, leaf))

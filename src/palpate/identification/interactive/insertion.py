@@ -81,7 +81,8 @@ def insert(
         others = np.isin(tree.labels[look], strange) | tree.points_of_others(number, look, known)
         tree.parts[number].positions[look] = tree.parts[number].positions[look + step]
         # a pull that told nothing may have moved it, and far
-        tree.find(number, look, others=others, beyond=FURTHER if look < before else None)
+        beyond = FURTHER if look < before else None
+        tree.find(number, look, others=others, beyond=beyond, new=True)
     for child in carried:
         if tree.parts[child].parent == parent:
             tree.parts[child].parent = number

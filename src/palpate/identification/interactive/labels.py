@@ -35,7 +35,6 @@ MOST_OF_HEIGHT = 1.5  # of evidence, of each look: what the height of its surfac
 
 OTHERS = 6  # looks that a look is held against
 LEAST_MOTION = 0.02  # rad or m: less is none
-DIFFERENT = 0.1  # rad or m: looks between which all parts have moved less show the same
 HARDLY = 3.0  # times as far as one part another one moves alone: where it was is not quite known
 TELLING = 0.3  # rad or m of a part: to be further away tells no more
 
@@ -139,7 +138,7 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
 
     `places` are positions of joints, rad or m. What has moved may have shown another side: then
     only a look in which the others would have had to be seen says that it is none of them. Once all
-    are told apart, looks that show other states still are added, `OTHERS` in all at most.
+    are told apart, others that do so are added, `OTHERS` in all at most.
     """
     count = places.shape[1]
     moved = np.minimum(np.abs(places - places[:, look, None]), TELLING)
@@ -156,8 +155,6 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
             if not covered.any():
                 break
             covered[:] = 0.0  # once more by others, as one look alone is noisy
-            same = np.abs(places[:, None] - places[:, chosen, None]).max(axis=0) < DIFFERENT
-            value[..., same.any(axis=0)] = 0.0
             continue
         chosen.append(best)
         covered = np.maximum(covered, value[..., best])

@@ -47,6 +47,7 @@ REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that
 LEAST_MET = 0.4  # share of its points that meet one
 ALONG_NORMALS = 0.2  # least share of its squared motion that is along normals: they tell how far
 FARTHEST = 0.15  # rad or m that it is moved so
+CLEARLY = 0.12  # as `NOT_MOVED`: of a new part, which is moved so
 # of evidence, and as `NOT_MOVED`: of a position in which hardly anything of it is seen
 UNSEEN, NOT_HIDDEN = -0.35, 1.5
 HAND_TELLS = 0.5  # of evidence, for each point: how much worse one may be that a hand's way says
@@ -124,6 +125,7 @@ class PartTree(Kinematics):
         others: Bool[np.ndarray, " points"] | None = None,
         beyond: float | None = None,
         creeps: bool = False,
+        new: bool = False,
     ) -> float:
         """Where a part is in a look: where it was, unless another position is clearly better, and
         there where its points meet what was seen. Where it never was it is only if it is seen.
@@ -134,6 +136,9 @@ class PartTree(Kinematics):
         closes flush with another surface is as well seen where it was, when it has gone. Points
         of `others` are not the part's, wherever it is. It is sought `beyond` (rad or m) where it
         was seen, less by default, or no further than it `creeps` by itself.
+
+        The joint of a `new` part may be a little wrong, so that its points meet something a little
+        elsewhere: it is where it was, unless clearly more of it is seen there.
         """
         one = self.parts[part]
         last = one.positions[look]
@@ -160,16 +165,21 @@ class PartTree(Kinematics):
             ahead = -HAND_TELLS
         if there > here + ahead:
             one.positions[look] = float(best)
-        self._align(part, look, others)
+        stays = new and one.positions[look] == last
+        self._align(part, look, others, CLEARLY if stays else 0.0)
         return float(max(there, here))
 
     def _align(
-        self, part: int, look: int, others: Bool[np.ndarray, " points"] | None = None
+        self,
+        part: int,
+        look: int,
+        others: Bool[np.ndarray, " points"] | None = None,
+        ahead: float = 0.0,
     ) -> None:
         """Take a part, near where it is, to where its points meet the surface that was seen there,
         along its normals: `evidence` is as good anywhere within the noise (Gauss-Newton).
 
-        Points of `others` are not met.
+        Points of `others` are not met. It stays unless the evidence there is as good, or `ahead`.
         """
         one, cloud, screw = self.parts[part], self.looks[look], self.screw(part, look)
         began = one.positions[look]
@@ -193,7 +203,7 @@ class PartTree(Kinematics):
             there = one.positions[look] + float(slope @ missed) / float(slope @ slope)
             one.positions[look] = float(np.clip(there, began - FARTHEST, began + FARTHEST))
         before, after = self.seen_at(part, look, np.array([began, one.positions[look]]), others)
-        if after < before:
+        if after < before + ahead:
             one.positions[look] = began
 
     def seen_at(

@@ -143,7 +143,7 @@ class Twin(PartTree):
         on_last = [number for number, part in enumerate(self.parts) if part.parent == last]
         kept = list(self.parts[last].positions)
         for look in range(len(self.looks)) if on_last else ():
-            self.find(last, look)  # also among points that were taken for theirs
+            self.find(last, look, new=True)  # also among points that were taken for theirs
         carried = [number for number in on_last if self._was_carried(self.parts[number])]
         if not carried:
             self.parts[last].positions = kept

@@ -164,9 +164,10 @@ def test_looks_differ_though_where_a_carrier_was_is_not_quite_known() -> None:
 
 
 def test_a_look_is_held_against_more_than_one_in_which_a_part_has_gone_as_far() -> None:
-    door = np.array([0.0, 0.0, 0.6, 1.1, 1.8, 0.0, 1.5])
+    door = np.array([0.0, 0.0, 0.6, 1.1, 1.8, 0.0, 1.5, 0.65])
     chosen = distinguishing_looks(door[None], 0)
-    assert set(chosen) == {2, 3, 4, 6}  # and none in which nothing has moved
+    # and none in which nothing has moved, or that shows the same as another one
+    assert set(chosen) == {2, 3, 4, 6}
     assert distinguishing_looks(np.zeros((1, 3)), 0) == [2]
 
 

@@ -8,13 +8,10 @@ looks and ways, so that how well they explain those compares them.
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import HIDDEN, evidence
-from palpate.identification.interactive.screws import Pose
+from palpate.identification.interactive.labels import scores
 from palpate.identification.interactive.twin import Twin
-from palpate.perception.clouds import Cloud
 
 POINTS = 100  # of each look that accounts are compared by, about
 # of evidence, for each point: what is hidden where it has gone is nearly as likely as what is seen
@@ -41,32 +38,19 @@ def reconsider(twin: Twin) -> Twin:
 def explained(twin: Twin) -> float:
     """How much likelier the likeliest label of a point makes another look (logarithm), the mean of
     points and pairs of looks, less what parts and unexplained pulls cost."""
-    found, parts = [], range(-1, len(twin.parts))
+    found = []
     for look, cloud in enumerate(twin.looks):
+        others = [other for other in range(len(twin.looks)) if other != look]
+        motions = [
+            [twin.motion(part, look, other) for other in others]
+            for part in range(-1, len(twin.parts))
+        ]
         chosen = slice(None, None, max(1, len(cloud.points) // POINTS))
-        points, normals = cloud.points[chosen], cloud.normals[chosen]
-        total = np.zeros((len(parts), len(points)))
-        for other, seen in enumerate(twin.looks):
-            if other != look:
-                motions = [twin.motion(part, look, other) for part in parts]
-                total += _evidence_of_motions(seen, points, normals, motions)
-        found.append(float(total.max(axis=0).mean()) / max(len(twin.looks) - 1, 1))
+        seen = [twin.looks[other] for other in others]
+        best = scores(cloud, seen, motions, chosen, hidden=CONCEALED).max(axis=0)
+        found.append(float(best.mean()) / max(len(others), 1))
     cost = OF_PART * len(twin.parts) + OF_PULLS * _share_unexplained(twin)
     return float(np.mean(found)) - cost
-
-
-def _evidence_of_motions(
-    seen: Cloud,
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    motions: list[Pose],
-) -> Float[np.ndarray, "motions n"]:
-    """The evidence of a look for points, as each motion takes them there."""
-    # at once, as each by itself takes as long as many
-    moved = np.concatenate([pose.at(points) for pose in motions])
-    turned = np.concatenate([pose.turned(normals) for pose in motions])
-    found = evidence(seen, moved, turned).reshape(len(motions), len(points))
-    return np.where(found == HIDDEN, CONCEALED, found)
 
 
 def _share_unexplained(twin: Twin) -> float:

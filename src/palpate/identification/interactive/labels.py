@@ -35,6 +35,7 @@ MOST_OF_HEIGHT = 1.5  # of evidence, of each look: what the height of its surfac
 
 OTHERS = 6  # looks that a look is held against
 LEAST_MOTION = 0.02  # rad or m: less is none
+DIFFERENT = 0.1  # rad or m: looks between which all parts have moved less show the same
 HARDLY = 3.0  # times as far as one part another one moves alone: where it was is not quite known
 TELLING = 0.3  # rad or m of a part: to be further away tells no more
 
@@ -46,10 +47,12 @@ def evidence(
     points: np.ndarray,
     normals: np.ndarray,
     others: Bool[np.ndarray, " cloud"] | None = None,
+    hidden: float = HIDDEN,
 ) -> Float[np.ndarray, " n"]:
     """How much likelier it makes these points that a look is as it is (logarithm).
 
-    Points of the look that are known to be of `others` say nothing for them.
+    Points of the look that are known to be of `others` say nothing for them; `hidden` is what a
+    look says for points that it cannot show.
     """
     on, free = cloud.surfaces(points, TOLERANCE, normals)
     reach = 0.02 + TOLERANCE * cloud.error
@@ -60,7 +63,7 @@ def evidence(
     alike = np.vecdot(cloud.normals[index], normals[met]) > AGREES
     if others is not None:
         alike &= ~others[index]
-    found = np.full(len(points), HIDDEN)
+    found = np.full(len(points), hidden)
     found[free] = FREE
     found[met[alike]] = ON
     unseen = ~free
@@ -70,11 +73,27 @@ def evidence(
     return found
 
 
+def evidence_of_poses(
+    cloud: Cloud,
+    points: np.ndarray,
+    normals: np.ndarray,
+    poses: Sequence[Pose],
+    others: Bool[np.ndarray, " cloud"] | None = None,
+    hidden: float = HIDDEN,
+) -> Float[np.ndarray, "poses n"]:
+    """The `evidence` of a look for points where each of some poses takes them."""
+    # at once, as each by itself takes as long as many
+    moved = np.concatenate([pose.at(points) for pose in poses])
+    turned = np.concatenate([pose.turned(normals) for pose in poses])
+    return evidence(cloud, moved, turned, others, hidden).reshape(len(poses), len(points))
+
+
 def scores(
     cloud: Cloud,
     others: Sequence[Cloud],
     motions: Sequence[Sequence[Pose]],
     chosen: np.ndarray | slice = slice(None),
+    hidden: float = HIDDEN,
 ) -> Scores:
     """Of each label, for each of the chosen points of a look; the first is what stands still.
 
@@ -83,14 +102,11 @@ def scores(
     points, normals = cloud.points[chosen], cloud.normals[chosen]
     found = np.zeros((len(motions), len(points)))
     for number, other in enumerate(others):
-        known: list[tuple[Pose, np.ndarray]] = []
-        for label, motion in enumerate(motions):
-            pose = motion[number]
-            same = next((value for one, value in known if _same(one, pose)), None)
-            if same is None:
-                same = evidence(other, pose.at(points), pose.turned(normals))
-                known.append((pose, same))
-            found[label] += same
+        poses = [motion[number] for motion in motions]
+        first = [next(at for at, one in enumerate(poses) if _same(one, pose)) for pose in poses]
+        distinct, same = np.unique(first, return_inverse=True)
+        each = [poses[at] for at in distinct]
+        found += evidence_of_poses(other, points, normals, each, hidden=hidden)[same]
     return np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
 
 
@@ -138,7 +154,7 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
 
     `places` are positions of joints, rad or m. What has moved may have shown another side: then
     only a look in which the others would have had to be seen says that it is none of them. Once all
-    are told apart, others that do so are added, `OTHERS` in all at most.
+    are told apart, looks that show other states still are added, `OTHERS` in all at most.
     """
     count = places.shape[1]
     moved = np.minimum(np.abs(places - places[:, look, None]), TELLING)
@@ -155,6 +171,8 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
             if not covered.any():
                 break
             covered[:] = 0.0  # once more by others, as one look alone is noisy
+            same = np.abs(places[:, None] - places[:, chosen, None]).max(axis=0) < DIFFERENT
+            value[..., same.any(axis=0)] = 0.0
             continue
         chosen.append(best)
         covered = np.maximum(covered, value[..., best])

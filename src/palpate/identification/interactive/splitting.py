@@ -16,7 +16,13 @@ from jaxtyping import Bool, Float, Int
 from palpate.identification.interactive.duplicates import merge_same
 from palpate.identification.interactive.explanation import FURTHER
 from palpate.identification.interactive.insertion import Discovery, insert
-from palpate.identification.interactive.labels import HIDDEN, ON, TOLERANCE, evidence
+from palpate.identification.interactive.labels import (
+    HIDDEN,
+    ON,
+    TOLERANCE,
+    evidence,
+    evidence_of_poses,
+)
 from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge
 from palpate.identification.interactive.refinement import NEAR, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
@@ -197,9 +203,7 @@ def _evidence_of_pieces(
     chosen = np.concatenate([one.members for one in pieces])
     ends = np.cumsum([len(one.members) for one in pieces])[:-1]
     points, normals = tree.looks[look].points[chosen], tree.looks[look].normals[chosen]
-    each = np.stack([
-        evidence(tree.looks[other], pose.at(points), pose.turned(normals)) for pose in motions
-    ])  # fmt: skip
+    each = evidence_of_poses(tree.looks[other], points, normals, motions)
     return np.split(each, ends, axis=1)
 
 
@@ -245,9 +249,7 @@ def _compare(
     def hold(turns: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " points"]]:
         """The best of some turns, and the evidence of each point for it."""
         poses = [carried @ option.screw.pose(float(turn)) for turn in turns]
-        moved = np.concatenate([pose.at(points) for pose in poses])
-        turned = np.concatenate([pose.turned(normals) for pose in poses])
-        each = evidence(there, moved, turned, others).reshape(len(poses), len(points))
+        each = evidence_of_poses(there, points, normals, poses, others)
         best = int(each.mean(axis=1).argmax())
         return float(turns[best]), each[best]
 

@@ -18,6 +18,7 @@ from palpate.identification.interactive.labels import (
     TELLING,
     distinguishing_looks,
     evidence,
+    evidence_of_poses,
     height_evidence,
     prior,
     scores,
@@ -216,11 +217,7 @@ class PartTree(Kinematics):
         """The evidence of a look, for each point, for each of some positions of a part."""
         one, carrier = self.parts[part], self.pose(self.parts[part].parent, look)
         poses = [carrier @ one.screw.pose(float(position)) for position in positions]
-        # at once, as each by itself takes as long as many
-        points = np.concatenate([pose.at(one.support[0]) for pose in poses])
-        normals = np.concatenate([pose.turned(one.support[1]) for pose in poses])
-        found = evidence(self.looks[look], points, normals, others)
-        return found.reshape(len(poses), len(one.support[0])).mean(axis=1)
+        return evidence_of_poses(self.looks[look], *one.support, poses, others).mean(axis=1)
 
     def averaged(self, look: int) -> Cloud:
         """A look made less noisy by all others, as how its parts have moved is known."""
@@ -240,7 +237,8 @@ class PartTree(Kinematics):
         With a candidate, whose label is the last, by the other of its two looks alone.
         """
         others, motions = self._telling(look, candidate)
-        return scores(self.looks[look], [self.looks[other] for other in others], motions)
+        seen = [self.looks[other] for other in others]
+        return scores(self.looks[look], seen, motions)
 
     def probabilities(
         self, look: int, candidate: Candidate | None = None

@@ -56,7 +56,7 @@ STAGES = {
         *("identification.interactive.insertion", "identification.interactive.hindsight"),
         *("identification.interactive.screws", "identification.interactive.labels"),
         *("identification.interactive.refinement", "identification.interactive.description"),
-        *("identification.interactive.resistance", "identification.interactive.dynamics"),
+        *("identification.interactive.forces.resistance", "identification.interactive.forces.dynamics"),
         *("identification.samplers.draws", "identification.samplers.target"),
         *("identification.samplers.hamiltonian", "identification.samplers.metropolis"),
         *("identification.samplers.local_global", "identification.samplers.tempered"),

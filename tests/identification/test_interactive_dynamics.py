@@ -10,14 +10,14 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.dynamics import (
+from palpate.identification.interactive.forces.dynamics import (
     FORCE,
     POSITION,
     _Action,
     _upright,
     dynamics_of,
 )
-from palpate.identification.interactive.resistance import JointMotion, regress
+from palpate.identification.interactive.forces.resistance import JointMotion, regress
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated import ArticulatedState

@@ -9,7 +9,7 @@ from palpate.errors import PalpateError
 from palpate.families.appliance.foreign import read_scene
 from palpate.families.appliance.twin_picture import FILM, PICTURE, film_twin, show_twin
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
+from palpate.identification.interactive.forces.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES, WORTHS, choose_best
 from palpate.learning.movable_guess import load_guess

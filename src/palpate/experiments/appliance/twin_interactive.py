@@ -20,7 +20,12 @@ from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, ratio
 from palpate.identification.gradient.residual import Correction, fit_residual
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.dynamics import FORCE, POSITION, Dynamics, dynamics_of
+from palpate.identification.interactive.forces.dynamics import (
+    FORCE,
+    POSITION,
+    Dynamics,
+    dynamics_of,
+)
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated.urdf import write_urdf

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.identification.interactive.dynamics import Dynamics, dynamics_of
+from palpate.identification.interactive.forces.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.hindsight import reconsider
 from palpate.identification.interactive.registration import exact_poses

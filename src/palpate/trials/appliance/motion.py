@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from palpate.identification.interactive.dynamics import Dynamics
+from palpate.identification.interactive.forces.dynamics import Dynamics
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.articulated import ACTION, Articulated
 from palpate.models.articulated.parameters import ArticulatedState

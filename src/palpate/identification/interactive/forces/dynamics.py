@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
+from palpate.identification.interactive.forces.resistance import JointMotion, Resistance, regress
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.resistance import JointMotion, Resistance, regress
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.articulated import ACTION, Articulated

@@ -1,0 +1,1 @@
+"""What a hand felt: the masses of a twin's parts, and what resists at their joints."""

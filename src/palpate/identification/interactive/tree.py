@@ -180,7 +180,8 @@ class PartTree(Kinematics):
         """Take a part, near where it is, to where its points meet the surface that was seen there,
         along its normals: `evidence` is as good anywhere within the noise (Gauss-Newton).
 
-        Points of `others` are not met. It stays unless the evidence there is as good, or `ahead`.
+        Points of `others` are not met. It stays if the evidence there is not better by `ahead`,
+        or as good if that is 0.
         """
         one, cloud, screw = self.parts[part], self.looks[look], self.screw(part, look)
         began = one.positions[look]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from palpate.identification.interactive.pairs import pairs_of_looks
 from palpate.identification.interactive.refinement import Estimate, Sighting, refine, surprise
 from palpate.identification.interactive.screws import Screw
 
@@ -55,6 +56,50 @@ def test_where_a_hand_began_is_not_known_if_the_part_was_not_seen_there() -> Non
     seen = [boxed(0.0), None, boxed(0.25)]
     found = refine(moved, np.array([0.0, 0.1, 0.247]), seen, [(1, way)])
     assert found.positions == pytest.approx([0.0, 0.15, 0.25], abs=8e-3)
+
+
+def turned(seen: Sighting, screw: Screw, turn: float) -> Sighting:
+    """The same, once it has turned about a joint."""
+    pose = screw.pose(turn)
+    points = pose.at(seen.points)
+    return Sighting(points, pose.turned(seen.normals), seen.deviation, cKDTree(points))
+
+
+def degrees_between(screw: Screw, other: Screw) -> float:
+    return float(np.degrees(np.arccos(min(abs(screw.axis @ other.axis), 1.0))))
+
+
+def test_a_board_turns_about_a_hinge_in_its_plane() -> None:
+    hinge, turn = Screw("revolute", np.array([0.0, 1.0, 0.0]), np.zeros(3)), -0.6
+    seen = [sheet(0.0), turned(sheet(0.0), hinge, turn)]
+    bisector = np.array([np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)])
+    for tilt in (-0.2, 0.2):  # out of its plane: this takes the sheet to the same plane
+        axis = np.cos(tilt) * hinge.axis + np.sin(tilt) * bisector
+        found = refine(dataclasses.replace(hinge, axis=axis), np.array([0.0, turn]), seen, [])
+        assert degrees_between(found.screw, hinge) < 2.0
+        aside = np.cross(found.screw.point, hinge.axis)
+        assert np.linalg.norm(aside) < 0.02
+
+
+def test_what_is_not_flat_turns_about_any_axis() -> None:
+    screw, turn = Screw("revolute", np.full(3, 3.0**-0.5), np.array([0.3, 0.0, 0.0])), 0.5
+    seen = [boxed(0.0), turned(boxed(0.0), screw, turn)]
+    guess = screw.varied(np.array([0.05, -0.05, 0.0, 0.01]))
+    found = refine(guess, np.array([0.0, 0.48]), seen, [])
+    assert degrees_between(found.screw, screw) < 0.2
+
+
+def test_looks_are_compared_between_which_a_part_has_moved() -> None:
+    places = [0.0, 0.01, 0.0, 1.0, 0.5, 0.51, 0.9, 0.2]
+    counts = {0: 100, 1: 300, 2: 200, 3: 100, 4: 200, 5: 100, 6: 10}  # too few in 6, none in 7
+    pairs, placed = pairs_of_looks(places, counts, [], [])
+    # of those at the same place the one with most points; three places, each with each
+    assert sorted(map(sorted, pairs)) == [[1, 3], [1, 4], [3, 4]]
+    assert placed == []
+    pairs, placed = pairs_of_looks(places, counts, [2, 3, 6], [5, 6, 7])
+    assert sorted(map(sorted, pairs)) == [[2, 3], [2, 4], [3, 4]]  # where the hand was first
+    assert placed == [(5, 4)]
+    assert pairs_of_looks(places, {}, [2], [6]) == ([], [])
 
 
 def test_a_way_surprises_the_joint_that_it_is_not_of() -> None:

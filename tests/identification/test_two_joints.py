@@ -16,7 +16,7 @@ from palpate.identification.interactive.explanation import (
 )
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.insertion import Discovery
-from palpate.identification.interactive.labels import distinguishing_looks
+from palpate.identification.interactive.labels import distinguishing_looks, weights_of_looks
 from palpate.identification.interactive.refinement import misfit
 from palpate.identification.interactive.screws import screws_of_way
 from palpate.identification.interactive.twin import Twin
@@ -166,8 +166,10 @@ def test_looks_differ_though_where_a_carrier_was_is_not_quite_known() -> None:
 def test_a_look_is_held_against_more_than_one_in_which_a_part_has_gone_as_far() -> None:
     door = np.array([0.0, 0.0, 0.6, 1.1, 1.8, 0.0, 1.5, 0.65])
     chosen = distinguishing_looks(door[None], 0)
-    # and none in which nothing has moved, or that shows the same as another one
-    assert set(chosen) == {2, 3, 4, 6}
+    # and none in which nothing has moved; two that show the same count as one
+    assert set(chosen) == {2, 3, 4, 6, 7}
+    weights = dict(zip(chosen, weights_of_looks(door[None], chosen), strict=True))
+    assert weights == {2: 0.5, 3: 1.0, 4: 1.0, 6: 1.0, 7: 0.5}
     assert distinguishing_looks(np.zeros((1, 3)), 0) == [2]
 
 

@@ -31,7 +31,7 @@ from palpate.identification.interactive.labels import (
     LEAST_MOTION,
     evidence,
 )
-from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge
+from palpate.identification.interactive.part import UNSURE, Candidate, Part, is_same_hinge
 from palpate.identification.interactive.refinement import (
     MOMENTS,
     Estimate,
@@ -43,7 +43,7 @@ from palpate.identification.interactive.refinement import (
     surprise,
 )
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
-from palpate.identification.interactive.tree import FEWEST, Candidate, PartTree
+from palpate.identification.interactive.tree import FEWEST, PartTree
 
 TELLS = 0.03  # m that a hand has to go to tell of a joint that is not known
 STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see `surprise`)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import FREE, LEAST_MOTION, evidence
-from palpate.identification.interactive.part import Part
+from palpate.identification.interactive.part import Candidate, Part
 from palpate.identification.interactive.refinement import (
     SURPRISE,
     Estimate,
@@ -18,7 +18,7 @@ from palpate.identification.interactive.refinement import (
     surprise,
 )
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
-from palpate.identification.interactive.tree import NOT_MOVED, Candidate, PartTree
+from palpate.identification.interactive.tree import NOT_MOVED, PartTree
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 FURTHER = 1.5  # rad or m that a part may have been beyond where it was seen

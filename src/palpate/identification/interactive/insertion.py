@@ -15,10 +15,10 @@ from palpate.identification.interactive.labels import (
     distinguishing_looks,
     evidence,
 )
-from palpate.identification.interactive.part import Part, support_of
+from palpate.identification.interactive.part import Candidate, Part, support_of
 from palpate.identification.interactive.refinement import Estimate
 from palpate.identification.interactive.screws import Pose
-from palpate.identification.interactive.tree import FEWEST, THICK, Candidate, PartTree
+from palpate.identification.interactive.tree import FEWEST, THICK, PartTree
 
 WITHIN = 0.6  # share of a part's points that make it a part of another
 SEEN = 0.2  # of evidence, for each point: less is no difference
@@ -201,7 +201,7 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
             continue
         carried = part.parent == carrier
         now = dataclasses.replace(part, positions=list(part.positions))
-        other = _hang(tree, part, tree.parts[carrier].parent if carried else carrier, first)
+        other = hang(tree, part, tree.parts[carrier].parent if carried else carrier, first)
         # as free to be elsewhere as on the carrier
         before = _evidence_with(tree, number, now, gone)
         gain = _evidence_with(tree, number, other, gone) - before
@@ -210,7 +210,9 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
             and _travel(other, look) + STILLER < _travel(part, look)
             and _share_beside(tree, number, carrier, look) > BESIDE
         )
-        if gain > SEEN or (gain > -SEEN and beside):
+        # on what it hung it only seemed to undo what that did
+        stood = carried and _travel(other, look) + STILLER < _travel(part, look)
+        if gain > SEEN or (gain > -SEEN and (beside or stood)):
             other.settle(tree.estimate(other))
             for one in gone:
                 tree.relabel(one)
@@ -218,8 +220,8 @@ def reparent(tree: PartTree, carrier: int, look: int, new: int = -1) -> None:
             tree.parts[number] = part
 
 
-def _hang(tree: PartTree, part: Part, parent: int, look: int) -> Part:
-    """A part as it is in a look, on another parent."""
+def hang(tree: PartTree, part: Part, parent: int, look: int) -> Part:
+    """A part as it is in a look, on another parent; it is not put into the tree."""
     onto = tree.pose(parent, look).inverse @ tree.pose(part.parent, look)
     return dataclasses.replace(
         part,

@@ -35,7 +35,7 @@ MOST_OF_HEIGHT = 1.5  # of evidence, of each look: what the height of its surfac
 
 OTHERS = 6  # looks that a look is held against
 LEAST_MOTION = 0.02  # rad or m: less is none
-DIFFERENT = 0.1  # rad or m: looks between which all parts have moved less show the same
+DIFFERENT = 0.1  # rad or m: looks between which all parts have moved less show one state
 HARDLY = 3.0  # times as far as one part another one moves alone: where it was is not quite known
 TELLING = 0.3  # rad or m of a part: to be further away tells no more
 
@@ -94,11 +94,14 @@ def scores(
     motions: Sequence[Sequence[Pose]],
     chosen: np.ndarray | slice = slice(None),
     hidden: float = HIDDEN,
+    weights: Sequence[float] | None = None,
 ) -> Scores:
     """Of each label, for each of the chosen points of a look; the first is what stands still.
 
-    `motions[label][other]` is how what has the label has moved from this look to each other.
+    `motions[label][other]` is how what has the label has moved from this look to each other, and
+    `weights` what each of them counts, 1 by default.
     """
+    weights = [1.0] * len(others) if weights is None else weights
     points, normals = cloud.points[chosen], cloud.normals[chosen]
     found = np.zeros((len(motions), len(points)))
     for number, other in enumerate(others):
@@ -106,7 +109,8 @@ def scores(
         first = [next(at for at, one in enumerate(poses) if _same(one, pose)) for pose in poses]
         distinct, same = np.unique(first, return_inverse=True)
         each = [poses[at] for at in distinct]
-        found += evidence_of_poses(other, points, normals, each, hidden=hidden)[same]
+        value = evidence_of_poses(other, points, normals, each, hidden=hidden)
+        found += weights[number] * value[same]
     return np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
 
 
@@ -154,7 +158,7 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
 
     `places` are positions of joints, rad or m. What has moved may have shown another side: then
     only a look in which the others would have had to be seen says that it is none of them. Once all
-    are told apart, looks that show other states still are added, `OTHERS` in all at most.
+    are told apart, others that do so are added, `OTHERS` in all at most.
     """
     count = places.shape[1]
     moved = np.minimum(np.abs(places - places[:, look, None]), TELLING)
@@ -171,12 +175,23 @@ def distinguishing_looks(places: Float[np.ndarray, "parts looks"], look: int) ->
             if not covered.any():
                 break
             covered[:] = 0.0  # once more by others, as one look alone is noisy
-            same = np.abs(places[:, None] - places[:, chosen, None]).max(axis=0) < DIFFERENT
-            value[..., same.any(axis=0)] = 0.0
             continue
         chosen.append(best)
         covered = np.maximum(covered, value[..., best])
     return chosen or [other for other in range(count) if other != look][-1:]
+
+
+def weights_of_looks(
+    places: Float[np.ndarray, "parts looks"], chosen: Sequence[int]
+) -> list[float]:
+    """What each of some looks counts: those of one state together as much as one of another, as
+    what lands on a surface by chance does so in all of them.
+
+    `places` are positions of joints, rad or m.
+    """
+    own = places[:, list(chosen)]
+    apart = np.abs(own[:, :, None] - own[:, None]).max(axis=0, initial=0.0)
+    return (1.0 / np.sum(apart < DIFFERENT, axis=1)).tolist()
 
 
 def prior(cloud: Cloud, given: Scores, motions: Sequence[Sequence[Pose]]) -> Scores:

@@ -84,6 +84,21 @@ class Part:
         return screw.position_of(place, was).tolist()
 
 
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A part that is not among the others yet: how it has moved from one look to another."""
+
+    motion: Pose
+    first: int
+    second: int
+
+    def between(self, look: int) -> tuple[int, Pose]:
+        """The other of the two looks, and how the part has moved from this one to it."""
+        if look == self.first:
+            return self.second, self.motion
+        return self.first, self.motion.inverse
+
+
 def support_of(
     clouds: Sequence[Cloud], masks: Sequence[Int[np.ndarray, " _"]], poses: Sequence[Pose]
 ) -> Support:

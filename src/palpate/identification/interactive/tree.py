@@ -3,8 +3,6 @@
 All looks count for every joint, and every joint for the labels of all points.
 """
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -23,8 +21,9 @@ from palpate.identification.interactive.labels import (
     prior,
     scores,
     smooth_labels,
+    weights_of_looks,
 )
-from palpate.identification.interactive.part import Part, support_of
+from palpate.identification.interactive.part import Candidate, Part, support_of
 from palpate.identification.interactive.refinement import (
     SURPRISE,
     Estimate,
@@ -48,25 +47,11 @@ REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that
 LEAST_MET = 0.4  # share of its points that meet one
 ALONG_NORMALS = 0.2  # least share of its squared motion that is along normals: they tell how far
 FARTHEST = 0.15  # rad or m that it is moved so
+ROUGHLY = 60  # points that say well enough about where a part is, before all say where exactly
 CLEARLY = 0.12  # as `NOT_MOVED`: of a new part, which is moved so
 # of evidence, and as `NOT_MOVED`: of a position in which hardly anything of it is seen
 UNSEEN, NOT_HIDDEN = -0.35, 1.5
 HAND_TELLS = 0.5  # of evidence, for each point: how much worse one may be that a hand's way says
-
-
-@dataclasses.dataclass(frozen=True)
-class Candidate:
-    """A part that is not among the others yet: how it has moved from one look to another."""
-
-    motion: Pose
-    first: int
-    second: int
-
-    def between(self, look: int) -> tuple[int, Pose]:
-        """The other of the two looks, and how the part has moved from this one to it."""
-        if look == self.first:
-            return self.second, self.motion
-        return self.first, self.motion.inverse
 
 
 class PartTree(Kinematics):
@@ -151,7 +136,7 @@ class PartTree(Kinematics):
         if around is not None:
             low, high = around - turn, around + turn
         tried = np.arange(low, high, step)
-        seen = self.seen_at(part, look, tried, others)
+        seen = self.seen_at(part, look, tried, others, ROUGHLY)
         if around is None:  # where it never was, it is only if it is seen there
             strange = (tried < one.range[0] - step) | (tried > one.range[1] + step)
             seen[strange & (seen < 0.0)] = -np.inf
@@ -214,11 +199,16 @@ class PartTree(Kinematics):
         look: int,
         positions: Float[np.ndarray, " n"],
         others: Bool[np.ndarray, " points"] | None = None,
+        fewest: int | None = None,
     ) -> Float[np.ndarray, " n"]:
-        """The evidence of a look, for each point, for each of some positions of a part."""
+        """The evidence of a look, for each point, for each of some positions of a part: of all its
+        points, or of evenly chosen ones, `fewest` or more."""
         one, carrier = self.parts[part], self.pose(self.parts[part].parent, look)
         poses = [carrier @ one.screw.pose(float(position)) for position in positions]
-        return evidence_of_poses(self.looks[look], *one.support, poses, others).mean(axis=1)
+        step = max(1, len(one.support[0]) // fewest) if fewest else 1
+        points, normals = one.support[0][::step], one.support[1][::step]
+        found = evidence_of_poses(self.looks[look], points, normals, poses, others)
+        return found.mean(axis=1)
 
     def averaged(self, look: int) -> Cloud:
         """A look made less noisy by all others, as how its parts have moved is known."""
@@ -237,9 +227,9 @@ class PartTree(Kinematics):
 
         With a candidate, whose label is the last, by the other of its two looks alone.
         """
-        others, motions = self._telling(look, candidate)
+        others, motions, weights = self._telling(look, candidate)
         seen = [self.looks[other] for other in others]
-        return scores(self.looks[look], seen, motions)
+        return scores(self.looks[look], seen, motions, weights=weights)
 
     def probabilities(
         self, look: int, candidate: Candidate | None = None
@@ -251,32 +241,33 @@ class PartTree(Kinematics):
         """
         if len(self.looks) < 2:
             return np.ones((1, len(self.looks[look].points)))
-        others, motions = self._telling(look, candidate)
+        others, motions, weights = self._telling(look, candidate)
         cloud = self.looks[look]
         seen = [self.looks[other] for other in others]
-        given = scores(cloud, seen, motions)
+        given = scores(cloud, seen, motions, weights=weights)
         if candidate is None:
             alone = given.copy()
             for part, one in enumerate(self.parts):
                 if one.parent >= 0:
                     given[part + 1] += self._height_evidence(part, look, alone)
         given += prior(cloud, given, motions)
-        given[0] = np.maximum(given[0], UNKNOWN * len(others))
+        given[0] = np.maximum(given[0], UNKNOWN * sum(weights))
         return smooth_labels(cloud, given)
 
     def _telling(
         self, look: int, candidate: Candidate | None
-    ) -> tuple[list[int], list[list[Pose]]]:
-        """The other looks that labels of a look are told from, and each label's motion to them."""
+    ) -> tuple[list[int], list[list[Pose]], list[float]]:
+        """The other looks that labels of a look are told from, each label's motion to them, and
+        what each look counts."""
         parts = range(len(self.parts))
         if candidate is not None:
             other, motion = candidate.between(look)
             known = [[self.motion(part, look, other)] for part in parts]
-            return [other], [[NOWHERE], *known, [motion]]
+            return [other], [[NOWHERE], *known, [motion]], [1.0]
         places = np.array([one.positions for one in self.parts]).reshape(-1, len(self.looks))
         others = distinguishing_looks(places, look)
         motions = [[self.motion(part, look, other) for other in others] for part in parts]
-        return others, [[NOWHERE] * len(others), *motions]
+        return others, [[NOWHERE] * len(others), *motions], weights_of_looks(places, others)
 
     def _height_evidence(
         self, part: int, look: int, given: Float[np.ndarray, "labels points"]

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from palpate.identification.interactive import hindsight
-from palpate.identification.interactive.hindsight import explain_backwards, explained, reconsider
+from palpate.identification.interactive.hindsight import (
+    correct_parents,
+    explain_backwards,
+    explained,
+    reconsider,
+)
+from palpate.identification.interactive.insertion import hang
 from palpate.identification.interactive.twin import Twin
 from rooms import DOOR, FLAP, Room
 
@@ -63,6 +69,23 @@ def test_an_account_backwards_is_of_the_same_looks_and_pulls(room, twin) -> None
 def test_nothing_is_reconsidered_where_all_pulls_are_explained(twin) -> None:
     assert [part for part, _ in twin.held] == [0, 1]
     assert reconsider(twin) is twin
+
+
+def test_a_part_hangs_on_what_explains_all_looks(room, twin) -> None:
+    assert correct_parents(twin) is twin
+    whole, flap = explained(twin), twin.parts[1]
+    twin.parts[1] = hang(twin, flap, -1, flap.shown)  # as if it had moved by itself each time
+    places = np.linspace(-2.0, 2.0, 81)
+    for look in range(len(twin.looks)):
+        twin.parts[1].positions[look] = float(places[twin.seen_at(1, look, places).argmax()])
+    assert explained(twin) < whole - hindsight.HANGS
+    kept = [list(part.positions) for part in twin.parts]
+    other = correct_parents(twin)
+    assert [part.parent for part in other.parts] == [-1, 0]
+    assert explained(other) == pytest.approx(whole, abs=hindsight.BETTER)
+    assert room.error(other, 1, 1)[0] < 4.0
+    assert [part.positions for part in twin.parts] == kept  # it has been left as it was
+    assert reconsider(twin).parts[1].parent == 0
 
 
 @pytest.mark.parametrize("held", [-1, 0], ids=["unexplained", "as-if-the-door-was-pulled"])

@@ -1,4 +1,7 @@
-"""All that was done explained once more, from the last to the first, if not all was explained.
+"""All that was done explained once more: on what each part hangs, and from the last to the first.
+
+A part on a wrong one seems to move when that one does, though no hand holds it. On what it hangs is
+told best by all looks together.
 
 Which part a pull is of depends on what is known by then: a pull that moved two joints tells little
 before one of them is known. Backwards in time other pulls come first. Both accounts are of the same
@@ -9,7 +12,9 @@ import dataclasses
 
 import numpy as np
 
+from palpate.identification.interactive.explanation import FURTHER
 from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.insertion import CARRIED, STILLER, hang
 from palpate.identification.interactive.labels import scores
 from palpate.identification.interactive.twin import Twin
 
@@ -19,20 +24,72 @@ POINTS = 100  # of each look that accounts are compared by, about
 CONCEALED = 0.6
 OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
 ENOUGH = 0.78  # the same: less than nearly all is explained
+AS_GOOD, HANGS = 0.003, 0.008  # the same: what hanging a part lower may cost, and on another gain
+NEARLY = 0.02  # of evidence, for each of a part's points: to be seen less is not to be seen as well
 BETTER = 0.03  # the same: how much more the account backwards has to explain
 
 
 def reconsider(twin: Twin) -> Twin:
-    """The twin, or what is believed of the same looks and handlings when they are taken from the
-    last to the first, if that explains more of what was seen.
+    """The twin with each part on what it hangs on, or what is believed of the same looks and
+    handlings when they are taken from the last to the first, if that explains more of what was
+    seen.
 
-    Nothing is tried where all pulls are explained, and nearly all that was seen.
+    The latter is not tried where all pulls are explained, and nearly all that was seen.
     """
+    twin = correct_parents(twin)
     known = explained(twin)
     if known > ENOUGH and not _share_unexplained(twin):
         return twin
-    other = explain_backwards(twin)
+    other = correct_parents(explain_backwards(twin))
     return other if explained(other) > known + BETTER else twin
+
+
+def correct_parents(twin: Twin) -> Twin:
+    """The twin, with each part on what makes all looks likeliest; of two doors above each other on
+    one hinge, which may as well hang on each other, both on what stands still."""
+    known, tried = explained(twin), set()
+    while options := [one for one in _other_parents(twin) if one not in tried]:
+        part, parent = options[0]
+        tried.add(options[0])
+        if (other := _with_parent(twin, part, parent)) is None:
+            continue
+        gain = explained(other) - known
+        if gain > (-AS_GOOD if parent in (-1, *twin.carriers(part)) else HANGS):
+            for look in range(len(other.looks)):
+                other.relabel(look)
+            other.refit(-1)
+            twin, known = other, explained(other)
+    return twin
+
+
+def _other_parents(twin: Twin) -> list[tuple[int, int]]:
+    """Parts that moved when another one did, though no hand held them, and that one: or if it is
+    what they hang on, what that hangs on."""
+    found: dict[tuple[int, int], None] = {}
+    places = np.array([part.positions for part in twin.parts]).reshape(-1, len(twin.looks))
+    held = {before: part for part, before in twin.held}
+    for look, gone in enumerate(np.abs(np.diff(places, axis=1)).T):
+        for part in np.flatnonzero(gone > STILLER).tolist():
+            if held.get(look) == part:
+                continue
+            for other in np.flatnonzero(gone > CARRIED).tolist():
+                if other == twin.parts[part].parent:
+                    found[part, twin.parts[other].parent] = None
+                elif other != part and part not in twin.carriers(other):
+                    found[part, other] = None
+    return list(found)
+
+
+def _with_parent(twin: Twin, number: int, parent: int) -> Twin | None:
+    """A twin with a part on another one, where its joint takes it nearest to what was seen; None if
+    that is not as near as it was."""
+    other, part = twin.copy(), twin.parts[number]
+    other.parts[number] = hang(other, part, parent, part.shown)
+    there, here = 0.0, 0.0
+    for look in range(len(other.looks)):
+        there += other.find(number, look, beyond=FURTHER)
+        here += float(twin.seen_at(number, look, np.array([part.positions[look]]))[0])
+    return other if there - here > -NEARLY * len(other.looks) else None
 
 
 def explained(twin: Twin) -> float:

@@ -5,6 +5,9 @@ that is known, or by a part that is new, which is split off what stood still or 
 carries it.
 """
 
+import copy
+import dataclasses
+
 import numpy as np
 
 from palpate.identification.interactive.discovery import TELLS, discover
@@ -40,6 +43,19 @@ class Twin(PartTree):
         super().__init__()
         self.handled: list[Handling] = []
         self.held: list[tuple[int, int]] = []
+
+    def copy(self) -> "Twin":
+        """Another one of the same looks, of which all that is believed may change by itself."""
+        other = copy.copy(self)
+        other.looks, other.labels = list(self.looks), list(self.labels)
+        other.handled, other.held = list(self.handled), list(self.held)
+        other.parts = [
+            dataclasses.replace(
+                part, positions=list(part.positions), seen=dict(part.seen), ways=list(part.ways)
+            )
+            for part in self.parts
+        ]
+        return other
 
     def observe(self, handling: Handling) -> None:
         """Explain what was seen and felt."""

@@ -143,7 +143,7 @@ def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(room, monkeypatch
     look = len(twin.looks) - 1
     part.positions[look] = 0.0
 
-    def seen_at(part, look, positions, others=None):
+    def seen_at(part, look, positions, others=None, fewest=None):
         """Hidden behind the wall, badly seen where it is, and in the open elsewhere."""
         there = np.abs(sign * positions - 0.5) < 0.1
         return np.where(sign * positions < -0.6, -0.4, np.where(there, -1.0, -2.9))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from palpate.identification.interactive.pairs import pairs_of_looks
 from palpate.identification.interactive.refinement import Estimate, Sighting, refine, surprise
 from palpate.identification.interactive.screws import Screw
 
@@ -87,19 +86,6 @@ def test_what_is_not_flat_turns_about_any_axis() -> None:
     guess = screw.varied(np.array([0.05, -0.05, 0.0, 0.01]))
     found = refine(guess, np.array([0.0, 0.48]), seen, [])
     assert degrees_between(found.screw, screw) < 0.2
-
-
-def test_looks_are_compared_between_which_a_part_has_moved() -> None:
-    places = [0.0, 0.01, 0.0, 1.0, 0.5, 0.51, 0.9, 0.2]
-    counts = {0: 100, 1: 300, 2: 200, 3: 100, 4: 200, 5: 100, 6: 10}  # too few in 6, none in 7
-    pairs, placed = pairs_of_looks(places, counts, [], [])
-    # of those at the same place the one with most points; three places, each with each
-    assert sorted(map(sorted, pairs)) == [[1, 3], [1, 4], [3, 4]]
-    assert placed == []
-    pairs, placed = pairs_of_looks(places, counts, [2, 3, 6], [5, 6, 7])
-    assert sorted(map(sorted, pairs)) == [[2, 3], [2, 4], [3, 4]]  # where the hand was first
-    assert placed == [(5, 4)]
-    assert pairs_of_looks(places, {}, [2], [6]) == ([], [])
 
 
 def test_a_way_surprises_the_joint_that_it_is_not_of() -> None:

@@ -7,6 +7,7 @@ hinge in its plane.
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -14,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from palpate.identification.interactive.pairs import FEWEST, pairs_of_looks
 from palpate.identification.interactive.screws import Pose, Screw
 from palpate.perception.clouds import Cloud
 
@@ -27,23 +27,25 @@ CUTOFF = 4.685  # standard deviations: Tukey's biweight, 95 % as efficient as le
 PATCH = 0.08  # m: the errors of points so near each other are not independent
 MODEL_ERROR = 1e-3  # m: of surfaces that are no planes, and of their normals
 POINTS = 700  # of a pair of looks
-RECENT = 3  # looks, in which nothing but evidence has said where a part is
-LOOSE = 6.0  # how many times the noise they are off, as what is not known yet may be among them
+PAIRS = 14
 AXES = 4  # numbers of a screw
 # What errors of labels add, as factors of standard deviations of directions and places: from the
 # errors of parts of thirty appliances of seeds 600000 to 600004, which no figure is measured on.
 INFLATION = 2.5, 2.5, 5.0, 5.0
 REFUTED = 4.0  # 90 % intervals from a joint: what is further away is another one
+FEWEST = 20  # points that say anything
+LEAST = 1e-3  # rad or m between two places
 ROUNDS, COARSE = 8, 3  # of Gauss-Newton, and those first ones that look further
 SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
 NEAR = 0.025, 0.05  # m beside noise, from a point to its surface: late and early
-FLAT, IS_FLAT = 0.015, 0.8  # m beside noise from a plane, and share of points that are as near
+FLAT, IS_FLAT = 0.015, 0.8  # m beside noise from a plane, and share of points: of what is flat
 OUT_OF_PLANE = math.radians(2.0), 0.03  # rad and m that the hinge of a board is out of its plane
 MOMENTS = 25  # of a hand's way
 STEP = 1e-5  # of differences
 
 
-# A look before a hand took hold of a part, which the one after it follows; its way (m, times by 3).
+# The look before a hand took hold of a part, which the one after it follows, and the way (m, times
+# by 3) that it went.
 Way = tuple[int, np.ndarray]
 
 
@@ -116,20 +118,17 @@ def refine(
     ended there. The position in the look before the first way stays as it is, or if the part was
     not seen there, in the first look with it: it says where the joint's zero is.
     """
-    counts = {look: len(one.points) for look, one in enumerate(seen) if one is not None}
-    handled = {before + gone for before, _ in ways for gone in (0, 1)}
-    recent = range(len(positions) - RECENT, len(positions))
-    compared, placed = pairs_of_looks(positions, counts, handled, recent)
-    shown = sorted({look for pair in (*compared, *placed) for look in pair})
+    pairs = _pairs(positions, seen)
+    shown = sorted({look for pair in pairs for look in pair})
     random = np.random.default_rng(0)
     chosen = {look: _subset(seen[look], random) for look in shown}
+    handled = {before + gone for before, _ in ways for gone in (0, 1)}
     used = [*shown, *sorted(handled - set(shown))]
     if ways and ways[0][0] in shown:
         used.remove(ways[0][0])
         used.insert(0, ways[0][0])
-    planes: list[tuple[np.ndarray, np.ndarray]] = []
-    if all(is_of_two_ends(way) for _, way in ways):  # what a hand has held it says better
-        planes = [one for look in shown if (one := _plane_of(seen[look])) is not None]
+    felt = any(not is_of_two_ends(way) for _, way in ways)
+    planes = [] if felt else [one for look in shown if (one := _plane_of(seen[look])) is not None]
     column = {look: AXES + number for number, look in enumerate(used[1:])}
     middle = np.mean([way.mean(axis=0) for _, way in ways], axis=0) if ways else screw.point
     screw, positions = screw.near(middle), np.array(positions, float)
@@ -140,12 +139,8 @@ def refine(
     sums = _Sums(unknown)
     for number in range(ROUNDS):
         sums = _Sums(unknown)
-        near = NEAR[number < COARSE]
-        for pair in compared:
-            _add_pair(sums, screw, positions, pair, seen, chosen, column, near)
-        for pair in placed:
-            own = {look: place for look, place in column.items() if look == pair[0]}
-            _add_pair(sums, screw, positions, pair, seen, chosen, own, near, tells_axis=False)
+        for pair in pairs:
+            _add_pair(sums, screw, positions, pair, seen, chosen, column, NEAR[number < COARSE])
         _add_planes(sums, screw, planes)
         for before, way in ways:
             _add_way(sums, screw, way)
@@ -159,8 +154,8 @@ def refine(
         if number > COARSE and np.abs(change[:AXES]).max() < 1e-5:
             break
     inverse = np.linalg.inv(sums.information + np.diag(prior))
-    covariance = (inverse @ (sums.scatter + np.diag(prior)) @ inverse)[:AXES, :AXES]
-    covariance *= np.outer(INFLATION, INFLATION)
+    covariance = inverse @ (sums.scatter + np.diag(prior)) @ inverse
+    covariance = covariance[:AXES, :AXES] * np.outer(INFLATION, INFLATION)
     return Estimate(screw, positions, covariance, sums.misfit, sums.independent)
 
 
@@ -188,13 +183,11 @@ def _add_pair(
     chosen: dict[int, np.ndarray],
     column: dict[int, int],
     near: float,
-    tells_axis: bool = True,
 ) -> None:
-    """Points of one look against the surface in another; they tell the positions of looks that have
-    a `column`, and the axis; or loosely the positions alone."""
+    """Points of one look against the surface in another."""
     first, second = pair
     one, other, own = seen[first], seen[second], chosen[first]
-    assert one is not None  # by `pairs_of_looks`
+    assert one is not None  # by `_pairs`
     assert other is not None
     turn = positions[second] - positions[first]
     pose = screw.pose(turn)
@@ -210,10 +203,10 @@ def _add_pair(
     normal = turned[met] + other.normals[index]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     deviation = one.deviation[own][met] ** 2 + other.deviation[index] ** 2 + MODEL_ERROR**2
-    scale = np.sqrt(deviation) * (1.0 if tells_axis else LOOSE)
+    scale = np.sqrt(deviation)
     standard = np.vecdot(normal, source - other.points[index]) / scale
     rows = np.zeros((len(source), len(sums.slope)))
-    for axis in range(AXES) if tells_axis else ():
+    for axis in range(AXES):
         varied = screw.varied(STEP * np.eye(AXES)[axis])
         rows[:, axis] = np.vecdot(normal, varied.pose(turn).at(start) - source) / STEP
     along = np.vecdot(normal, screw.velocity(source))
@@ -234,17 +227,18 @@ def _add_pair(
 
 def _plane_of(seen: Sighting | None) -> tuple[np.ndarray, np.ndarray] | None:
     """The normal of what was seen of a part, and a place on it; None if that is not flat."""
-    assert seen is not None  # by `pairs_of_looks`
+    assert seen is not None  # by `_pairs`
     normal = np.linalg.eigh(seen.normals.T @ seen.normals)[1][:, -1]
     height = seen.points @ normal
     middle = float(np.median(height))
     on = np.abs(height - middle) < FLAT + 3.0 * seen.deviation
     on &= np.abs(seen.normals @ normal) > ALIKE
-    return (normal, middle * normal) if np.mean(on) > IS_FLAT else None
+    return (normal, middle * normal) if on.mean() > IS_FLAT else None
 
 
 def _add_planes(sums: _Sums, screw: Screw, planes: list[tuple[np.ndarray, np.ndarray]]) -> None:
-    """A board that turns has its hinge in its plane: looks alone leave open how it lies in that."""
+    """A board that turns has its hinge in its plane, wherever it is: looks alone leave open how far
+    the axis is turned in that. A hand that has held it says so better."""
     if screw.joint == "prismatic" or not planes:
         return
     normals, places = map(np.array, zip(*planes, strict=True))
@@ -348,6 +342,21 @@ def way_information(screw: Screw, way: Float[np.ndarray, "times 3"]) -> Float[np
     """What one more way of a hand would say of a joint's four numbers (Fisher information)."""
     rows, _ = _whiten(screw, way)
     return rows.T @ rows
+
+
+def _pairs(
+    positions: Float[np.ndarray, " looks"], seen: Sequence[Sighting | None]
+) -> list[tuple[int, int]]:
+    """Looks to compare: neighbours among those in which the part is at different places."""
+    known = [look for look, one in enumerate(seen) if one is not None and len(one.points) >= FEWEST]
+    distinct: list[int] = []
+    for look in sorted(known, key=lambda look: positions[look]):
+        if not distinct or positions[look] - positions[distinct[-1]] > LEAST:
+            distinct.append(look)
+    found = [*itertools.pairwise(distinct), *zip(distinct, distinct[2:], strict=False)]
+    if len(distinct) > 3:
+        found.append((distinct[0], distinct[-1]))
+    return found[:PAIRS]
 
 
 def _subset(seen: Sighting | None, random: np.random.Generator) -> Int[np.ndarray, " n"]:

@@ -71,7 +71,7 @@ def test_nothing_is_reconsidered_where_all_pulls_are_explained(twin) -> None:
     assert reconsider(twin) is twin
 
 
-def test_a_part_hangs_on_what_explains_all_looks(room, twin) -> None:
+def test_a_part_hangs_on_what_explains_all_looks(room, twin, monkeypatch) -> None:
     assert correct_parents(twin) is twin
     whole, flap = explained(twin), twin.parts[1]
     twin.parts[1] = hang(twin, flap, -1, flap.shown)  # as if it had moved by itself each time
@@ -86,6 +86,12 @@ def test_a_part_hangs_on_what_explains_all_looks(room, twin) -> None:
     assert room.error(other, 1, 1)[0] < 4.0
     assert [part.positions for part in twin.parts] == kept  # it has been left as it was
     assert reconsider(twin).parts[1].parent == 0
+
+    def lose(other: Twin, last: int) -> None:
+        other.parts[1].positions = [1.5] * len(other.looks)
+
+    monkeypatch.setattr(Twin, "refit", lose)
+    assert correct_parents(twin) is twin  # as its joint is lost there
 
 
 @pytest.mark.parametrize("held", [-1, 0], ids=["unexplained", "as-if-the-door-was-pulled"])

@@ -53,12 +53,14 @@ def correct_parents(twin: Twin) -> Twin:
         tried.add(options[0])
         if (other := _with_parent(twin, part, parent)) is None:
             continue
-        gain = explained(other) - known
-        if gain > (-AS_GOOD if parent in (-1, *twin.carriers(part)) else HANGS):
-            for look in range(len(other.looks)):
-                other.relabel(look)
-            other.refit(-1)
-            twin, known = other, explained(other)
+        least = known + (-AS_GOOD if parent in (-1, *twin.carriers(part)) else HANGS)
+        if explained(other) < least:
+            continue
+        for look in range(len(other.looks)):
+            other.relabel(look)
+        other.refit(-1)
+        if (settled := explained(other)) > least:  # its joint may have been lost meanwhile
+            twin, known = other, settled
     return twin
 
 

@@ -57,6 +57,7 @@ STAGES = {
         *("identification.interactive.screws", "identification.interactive.labels"),
         *("identification.interactive.refinement", "identification.interactive.description"),
         "identification.interactive.forces.resistance",
+        "identification.interactive.forces.action",
         "identification.interactive.forces.dynamics",
         *("identification.samplers.draws", "identification.samplers.target"),
         *("identification.samplers.hamiltonian", "identification.samplers.metropolis"),

@@ -10,7 +10,7 @@ from palpate.commands import identify
 from palpate.errors import PalpateError
 from palpate.families.appliance.options import TWIN, IdentifyAppliance, RecordAppliance
 from palpate.families.appliance.recording import FORCE, HAND, ApplianceTwin, twin_of
-from palpate.identification.interactive.forces.dynamics import POSITION
+from palpate.identification.interactive.forces.action import POSITION
 from palpate.models.articulated.urdf import read_urdf
 from palpate.models.files import load_model
 from palpate.recordings import Quantity, Recording

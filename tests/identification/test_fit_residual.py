@@ -168,9 +168,9 @@ def test_a_cut_off_fit_goes_on_to_the_same_result(tmp_path, monkeypatch):
         np.testing.assert_array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize(("count", "judges"), [(3, 2), (4, 3), (5, 4), (8, 4), (16, 4), (40, 10)])
+@pytest.mark.parametrize(("count", "judges"), [(5, 4), (8, 4), (16, 4), (40, 10)])
 def test_few_trials_rather_judge_than_teach(count, judges):
-    """Two held-out trials agree by chance too often: one correction in three of those kept so made
+    """Few held-out trials agree by chance too often: by two of them, one correction in three made
     the motion of an oven worse."""
     ones = np.ones((count, 1, 1))
     aligned = Aligned(0.1, ones, ones, np.ones(count, int))
@@ -188,8 +188,8 @@ def test_what_cannot_be_fitted_is_refused():
 
     with pytest.raises(PalpateError, match=r"^Stateless does not say which leaf of its state"):
         fit_residual(Stateless(1.0, 0.2), aligned, settings)
-    few = Aligned(aligned.period, aligned.observation[:2], aligned.action[:2], aligned.length[:2])
-    with pytest.raises(PalpateError, match=r"needs at least 3 trials.*the recording has 2$"):
+    few = Aligned(aligned.period, aligned.observation[:4], aligned.action[:4], aligned.length[:4])
+    with pytest.raises(PalpateError, match=r"needs at least 5 trials.*the recording has 4$"):
         fit_residual(physics, few, settings)
     for wrong, sentence in (
         ({"share": 0.0}, "share"),

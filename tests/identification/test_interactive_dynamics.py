@@ -10,13 +10,8 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.forces.dynamics import (
-    FORCE,
-    POSITION,
-    _Action,
-    _upright,
-    dynamics_of,
-)
+from palpate.identification.interactive.forces.action import FORCE, POSITION, Action, upright
+from palpate.identification.interactive.forces.dynamics import _centres, dynamics_of
 from palpate.identification.interactive.forces.resistance import JointMotion, regress
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
@@ -33,8 +28,12 @@ PERIOD = 0.02
 INERTIA, DAMPING, FRICTION = 0.4, 0.3, 0.9
 
 
-def motion(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3, seed=0):
-    """A joint that a torque drives one way, by small steps; the inertia was guessed as half."""
+def motion(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3, seed=0, hangs=0.0):
+    """A joint that a torque drives one way, by small steps; the inertia was guessed as half.
+
+    With a weight that `hangs`, its torque falls as the cosine of the position, and the guess of the
+    part's centre of mass was `hangs` m too near to the hinge.
+    """
     steps = 20
     random = np.random.default_rng(seed)
     position = velocity = 0.0
@@ -44,7 +43,8 @@ def motion(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3,
     for act in acts:
         found.append(position)
         for _ in range(steps):
-            resists = DAMPING * velocity + stiffness * (position - rest) - weight
+            pulls = weight * (math.cos(position) if hangs else 1.0)
+            resists = DAMPING * velocity + stiffness * (position - rest) - pulls
             free = velocity + PERIOD / steps * (act - resists) / INERTIA
             stops = PERIOD / steps * FRICTION / INERTIA
             velocity = math.copysign(max(abs(free) - stops, 0.0), free)
@@ -52,8 +52,11 @@ def motion(sign=1.0, stiffness=0.0, rest=0.0, weight=0.0, guess=0.2, noise=1e-3,
     # an act holds for the period after its moment: at the moment it is the mean of two
     acts[1:] = 0.5 * (acts[1:] + acts[:-1])
     seen = np.array(found) + noise * random.standard_normal(len(found))
-    gravity = np.full(len(times), 0.5 * weight)
-    return JointMotion(times, seen, acts, gravity, guess)
+    gravity, levers = np.full(len(times), 0.5 * weight), np.zeros((len(times), 3))
+    if hangs:  # of 2 kg, of which half was guessed
+        levers[:, 0], levers[:, 2] = 9.81 * np.cos(seen), 9.81 * np.sin(seen)
+        gravity = 0.5 * weight * np.cos(seen) - hangs * levers[:, 0]
+    return JointMotion(times, seen, acts, gravity, levers, guess, 0.4 if hangs else 0.0)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -85,6 +88,24 @@ def test_what_a_part_weighs_is_no_friction():
     assert known.friction == pytest.approx(FRICTION, rel=0.12)
 
 
+def test_the_centre_of_mass_is_told_by_its_weight():
+    moves = [motion(sign, weight=0.6, hangs=0.05, seed=seed)
+             for sign in (1.0, -1.0) for seed in (0, 1)]  # fmt: skip
+    known = regress(moves)
+    assert known is not None
+    assert known.offset[0] == pytest.approx(0.05, abs=0.02)
+    assert abs(known.offset[2]) < 3.0 * known.deviation[7] < 0.1
+    assert known.friction == pytest.approx(FRICTION, rel=0.06)
+    # were it taken for known, friction would make up for it where a hand pulls one way alone
+    one_way = [motion(weight=0.6, hangs=0.05, seed=seed) for seed in (0, 1)]
+    fixed = regress([one._replace(radius=0.0) for one in one_way])
+    free = regress(one_way)
+    assert free is not None
+    assert fixed is not None
+    assert free.deviation[2] > 1.5 * fixed.deviation[2]
+    assert abs(free.friction - FRICTION) < 2.0 * free.deviation[2]
+
+
 def test_a_joint_that_rests_tells_nothing():
     still = motion()
     assert regress([]) is None
@@ -102,9 +123,9 @@ def test_draws_spread_as_far_as_is_known_and_nothing_is_negative():
 
 def test_axes_are_made_upright_only_within_their_interval():
     tilted = np.array([math.cos(0.02), 0.0, math.sin(0.02)])
-    assert _upright(tilted, 0.03) == pytest.approx([1.0, 0.0, 0.0])
-    assert _upright(tilted, 0.01) == pytest.approx(tilted)
-    assert _upright(-tilted[::-1], 0.03) == pytest.approx([0.0, 0.0, -1.0])
+    assert upright(tilted, 0.03) == pytest.approx([1.0, 0.0, 0.0])
+    assert upright(tilted, 0.01) == pytest.approx(tilted)
+    assert upright(-tilted[::-1], 0.03) == pytest.approx([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +167,7 @@ def test_the_recording_is_what_the_model_takes(known):
 def test_a_force_of_a_period_is_half_a_period_late(known):
     """As a moment's force it would delay it, and inertia would look like damping."""
     _, twin, found = known
-    action = next(one for one in map(partial(_Action, twin), range(len(twin.held)))
+    action = next(one for one in map(partial(Action, twin), range(len(twin.held)))
                   if one.part == 0 and one.handling.moved)  # fmt: skip
     acts = action.motion(assemble(describe(twin, "door")).links, found.parts).effort
     trial = action.trial(slice(0, len(acts)), found.parts)
@@ -183,6 +204,44 @@ def test_the_file_has_what_was_felt(known):
     resting = dataclasses.replace(found.model, gravity=jnp.zeros(3))
     gains = float(resting.acceleration(still, push)[0])
     assert 1.0 / gains == pytest.approx(found.inertia[0], rel=1e-3)
+
+
+def test_a_stop_is_where_it_held_a_part_against_a_hand(known):
+    _, twin, found = known
+    links = assemble(describe(twin, "door")).links
+    number = next(n for n, (part, _) in enumerate(twin.held)
+                  if part == 0 and twin.handled[n].moved)  # fmt: skip
+    action, (own,) = Action(twin, number), found.resistance
+    last, opens = twin.handled[number], np.sign(action.positions[-1] - action.positions[0])
+    rests = np.concatenate([last.points, np.repeat(last.points[-1:], 20, axis=0)])
+    along = opens * action.screw.velocity(last.points[-1])
+    for strength, stopped in ((30.0, True), (0.0, False)):
+        forces = np.concatenate([last.forces, np.tile(strength * along, (20, 1))])
+        times = np.concatenate([last.times, last.times[-1] + PERIOD * np.arange(1, 21)])
+        held = dataclasses.replace(last, times=times, points=rests, forces=forces)
+        other = twin.copy()
+        other.handled[number] = held
+        ends = sorted(Action(other, number).stop(own, links, found.parts), key=abs)
+        assert np.isfinite(ends[0]) == stopped
+        if stopped:
+            assert ends[0] == pytest.approx(float(action.positions[-1]), abs=1e-3)
+            # what has gone further at another time was held by something else
+            other.parts[0].positions = [*other.parts[0].positions[:-1], ends[0] + opens * 0.2]
+            assert not np.isfinite(Action(other, number).stop(own, links, found.parts)).any()
+
+
+def test_a_centre_of_mass_moves_without_the_inertia(known):
+    _, _, found = known
+    model, moved = found.model, np.array([[[0.02, -0.03, 0.01]]])
+    there = {key: jnp.asarray(value[0]) for key, value in _centres(model, moved).items()}
+    other = dataclasses.replace(model, **there)
+    still, push = ArticulatedState(jnp.zeros(1), jnp.zeros(1)), jnp.zeros((1, 7)).at[0, 0].set(1.0)
+    gains = [
+        float(dataclasses.replace(one, gravity=jnp.zeros(3)).acceleration(still, push)[0])
+        for one in (model, other)
+    ]
+    assert not np.allclose(model.centre_of_mass, other.centre_of_mass)
+    assert gains[1] == pytest.approx(gains[0], rel=1e-4)
 
 
 def test_without_an_action_nothing_is_felt():

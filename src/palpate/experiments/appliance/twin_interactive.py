@@ -18,14 +18,10 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.experiments.experiment import Experiment, ratio
-from palpate.identification.gradient.residual import Correction, fit_residual
+from palpate.identification.gradient.residual import FEWEST_TRIALS, Correction, fit_residual
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.forces.dynamics import (
-    FORCE,
-    POSITION,
-    Dynamics,
-    dynamics_of,
-)
+from palpate.identification.interactive.forces.action import FORCE, POSITION
+from palpate.identification.interactive.forces.dynamics import Dynamics, dynamics_of
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated.urdf import write_urdf
@@ -37,11 +33,10 @@ from palpate.worlds.appliance.appliance import ApplianceWorld
 from palpate.worlds.appliance.categories import CATEGORIES, draw_design
 
 NAME = "twin-interactive"
-FIRST, FIRST_QUICK = 760_000, 490_000  # seed of the first appliance
+FIRST, FIRST_QUICK = 770_000, 490_000  # seed of the first appliance
 OBJECTS, PAIRED, QUICK = 20, 5, 1  # of each category
 EACH, MORE = 3, 3  # pushes for each moving part, and in all
 NEAR = 2.0  # degrees that every axis is known to
-FEWEST_ACTIONS = 3  # of which a correction can be learnt and judged
 RIVALS = "random", "loss"  # ways to choose that are compared with most information
 MINUTES = {"by information": 35, "by rivals": 20}
 
@@ -144,7 +139,7 @@ def correction_of(known: Dynamics) -> Correction | None:
     aligned = known.recording.align(
         period=known.model.control_period, observation=POSITION, action=FORCE
     )
-    if len(aligned.length) < FEWEST_ACTIONS:
+    if len(aligned.length) < FEWEST_TRIALS:
         return None
     return fit_residual(known.model, aligned)
 

@@ -38,7 +38,9 @@ from palpate.runs.progress import interruptible, progress
 
 CHECK = 20  # iterations between looks at the held-out trials
 CONFIDENCE = 0.95  # that the gain on held-out trials is not chance, one-sided
-JUDGES = 4  # held-out trials at least, where there are so many: two agree by chance too often
+# Held-out trials at least: two or three agree by chance too often, as they also stop the descent.
+JUDGES = 4
+FEWEST_TRIALS = JUDGES + 1  # that say whether a correction helps
 MIN_GAIN = 0.02  # of the physics' error, below which a correction is not worth carrying
 AVERAGED = 30  # iterations whose networks are averaged (Polyak): one alone is noisy
 # Share of what the physics changes below which a correction mends no physics: it makes up for how
@@ -54,7 +56,7 @@ class ResidualSettings:
     `share`: the most it adds to a velocity in a control period, relative to the root mean square
     of what the physics changes there. `horizons` are shares of the longest that every trial
     offers; `held_out` is the share of the trials that stop and decide, and at least `JUDGES` of
-    them where there are more; `patience` looks at them without progress end the descent.
+    them; `patience` looks at them without progress end the descent.
     """
 
     share: float = 0.3
@@ -141,17 +143,17 @@ def check_correctable(model: Model, aligned: Aligned) -> None:
     """Raise `PalpateError` for a model that cannot be corrected, and for too few trials."""
     correctable(model)
     count = len(aligned.length)
-    if count < 3:
+    if count < FEWEST_TRIALS:
         raise PalpateError(
-            f"a correction needs at least 3 trials, one to learn from and two to judge by; "
-            f"the recording has {count}"
+            f"a correction needs at least {FEWEST_TRIALS} trials, one to learn from and {JUDGES} "
+            f"to judge by; the recording has {count}"
         )
 
 
 def _split_trials(aligned: Aligned, settings: ResidualSettings) -> tuple[np.ndarray, np.ndarray]:
     count = len(aligned.length)
     order = np.random.default_rng(settings.seed).permutation(count)
-    judges = min(max(JUDGES, round(settings.held_out * count)), count - 1)
+    judges = max(JUDGES, round(settings.held_out * count))
     return np.sort(order[judges:]), np.sort(order[:judges])
 
 
@@ -297,8 +299,8 @@ def _verdict(physics: PredictionError, corrected: PredictionError, size: float) 
     predicted = np.isfinite(before) & np.isfinite(after)
     gain, count = (before - after)[predicted], int(predicted.sum())
     relative = 1.0 - corrected.mean_absolute / physics.mean_absolute
-    if count < 2 or not np.isfinite(relative):
-        return False, "dropped: fewer than two held-out trials can be predicted with it"
+    if count < JUDGES or not np.isfinite(relative):
+        return False, f"dropped: fewer than {JUDGES} held-out trials can be predicted with it"
     chance = student.ppf(CONFIDENCE, count - 1) * np.std(gain, ddof=1) / np.sqrt(count)
     gained = f"on {count} held-out trials the error falls by {relative:.1%}"
     if relative < MIN_GAIN:

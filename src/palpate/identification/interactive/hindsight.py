@@ -104,9 +104,9 @@ def explained(twin: Twin) -> float:
             [twin.motion(part, look, other) for other in others]
             for part in range(-1, len(twin.parts))
         ]
-        chosen = slice(None, None, max(1, len(cloud.points) // POINTS))
+        step = max(1, len(cloud.points) // POINTS)
         seen = [twin.looks[other] for other in others]
-        best = scores(cloud, seen, motions, chosen, hidden=CONCEALED).max(axis=0)
+        best = scores(cloud, seen, motions, step, hidden=CONCEALED).max(axis=0)
         found.append(float(best.mean()) / max(len(others), 1))
     cost = OF_PART * len(twin.parts) + OF_PULLS * _share_unexplained(twin)
     return float(np.mean(found)) - cost

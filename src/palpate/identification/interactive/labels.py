@@ -6,6 +6,7 @@ what would have faced a camera that saw nothing there: depth has holes, but smal
 """
 
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -38,6 +39,9 @@ LEAST_MOTION = 0.02  # rad or m: less is none
 DIFFERENT = 0.1  # rad or m: looks between which all parts have moved less show one state
 HARDLY = 3.0  # times as far as one part another one moves alone: where it was is not quite known
 TELLING = 0.3  # rad or m of a part: to be further away tells no more
+
+KEPT = 16  # poses between two looks of which the evidence is kept
+_KNOWN: WeakKeyDictionary[Cloud, WeakKeyDictionary[Cloud, dict]] = WeakKeyDictionary()
 
 Scores = Float[np.ndarray, "labels points"]
 
@@ -92,26 +96,44 @@ def scores(
     cloud: Cloud,
     others: Sequence[Cloud],
     motions: Sequence[Sequence[Pose]],
-    chosen: np.ndarray | slice = slice(None),
+    step: int = 1,
     hidden: float = HIDDEN,
     weights: Sequence[float] | None = None,
 ) -> Scores:
-    """Of each label, for each of the chosen points of a look; the first is what stands still.
+    """Of each label, for every `step`-th point of a look; the first is what stands still.
 
     `motions[label][other]` is how what has the label has moved from this look to each other, and
     `weights` what each of them counts, 1 by default.
     """
     weights = [1.0] * len(others) if weights is None else weights
-    points, normals = cloud.points[chosen], cloud.normals[chosen]
-    found = np.zeros((len(motions), len(points)))
+    found = np.zeros((len(motions), len(cloud.points[::step])))
     for number, other in enumerate(others):
         poses = [motion[number] for motion in motions]
-        first = [next(at for at, one in enumerate(poses) if _same(one, pose)) for pose in poses]
-        distinct, same = np.unique(first, return_inverse=True)
-        each = [poses[at] for at in distinct]
-        value = evidence_of_poses(other, points, normals, each, hidden=hidden)
-        found += weights[number] * value[same]
+        found += weights[number] * _known_evidence(cloud, other, poses, step, hidden)
     return np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
+
+
+def _known_evidence(
+    cloud: Cloud, other: Cloud, poses: Sequence[Pose], step: int, hidden: float
+) -> Float[np.ndarray, "poses n"]:
+    """The evidence of another look for every `step`-th point of a look where each pose takes it.
+
+    Most poses have been asked for before: what has not moved has not, and few joints change.
+    """
+    known = _KNOWN.setdefault(cloud, WeakKeyDictionary()).setdefault(other, {})
+    keys = [(step, hidden, (np.round(np.vstack(pose), 6) + 0.0).tobytes()) for pose in poses]
+    new = {key: pose for key, pose in zip(keys, poses, strict=True) if key not in known}
+    levels = np.sort([ON, FREE, MISSING, hidden])  # all that evidence may be: a byte says which
+    if new:
+        points, normals = cloud.points[::step], cloud.normals[::step]
+        found = evidence_of_poses(other, points, normals, list(new.values()), hidden=hidden)
+        known.update(zip(new, np.searchsorted(levels, found).astype(np.uint8), strict=True))
+    for key in dict.fromkeys(keys):  # what was asked for last comes last
+        known[key] = known.pop(key)
+    result = levels[np.array([known[key] for key in keys])]
+    for key in list(known)[:-KEPT]:
+        del known[key]
+    return result
 
 
 def height_evidence(

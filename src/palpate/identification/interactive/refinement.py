@@ -36,6 +36,7 @@ REFUTED = 4.0  # 90 % intervals from a joint: what is further away is another on
 FEWEST = 20  # points that say anything
 LEAST = 1e-3  # rad or m between two places
 ROUNDS, COARSE = 8, 3  # of Gauss-Newton, and those first ones that look further
+SETTLED = 1e-4  # rad and m by which a round changes a joint that needs no more of them
 SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
 NEAR = 0.025, 0.05  # m beside noise, from a point to its surface: late and early
 FLAT, IS_FLAT = 0.015, 0.8  # m beside noise from a plane, and share of points: of what is flat
@@ -151,7 +152,7 @@ def refine(
         screw = screw.varied(change[:AXES]).near(middle)
         for look, place in column.items():
             positions[look] += np.clip(change[place], -0.3, 0.3)
-        if number > COARSE and np.abs(change[:AXES]).max() < 1e-5:
+        if number > COARSE and np.abs(change[:AXES]).max() < SETTLED:
             break
     inverse = np.linalg.inv(sums.information + np.diag(prior))
     covariance = inverse @ (sums.scatter + np.diag(prior)) @ inverse
@@ -167,11 +168,27 @@ class _Sums:
         self.slope = np.zeros(unknown)
         self.misfit = self.independent = 0.0
 
-    def add(self, rows: np.ndarray, standard: np.ndarray, weight: np.ndarray) -> None:
-        """Rows of slopes and residuals, whitened, with the weights of robust least squares."""
-        weighted = weight[:, None] * rows
-        self.information += rows.T @ weighted
-        self.slope += weighted.T @ standard
+    def add(
+        self,
+        rows: np.ndarray,
+        standard: np.ndarray,
+        weight: np.ndarray | None = None,
+        patches: Int[np.ndarray, " n"] | None = None,
+        columns: list[int] | None = None,
+    ) -> None:
+        """Rows of slopes and residuals, whitened, with the weights of robust least squares, and
+        errors that are alike within `patches`, by default independent. The rows have the slopes of
+        some `columns`, by default of all.
+        """
+        columns = list(range(len(self.slope))) if columns is None else columns
+        weighted = rows if weight is None else weight[:, None] * rows
+        own = np.ix_(columns, columns)
+        self.information[own] += rows.T @ weighted
+        self.slope[columns] += standard @ weighted
+        if patches is not None:
+            each = (weighted * standard[:, None]).T
+            rows = np.stack([np.bincount(patches, one) for one in each], axis=1)
+        self.scatter[own] += rows.T @ rows
 
 
 def _add_pair(
@@ -205,24 +222,22 @@ def _add_pair(
     deviation = one.deviation[own][met] ** 2 + other.deviation[index] ** 2 + MODEL_ERROR**2
     scale = np.sqrt(deviation)
     standard = np.vecdot(normal, source - other.points[index]) / scale
-    rows = np.zeros((len(source), len(sums.slope)))
-    for axis in range(AXES):
-        varied = screw.varied(STEP * np.eye(AXES)[axis])
-        rows[:, axis] = np.vecdot(normal, varied.pose(turn).at(start) - source) / STEP
-    along = np.vecdot(normal, screw.velocity(source))
+    slopes = [
+        np.vecdot(normal, screw.varied(STEP * one).pose(turn).at(start) - source) / STEP
+        for one in np.eye(AXES)
+    ]
+    along, columns = np.vecdot(normal, screw.velocity(source)), list(range(AXES))
     for look, sign in ((second, 1.0), (first, -1.0)):
         if look in column:
-            rows[:, column[look]] = sign * along
-    rows /= scale[:, None]
+            slopes.append(sign * along)
+            columns.append(column[look])
+    rows = np.stack(slopes, axis=1) / scale[:, None]
     weight = np.clip(1.0 - (standard / CUTOFF) ** 2, 0.0, None) ** 2
-    sums.add(rows, standard, weight)
     patches = patches_of(source)
-    by_patch = np.zeros((patches.max() + 1, len(sums.slope)))
-    np.add.at(by_patch, patches, (weight * standard)[:, None] * rows)
-    sums.scatter += by_patch.T @ by_patch
-    share = len(by_patch) / len(source)
-    sums.misfit += share * float(np.sum(_biweight(standard)))
-    sums.independent += len(by_patch)
+    sums.add(rows, standard, weight, patches, columns)
+    count = int(patches.max()) + 1
+    sums.misfit += count / len(source) * float(np.sum(_biweight(standard)))
+    sums.independent += count
 
 
 def _plane_of(seen: Sighting | None) -> tuple[np.ndarray, np.ndarray] | None:
@@ -252,8 +267,7 @@ def _add_planes(sums: _Sums, screw: Screw, planes: list[tuple[np.ndarray, np.nda
     rows = np.zeros((len(standard), len(sums.slope)))
     for axis, one in enumerate(np.eye(AXES)):
         rows[:, axis] = (errors(screw.varied(STEP * one)) - standard) / STEP
-    sums.add(rows, standard, np.ones(len(standard)))
-    sums.scatter += rows.T @ rows
+    sums.add(rows, standard)
 
 
 def _add_way(sums: _Sums, screw: Screw, way: Float[np.ndarray, "times 3"]) -> None:
@@ -261,8 +275,7 @@ def _add_way(sums: _Sums, screw: Screw, way: Float[np.ndarray, "times 3"]) -> No
     slopes, standard = _whiten(screw, way)
     rows = np.zeros((len(standard), len(sums.slope)))
     rows[:, :AXES] = slopes
-    sums.add(rows, standard, np.ones(len(standard)))
-    sums.scatter += rows.T @ rows
+    sums.add(rows, standard)
     sums.misfit += float(standard @ standard)
     sums.independent += len(standard)
 
@@ -294,8 +307,7 @@ def _add_travel(
     standard = np.array([error(screw)])
     for axis, one in enumerate(np.eye(AXES)):
         rows[0, axis] = (error(screw.varied(STEP * one)) - standard[0]) / STEP
-    sums.add(rows, standard, np.ones(1))
-    sums.scatter += rows.T @ rows
+    sums.add(rows, standard)
 
 
 def _whiten(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -47,7 +47,8 @@ REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that
 LEAST_MET = 0.4  # share of its points that meet one
 ALONG_NORMALS = 0.2  # least share of its squared motion that is along normals: they tell how far
 FARTHEST = 0.15  # rad or m that it is moved so
-ROUGHLY = 60  # points that say well enough about where a part is, before all say where exactly
+# points that say well enough about where a part is, and where exactly, before all say whether
+ROUGHLY, FINELY = 60, 200
 CLEARLY = 0.12  # as `NOT_MOVED`: of a new part, which is moved so
 # of evidence, and as `NOT_MOVED`: of a position in which hardly anything of it is seen
 UNSEEN, NOT_HIDDEN = -0.35, 1.5
@@ -143,7 +144,7 @@ class PartTree(Kinematics):
         best = tried[seen.argmax()]
         for _ in range(2):
             tried = np.linspace(best - step, best + step, 7)
-            best = tried[self.seen_at(part, look, tried, others).argmax()]
+            best = tried[self.seen_at(part, look, tried, others, FINELY).argmax()]
             step /= 3.0
         there, here = self.seen_at(part, look, np.array([best, last]), others)
         ahead = NOT_MOVED if there > UNSEEN else NOT_HIDDEN

@@ -14,37 +14,46 @@ from scipy.optimize import nnls
 
 SHORT, LONG = 18, 40  # moments of a window: a share of an action, from its least to its most
 SHARE, OVERLAP = 0.25, 0.7  # of an action, and of a window
+INDEPENDENT = 2.0 * (1.0 - OVERLAP)  # of windows that overlap
 MOVES = 0.2  # of the speed of a window in each of its quarters, and of the fastest in each
 EVIDENT = 20.0  # by which Bayes' information criterion has to fall for a spring
 FEWEST, BLOCKS = 5, 10  # windows that say anything, and parts of them that are left out in turn
 LIGHTEST = 0.005  # of the masses that were guessed
 LEAST = 0.02  # of what the hand gave: less damping or friction than that is not told from none
 ROUGH = 0.04  # of an inertia: how well a part is known by its shape and axis
+CENTRE = 0.2  # of a part's radius of gyration about its hinge: how well its centre of mass is known
 # What the jackknife does not see, as a factor of standard deviations: from eighteen appliances of
 # seeds 600006 to 600009, which no figure is measured on.
 INFLATION = 2.0
-PARAMETERS = 5
+PARAMETERS, PULL, OFFSET = 8, 4, 5  # that are fitted: those from these on may be negative
 
 
 class JointMotion(NamedTuple):
     """One action: where a joint was (rad or m) at `times` (s), and what acted on it.
 
-    `effort` (N m or N) is that of the hand and `gravity` what weight does; `inertia` (kg m^2 or kg)
-    is of the parts that it moves. The last two are for masses that are guessed.
+    `effort` (N m or N) is that of the hand and `gravity` what weight does, and `levers` (N m/m) how
+    much more it does for each metre that the part's centre of mass is elsewhere, along the axes of
+    its link; `inertia` (kg m^2 or kg) is of the parts that it moves. The last three are for masses
+    that are guessed. `radius` (m) is that of gyration about the hinge, 0 of a slide, and `slack` by
+    which share the lever of the hand may be off, as the hinge may (standard deviation).
     """
 
     times: Float[np.ndarray, " times"]
     positions: Float[np.ndarray, " times"]
     effort: Float[np.ndarray, " times"]
     gravity: Float[np.ndarray, " times"]
+    levers: Float[np.ndarray, "times 3"]
     inertia: float
+    radius: float
+    slack: float = 0.0
 
 
 class Resistance(NamedTuple):
     """Masses over those that were guessed, and what resists (N m or N, and per rad or m, and s).
 
-    `pull` is the spring's at position zero: it is at rest at `pull / stiffness`. `root` is the
-    symmetric root of the covariance of these five numbers.
+    `pull` is the spring's at position zero: it is at rest at `pull / stiffness`. `offset` (m, along
+    the axes of the link) is how far the centre of mass is from where it was guessed, which weight
+    tells. `root` is the symmetric root of the covariance of these eight numbers.
     """
 
     mass_share: float
@@ -52,16 +61,17 @@ class Resistance(NamedTuple):
     friction: float
     stiffness: float
     pull: float
-    root: Float[np.ndarray, "5 5"]
+    offset: tuple[float, float, float]
+    root: Float[np.ndarray, "8 8"]
 
     @property
-    def deviation(self) -> Float[np.ndarray, "5"]:
-        """Standard deviations of the five numbers."""
+    def deviation(self) -> Float[np.ndarray, "8"]:
+        """Standard deviations of the eight numbers."""
         return np.sqrt(np.square(self.root).sum(axis=1))
 
-    def draws(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "count 5"]:
+    def draws(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "count 8"]:
         """Numbers that are as probable as these; none that has to be positive is negative."""
-        found = np.array(self[:PARAMETERS])
+        found = np.array([*self[:OFFSET], *self.offset])
         found = found + random.standard_normal((count, PARAMETERS)) @ self.root
         found[:, 0] = np.maximum(found[:, 0], LIGHTEST * self.mass_share)
         found[:, 1:4] = np.maximum(found[:, 1:4], 0.0)
@@ -71,34 +81,78 @@ class Resistance(NamedTuple):
 def regress(actions: Sequence[JointMotion]) -> Resistance | None:
     """By non-negative least squares; None where too few windows show motion.
 
-    A spring is only believed where Bayes' information criterion falls by `EVIDENT`. How far the
-    numbers are to be trusted is told by how they change when a tenth of the windows is left out
-    (jackknife of blocks: Kuensch 1989, Annals of Statistics 17:3).
+    Where in a part its mass is nobody has seen: its weight is fitted too, from what boxes say of it
+    (ridge regression). A spring is only believed where Bayes' information criterion falls by
+    `EVIDENT`. How far the numbers are to be trusted is told by how they change when a tenth of the
+    windows is left out (jackknife of blocks: Kuensch 1989, Annals of Statistics 17:3), and by what
+    the boxes leave open.
     """
-    table = np.array([row for action in actions for row in _rows(action)]).reshape(-1, 6)
+    table = np.array([row for action in actions for row in _rows(action)])
+    table = table.reshape(-1, PARAMETERS + 1)
     speed = np.abs(table[:, 1])
     table = table[speed > MOVES * speed.max(initial=0.0)]
     if len(table) < FEWEST:
         return None
     # effort = share (inertia acceleration - gravity) + damping velocity + friction sign
-    #        + stiffness position - pull
-    plain, sprung = [0, 1, 2], [0, 1, 2, 3, 4]
-    evident = _fit(table, sprung)[1] < _fit(table, plain)[1] - EVIDENT
+    #        + stiffness position - pull - share levers offset
+    turns = [OFFSET, OFFSET + 1, OFFSET + 2] if actions[0].radius else []
+    plain, sprung = [0, 1, 2, *turns], [0, 1, 2, 3, 4, *turns]
+    prior = _prior(table, plain, CENTRE * actions[0].radius)
+    evident = _fit(table, sprung, prior)[1] < _fit(table, plain, prior)[1] - EVIDENT
     columns = sprung if evident else plain
-    values = _fit(table, columns)[0]
+    values = _fit(table, columns, prior)[0]
     blocks = np.array_split(np.arange(len(table)), min(BLOCKS, len(table)))
-    left_out = np.array([_fit(np.delete(table, one, axis=0), columns)[0] for one in blocks])
-    off = (left_out - left_out.mean(axis=0)) * np.sqrt((len(blocks) - 1) / len(blocks))
+    left_out = [_fit(np.delete(table, one, axis=0), columns, prior)[0] for one in blocks]
+    off = np.array(left_out) - np.mean(left_out, axis=0)
+    off *= np.sqrt((len(blocks) - 1) / len(blocks))
     area = float(_window(LONG)[0].mean())
     force = float(np.abs(table[:, -1]).mean()) / area
     velocity = float(np.quantile(np.abs(table[:, 1]), 0.8)) / area
-    least = np.array([0.0, LEAST * force / velocity, LEAST * force, 0.0, 0.0])
-    values[:3] = np.maximum(values[:3], [LIGHTEST, *least[1:3]])
-    rough = np.diag([ROUGH * values[0], *least[1:]])
-    size, vectors = np.linalg.eigh(off.T @ off + rough @ rough)
-    root = INFLATION * (vectors * np.sqrt(np.maximum(size, 0.0))) @ vectors.T
-    share, damping, friction, stiffness, pull = map(float, values)
-    return Resistance(share, damping, friction, stiffness, pull, root)
+    least = np.array([0.0, LEAST * force / velocity, LEAST * force])
+    values[:3] = np.maximum(values[:3], [LIGHTEST, *least[1:]])
+    covariance = off.T @ off
+    covariance[:3, :3] += np.diag([ROUGH * values[0], *least[1:]]) ** 2
+    covariance *= INFLATION**2
+    covariance += _left_open(table, columns, prior)
+    wrong = max(action.slack for action in actions) * values  # all that a force is held against
+    covariance += np.outer(wrong, wrong)
+    scale = np.append(np.ones(OFFSET), np.full(3, 1.0 / values[0]))
+    size, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
+    root = (vectors * np.sqrt(np.maximum(size, 0.0))) @ vectors.T
+    share, damping, friction, stiffness, pull, *offset = (values * scale).tolist()
+    return Resistance(share, damping, friction, stiffness, pull, (*offset,), root)
+
+
+class _Prior(NamedTuple):
+    """What is known of the centre of mass before anything is felt: standard deviations of it times
+    the share of masses (m), and of what a row leaves over."""
+
+    spread: float
+    error: float
+
+    def rows(self, columns: list[int]) -> np.ndarray:
+        """Rows of a regression that say so, as many as there are numbers of the centre."""
+        own = [place for place, one in enumerate(columns) if one >= OFFSET]
+        return self.error / max(self.spread, 1e-9) * np.eye(len(columns))[own]
+
+
+def _prior(table: np.ndarray, columns: list[int], spread: float) -> _Prior:
+    """With what rows leave over where the centre may be anywhere: rows that share moments say less
+    than as many others, and errors of the axis are in all of them."""
+    values, _ = _fit(table, columns, _Prior(1e9, 0.0))
+    left = table[:, -1] - table[:, :PARAMETERS] @ values
+    freedom = max(len(table) - len(columns), 1)
+    error = INFLATION * float(np.sqrt(left @ left / freedom / INDEPENDENT))
+    return _Prior(spread * max(values[0], LIGHTEST), error)
+
+
+def _left_open(table: np.ndarray, columns: list[int], prior: _Prior) -> np.ndarray:
+    """The covariance that is due to the prior: what it is taken to say may as well be otherwise."""
+    rows = prior.rows(columns)
+    inverse = np.linalg.pinv(table[:, columns].T @ table[:, columns] + rows.T @ rows)
+    found = np.zeros((PARAMETERS, PARAMETERS))
+    found[np.ix_(columns, columns)] = prior.error**2 * inverse @ (rows.T @ rows) @ inverse
+    return found
 
 
 def _window(moments: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -131,26 +185,28 @@ def _rows(action: JointMotion) -> list[np.ndarray]:
             np.sign(velocity) * value.sum(),
             float(value @ position),
             -value.sum(),
+            *(-value @ action.levers[part]),
             float(value @ action.effort[part]),
         ]))  # fmt: skip
     return found
 
 
-def _fit(table: np.ndarray, columns: list[int]) -> tuple[np.ndarray, float]:
+def _fit(table: np.ndarray, columns: list[int], prior: _Prior) -> tuple[np.ndarray, float]:
     """Values of all columns, zero of those not chosen, and Bayes' information criterion.
 
-    The pull of a spring may have either sign; all else is positive.
+    The pull of a spring and the centre of mass may have either sign; all else is positive.
     """
-    used = table[:, columns]
+    used = np.concatenate([table[:, columns], prior.rows(columns)])
+    effort = np.append(table[:, -1], np.zeros(len(used) - len(table)))
     scale = np.maximum(np.abs(used).max(axis=0), 1e-12)
     matrix = used / scale
-    if 4 in columns:  # twice, with both signs
-        matrix = np.concatenate([matrix, -matrix[:, [columns.index(4)]]], axis=1)
-    solved, left = nnls(matrix, table[:, -1])
+    signed = [place for place, one in enumerate(columns) if one >= PULL]
+    matrix = np.concatenate([matrix, -matrix[:, signed]], axis=1)  # twice, with both signs
+    solved, left = nnls(matrix, effort)
+    found = solved[: len(columns)]
+    found[signed] -= solved[len(columns) :]
     values = np.zeros(PARAMETERS)
-    values[columns] = solved[: len(columns)] / scale
-    if 4 in columns:
-        values[4] -= solved[-1] / scale[columns.index(4)]
-    independent = max(2.0 * (1.0 - OVERLAP) * len(table), 1.0)  # as windows overlap
+    values[columns] = found / scale
+    independent = max(INDEPENDENT * len(table), 1.0)
     variance = max(left**2 / len(table), 1e-12)
     return values, independent * np.log(variance) + len(columns) * np.log(independent)

@@ -1,0 +1,213 @@
+"""One action of a hand on a part of a twin: how its joint moved, and what acted on it.
+
+What the clouds before and after an action show to have stayed where it was has stayed there.
+"""
+
+import dataclasses
+import math
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from palpate.identification.interactive.forces.resistance import JointMotion, Resistance
+from palpate.identification.interactive.handling import Handling
+from palpate.identification.interactive.screws import Screw
+from palpate.identification.interactive.twin import Twin
+from palpate.models.articulated.articulated import ACTION
+from palpate.models.articulated.links import GRAVITY, Link
+from palpate.recordings import Channel, Role, Trial
+
+POSITION, FORCE = "joint position", "force on links"
+STAYED = 0.01  # rad or m between two looks, in which a part that is not handled may seem to move
+END = {"revolute": 0.03, "prismatic": 0.01}  # rad, m before an end, where its stop may be met
+LATCH = {"revolute": 0.1, "prismatic": 0.035}  # rad, m from an end: as far as a latch may pull
+SHORTEST = 12  # moments of a hand's way that say something of forces
+LOOSE, DELAY = 3e-3, 5  # m that a hand goes when a part is loose, and moments before that
+STICKS, LIGHT = 0.4, 1.0  # of friction and N: what breaks it loose beyond that is a latch
+AT_REST = 10  # moments at the end of a hand's way, in which a stop holds a part
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Action:
+    """One action of a twin, by its number."""
+
+    twin: Twin
+    number: int
+
+    @property
+    def part(self) -> int:
+        """The part that the hand held."""
+        return self.twin.held[self.number][0]
+
+    @property
+    def before(self) -> int:
+        """The look before it."""
+        return self.twin.held[self.number][1]
+
+    @property
+    def handling(self) -> Handling:
+        """What the hand did, and what was seen and felt meanwhile."""
+        return self.twin.handled[self.number]
+
+    @cached_property
+    def screw(self) -> Screw:
+        return self.twin.screw(self.part, self.before)
+
+    @cached_property
+    def start(self) -> Float[np.ndarray, "3"]:
+        """Where the hand took hold."""
+        return self.handling.points[:3].mean(axis=0)
+
+    @cached_property
+    def positions(self) -> Float[np.ndarray, " times"]:
+        """Where the joint was (rad or m), by where the hand was."""
+        gone = self.screw.position_of(self.start, self.handling.points)
+        return self.twin.parts[self.part].positions[self.before] + gone
+
+    @property
+    def away(self) -> Float[np.ndarray, " times"]:
+        """How far the joint was from where it began."""
+        return np.abs(self.positions - self.positions[:3].mean())
+
+    @property
+    def alone(self) -> bool:
+        """Whether nothing that carries the part moved meanwhile."""
+        return not any(self.moved(one) for one in self.twin.carriers(self.part))
+
+    @property
+    def slack(self) -> float:
+        """The share by which the lever of the hand may be off, as the hinge may (deviation)."""
+        if self.screw.joint == "prismatic":
+            return 0.0
+        aside = self.twin.parts[self.part].estimate.intervals[1] / 1.645
+        return aside / float(np.linalg.norm(self.screw.velocity(self.start)))
+
+    def moved(self, part: int) -> bool:
+        """Whether a part is elsewhere after the action."""
+        after = next(n for n, one in enumerate(self.twin.looks) if one is self.handling.after)
+        places = self.twin.parts[part].positions
+        return abs(places[after] - places[self.before]) > STAYED
+
+    def span(self, latched: bool) -> slice:
+        """The moments until the part came to rest; those within a latch's reach left out."""
+        part = self.twin.parts[self.part]
+        reach = LATCH[part.screw.joint]
+        at_end = min(abs(self.positions[0] - end) for end in part.range) < reach
+        begins = int(np.argmax(self.away > reach)) if latched and at_end else 0
+        rests = np.abs(self.positions - self.positions[-3:].mean()) < END[part.screw.joint]
+        return slice(begins, max(begins, int(np.argmax(rests))))
+
+    def stop(self, known: Resistance, links: list[Link], parts: list[int]) -> tuple[float, float]:
+        """Where a stop held the part against the hand at the end of its way (rad or m), below and
+        above; infinite where none did."""
+        last = self.motion(links, parts, slice(-AT_REST, None))
+        weight = known.mass_share * (last.gravity + last.levers @ np.array(known.offset))
+        spring = known.pull - known.stiffness * last.positions
+        pressed = float(np.mean(last.effort + weight + spring))
+        lever = float(np.linalg.norm(self.screw.velocity(self.start)))
+        place = float(last.positions.mean())
+        part = self.twin.parts[self.part]
+        beyond = max(0.0, (part.range[1] - place) if pressed > 0.0 else (place - part.range[0]))
+        if (
+            abs(pressed) < (1.0 + STICKS) * known.friction + LIGHT * lever
+            or np.ptp(last.positions) * lever > LOOSE
+            or beyond > END[part.screw.joint]  # it has gone on at another time: something else did
+        ):
+            return -math.inf, math.inf
+        # what was seen of the part has to be between its ends
+        low, high = min(place, part.range[0]), max(place, part.range[1])
+        return (-math.inf, high) if pressed > 0.0 else (low, math.inf)
+
+    def latch(self, known: Resistance) -> float:
+        """How much more than friction it took to break the part loose, N m or N; 0: no more."""
+        along = self.screw.velocity(self.start)
+        lever = float(np.linalg.norm(along))
+        loose = int(np.argmax(self.away * lever > LOOSE))
+        effort = np.abs(self.handling.forces[: max(loose - DELAY, 1)] @ along)
+        more = float(effort[-3:].mean()) - known.friction
+        return more if more > STICKS * known.friction + LIGHT * lever else 0.0
+
+    def motion(
+        self, links: list[Link], parts: list[int], chosen: slice | None = None
+    ) -> JointMotion:
+        """How the joint moved, and what acted on it, until it came to rest or at other moments."""
+        twin, screw, handling = self.twin, self.screw, self.handling
+        chosen = self.span(latched=False) if chosen is None else chosen
+        # a force is the mean of the period before: at a moment it is that of the two around it
+        forces = handling.forces.copy()
+        forces[:-1] = 0.5 * (forces[:-1] + forces[1:])
+        effort = [f @ screw.velocity(at) for f, at in zip(forces, handling.points, strict=True)]
+        level = dataclasses.replace(screw, axis=level_axis(twin, self.part, screw.axis))
+        gone = self.positions[chosen] - twin.parts[self.part].positions[self.before]
+        poses, hinge = [level.pose(each) for each in gone], screw.joint == "revolute"
+        weight, inertia, mass = np.zeros(len(gone)), 0.0, 0.0
+        levers = np.zeros((len(gone), 3))
+        for link, other in zip(links, parts, strict=True):
+            if other != self.part and self.part not in twin.carriers(other):
+                continue
+            pose = twin.pose(other, self.before)
+            own = twin.parts[other].screw.point + np.asarray(link.centre_of_mass)
+            centre = pose.at(own[None])[0]
+            arm = screw.velocity(centre)
+            inertia += link.mass * float(arm @ arm)
+            mass += link.mass
+            if hinge:
+                axis = pose.inverse.turned(screw.axis[None])[0]
+                inertia += float(axis @ np.asarray(link.inertia) @ axis)
+            along = [level.velocity(one.at(centre[None])[0]) for one in poses]
+            weight += link.mass * np.array(along).reshape(-1, 3) @ np.array(GRAVITY)
+            if hinge and other == self.part:
+                turns = np.array([one.rotation @ pose.rotation for one in poses]).reshape(-1, 3, 3)
+                levers = link.mass * np.cross(GRAVITY, level.axis) @ turns
+        return JointMotion(
+            handling.times[chosen],
+            self.positions[chosen],
+            np.array(effort)[chosen],
+            weight,
+            levers,
+            inertia,
+            math.sqrt(inertia / mass) if hinge else 0.0,
+            self.slack,
+        )
+
+    def trial(self, span: slice, parts: list[int]) -> Trial:
+        """The action as a trial of a recording."""
+        twin, handling = self.twin, self.handling
+        places = np.full((len(handling.times), len(parts)), np.nan)
+        acts = np.zeros((len(handling.times), len(parts), ACTION))
+        for link, other in enumerate(parts):
+            was = twin.parts[other].positions[self.before]
+            if not self.moved(other):
+                places[:, link] = was
+            places[span.start : span.start + 3, link] = was  # a prediction starts from all of them
+        link = parts.index(self.part)
+        places[:, link] = self.positions
+        hold = twin.pose(self.part, self.before).inverse.at(self.start[None])[0]
+        acts[:-1, link, 1:4] = handling.forces[1:]
+        acts[:, link, 4:] = hold - twin.parts[self.part].screw.point
+        units = ["rad" if twin.parts[one].screw.joint == "revolute" else "m" for one in parts]
+        times = handling.times[span]
+        channels = [
+            Channel(POSITION, Role.OBSERVATION, times, places[span], ", ".join(units)),
+            Channel(FORCE, Role.COMMAND, times[:-1], acts[span][:-1], "N, m"),
+        ]
+        return Trial(f"action {self.number + 1}", {each.name: each for each in channels})
+
+
+def level_axis(twin: Twin, part: int, axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The axis of a part's joint, made upright as far as it may be so."""
+    return upright(axis, math.radians(twin.parts[part].estimate.intervals[0]))
+
+
+def upright(axis: Float[np.ndarray, "3"], interval: float) -> Float[np.ndarray, "3"]:
+    """The axis, made vertical or level where it is so within its interval.
+
+    A degree by which an axis is off would else let a part's weight turn it or make it slide.
+    """
+    tilt = math.asin(min(abs(float(axis[2])), 1.0))
+    if tilt < interval:
+        axis = axis * (1.0, 1.0, 0.0)
+    elif 0.5 * math.pi - tilt < interval:
+        axis = axis * (0.0, 0.0, 1.0)
+    return axis / np.linalg.norm(axis)

@@ -10,13 +10,15 @@ import pytest
 
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
-from palpate.identification.interactive.forces.action import FORCE, POSITION, Action, upright
+from palpate.identification.interactive.forces import action as forces
+from palpate.identification.interactive.forces.action import FORCE, POSITION, Action, aligned
 from palpate.identification.interactive.forces.dynamics import _centres, dynamics_of
 from palpate.identification.interactive.forces.resistance import JointMotion, regress
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
 from palpate.models.articulated import ArticulatedState
 from palpate.models.articulated.assembly import assemble
+from palpate.models.articulated.links import tree_of
 from palpate.parameters import parameters_of
 from palpate.perception.clouds import cloud_of
 from palpate.trials.appliance.interaction import interact
@@ -121,11 +123,11 @@ def test_draws_spread_as_far_as_is_known_and_nothing_is_negative():
     assert drawn[:, 2].std() == pytest.approx(known.deviation[2], rel=0.1)
 
 
-def test_axes_are_made_upright_only_within_their_interval():
+def test_axes_are_made_aligned_only_within_their_interval():
     tilted = np.array([math.cos(0.02), 0.0, math.sin(0.02)])
-    assert upright(tilted, 0.03) == pytest.approx([1.0, 0.0, 0.0])
-    assert upright(tilted, 0.01) == pytest.approx(tilted)
-    assert upright(-tilted[::-1], 0.03) == pytest.approx([0.0, 0.0, -1.0])
+    assert aligned(tilted, 0.03) == pytest.approx([1.0, 0.0, 0.0])
+    assert aligned(tilted, 0.01) == pytest.approx(tilted)
+    assert aligned(-tilted[::-1], 0.03) == pytest.approx([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(scope="module")
@@ -193,17 +195,21 @@ def test_the_twin_moves_as_the_appliance_does(known):
     assert other.error > 3.0 * one.error
 
 
+def yields(model):
+    """How a door that stands still takes up speed under 1 N m (rad/s^2), without friction."""
+    free = dataclasses.replace(model, friction=jnp.zeros(1), gravity=jnp.zeros(3))
+    still, push = ArticulatedState(jnp.zeros(1), jnp.zeros(1)), jnp.zeros((1, 7)).at[0, 0].set(1.0)
+    return float(free.acceleration(still, push)[0])
+
+
 def test_the_file_has_what_was_felt(known):
     _, twin, found = known
     link = assemble(found.describe_with(describe(twin, "door"))).links[0]
     (own,) = found.resistance
     assert (link.damping, link.friction) == pytest.approx((own.damping, own.friction))
-    still = ArticulatedState(jnp.zeros(1), jnp.zeros(1))
+    assert link.centre_of_mass == pytest.approx(np.asarray(found.model.centre_of_mass[0]), abs=1e-6)
     assert link.mass == pytest.approx(float(found.model.mass[0]), rel=1e-5)
-    push = jnp.zeros((1, 7)).at[0, 0].set(1.0)
-    resting = dataclasses.replace(found.model, gravity=jnp.zeros(3))
-    gains = float(resting.acceleration(still, push)[0])
-    assert 1.0 / gains == pytest.approx(found.inertia[0], rel=1e-3)
+    assert 1.0 / yields(found.model) == pytest.approx(found.inertia[0], rel=1e-3)
 
 
 def test_a_stop_is_where_it_held_a_part_against_a_hand(known):
@@ -221,27 +227,75 @@ def test_a_stop_is_where_it_held_a_part_against_a_hand(known):
         held = dataclasses.replace(last, times=times, points=rests, forces=forces)
         other = twin.copy()
         other.handled[number] = held
-        ends = sorted(Action(other, number).stop(own, links, found.parts), key=abs)
-        assert np.isfinite(ends[0]) == stopped
+        ends = Action(other, number).stop(own, links, found.parts)
+        at, free = ends[::-1] if opens > 0.0 else ends
+        assert not np.isfinite(free)
+        assert np.isfinite(at) == stopped
         if stopped:
-            assert ends[0] == pytest.approx(float(action.positions[-1]), abs=1e-3)
+            assert at == pytest.approx(float(action.positions[-1]), abs=1e-3)
             # what has gone further at another time was held by something else
-            other.parts[0].positions = [*other.parts[0].positions[:-1], ends[0] + opens * 0.2]
+            other.parts[0].positions = [*other.parts[0].positions[:-1], at + opens * 0.2]
             assert not np.isfinite(Action(other, number).stop(own, links, found.parts)).any()
+
+
+def test_weight_grows_with_the_way_to_the_centre_of_mass(known, monkeypatch):
+    """As if a door turned about a level axis: gravity lies across it."""
+    _, twin, found = known
+    monkeypatch.setattr(forces, "GRAVITY", (5.0, -8.0, 0.0))
+    links = assemble(describe(twin, "door")).links
+    number = next(n for n, (part, _) in enumerate(twin.held)
+                  if part == 0 and twin.handled[n].moved)  # fmt: skip
+    felt = Action(twin, number).motion(links, found.parts)
+    assert np.abs(felt.levers).max() > 1.0
+    for moved in 0.1 * np.eye(3):
+        other = dataclasses.replace(links[0], centre_of_mass=links[0].centre_of_mass + moved)
+        weight = Action(twin, number).motion([other], found.parts).gravity
+        assert weight - felt.gravity == pytest.approx(felt.levers @ moved, abs=1e-6)
+
+
+def test_a_lid_is_not_latched_by_its_weight(known, monkeypatch):
+    _, twin, found = known
+    links, (own,) = assemble(describe(twin, "door")).links, found.resistance
+    number = next(n for n, (part, _) in enumerate(twin.held)
+                  if part == 0 and twin.handled[n].moved)  # fmt: skip
+    action = Action(twin, number)
+    assert action.latch(own, links, found.parts) == 0.0
+    before = action.motion(links, found.parts, slice(0, 1))
+    pull = 3.0 * own.friction * np.sign(float(before.effort[0]) or 1.0)
+    felt = JointMotion(*before)._replace(effort=np.array([pull]))
+    for weight, latched in ((0.0, True), (-0.7 * pull / own.mass_share, False)):
+        stands = felt._replace(gravity=np.array([weight]), levers=np.zeros((1, 3)))
+        monkeypatch.setattr(Action, "motion", lambda *_, stands=stands: stands)
+        assert (action.latch(own, links, found.parts) > 0.0) == latched
+
+
+def with_centre(model, moved):
+    changes = {key: jnp.asarray(one) for key, one in _centres(model, np.array([moved])).items()}
+    return dataclasses.replace(model, **changes)
 
 
 def test_a_centre_of_mass_moves_without_the_inertia(known):
     _, _, found = known
-    model, moved = found.model, np.array([[[0.02, -0.03, 0.01]]])
-    there = {key: jnp.asarray(value[0]) for key, value in _centres(model, moved).items()}
-    other = dataclasses.replace(model, **there)
-    still, push = ArticulatedState(jnp.zeros(1), jnp.zeros(1)), jnp.zeros((1, 7)).at[0, 0].set(1.0)
-    gains = [
-        float(dataclasses.replace(one, gravity=jnp.zeros(3)).acceleration(still, push)[0])
-        for one in (model, other)
-    ]
-    assert not np.allclose(model.centre_of_mass, other.centre_of_mass)
-    assert gains[1] == pytest.approx(gains[0], rel=1e-4)
+    near, far = (
+        with_centre(found.model, moved) for moved in ((0.02, -0.03, 0.01), (2.0, 2.0, 0.0))
+    )
+    for other in (near, far):  # one goes no further out than the inertia allows
+        assert not np.allclose(found.model.centre_of_mass, other.centre_of_mass)
+        assert yields(other) == pytest.approx(yields(found.model), rel=1e-3)
+    assert near.centre_of_mass[0] - found.model.centre_of_mass[0] == pytest.approx(
+        [0.02, -0.03, 0.01], abs=1e-6
+    )
+
+
+def test_the_file_moves_as_the_model_does(known):
+    """Its centre of mass, radii of gyration and stops included."""
+    _, twin, found = known
+    model = with_centre(dataclasses.replace(found.model, upper=jnp.asarray([1.2])), (0.1, 0.1, 0.0))
+    link = assemble(found.describe_with(describe(twin, "door"), model)).links[0]
+    other = tree_of([link], control_period=found.model.control_period, substeps=4)
+    assert yields(other) == pytest.approx(yields(model), rel=0.02)  # its axis is as it was seen
+    assert link.centre_of_mass == pytest.approx(np.asarray(model.centre_of_mass[0]), abs=1e-6)
+    assert link.upper == pytest.approx(1.2)
 
 
 def test_without_an_action_nothing_is_felt():

@@ -17,9 +17,9 @@ from palpate.identification.interactive.explanation import (
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.insertion import Discovery
 from palpate.identification.interactive.labels import distinguishing_looks, weights_of_looks
-from palpate.identification.interactive.refinement import misfit
 from palpate.identification.interactive.screws import screws_of_way
 from palpate.identification.interactive.twin import Twin
+from palpate.identification.interactive.ways import misfit
 from rooms import DOOR, FLAP, Room
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes

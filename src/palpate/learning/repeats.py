@@ -13,9 +13,9 @@ from jaxtyping import Float
 from palpate.identification.interactive.discovery import TELLS
 from palpate.identification.interactive.handling import Push
 from palpate.identification.interactive.part import Part
-from palpate.identification.interactive.refinement import way_information
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
+from palpate.identification.interactive.ways import way_information
 
 FORCES = 4.0  # nats that are worth masses and what resists one way, where no long way went there
 LONG = 0.1  # m of a way that tells them

@@ -33,9 +33,7 @@ from palpate.identification.interactive.labels import (
 )
 from palpate.identification.interactive.part import UNSURE, Candidate, Part, is_same_hinge
 from palpate.identification.interactive.refinement import (
-    MOMENTS,
     Estimate,
-    misfit,
     nearness,
     patches_of,
     refine,
@@ -44,6 +42,7 @@ from palpate.identification.interactive.refinement import (
 )
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.identification.interactive.tree import FEWEST, PartTree
+from palpate.identification.interactive.ways import MOMENTS, misfit
 
 TELLS = 0.03  # m that a hand has to go to tell of a joint that is not known
 STRANGE = 1.5  # of a hand's way, for the line or circle that fits it best (see `surprise`)

@@ -9,16 +9,10 @@ from jaxtyping import Float
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import FREE, LEAST_MOTION, evidence
 from palpate.identification.interactive.part import Candidate, Part
-from palpate.identification.interactive.refinement import (
-    SURPRISE,
-    Estimate,
-    Way,
-    misfit,
-    refine,
-    surprise,
-)
+from palpate.identification.interactive.refinement import SURPRISE, Estimate, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
 from palpate.identification.interactive.tree import NOT_MOVED, PartTree
+from palpate.identification.interactive.ways import MOMENTS, Way, misfit
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 FURTHER = 1.5  # rad or m that a part may have been beyond where it was seen
@@ -27,7 +21,7 @@ SHORT = 0.05  # m that a hand went: a way so short fits many joints
 TOGETHER = 0.02  # of the travel: how far two joints may miss the hand, beside the metres below
 OPEN = -1.0  # of evidence, for each point: what has less is not where it is believed to be
 IN_THE_WAY = 0.05  # share of a part's points that cameras look through: hardly any where it is
-MOMENTS, STEPS = 25, 5  # of a hand's way, and of Gauss-Newton at each
+STEPS = 5  # of Gauss-Newton at each moment of a hand's way
 SMALL, DAMPED, MOST_STEP = 1e-5, 1e-5, 0.2  # rad or m, m^2, rad or m
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 

@@ -15,20 +15,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from palpate.identification.interactive.screws import Pose, Screw
+from palpate.identification.interactive.screws import AXES, STEP, Pose, Screw
+from palpate.identification.interactive.ways import Way, is_of_two_ends, travel_deviation, whiten
 from palpate.perception.clouds import Cloud
 
-CREEP = 3e-3  # m by which a hand may have crept on its hold over `CREEP_TRAVEL`, as a random walk
-CREEP_TRAVEL = 0.3  # m
-HAND = 1e-3  # m, how well the hand is known to itself
-END_ERROR = 4e-3  # m, of the end of a way in which what carries the part moved as well
 ALIKE = 0.8  # cosine of the angle between normals of the same surface
 CUTOFF = 4.685  # standard deviations: Tukey's biweight, 95 % as efficient as least squares
 PATCH = 0.08  # m: the errors of points so near each other are not independent
 MODEL_ERROR = 1e-3  # m: of surfaces that are no planes, and of their normals
 POINTS = 700  # of a pair of looks
 PAIRS = 14
-AXES = 4  # numbers of a screw
 # What errors of labels add, as factors of standard deviations of directions and places: from the
 # errors of parts of thirty appliances of seeds 600000 to 600004, which no figure is measured on.
 INFLATION = 2.5, 2.5, 5.0, 5.0
@@ -41,13 +37,6 @@ SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is us
 NEAR = 0.025, 0.05  # m beside noise, from a point to its surface: late and early
 FLAT, IS_FLAT = 0.015, 0.8  # m beside noise from a plane, and share of points: of what is flat
 OUT_OF_PLANE = math.radians(2.0), 0.03  # rad and m that the hinge of a board is out of its plane
-MOMENTS = 25  # of a hand's way
-STEP = 1e-5  # of differences
-
-
-# The look before a hand took hold of a part, which the one after it follows, and the way (m, times
-# by 3) that it went.
-Way = tuple[int, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -272,7 +261,7 @@ def _add_planes(sums: _Sums, screw: Screw, planes: list[tuple[np.ndarray, np.nda
 
 def _add_way(sums: _Sums, screw: Screw, way: Float[np.ndarray, "times 3"]) -> None:
     """The way of a hand, whose errors are whitened: there the information is the scatter."""
-    slopes, standard = _whiten(screw, way)
+    slopes, standard = whiten(screw, way)
     rows = np.zeros((len(standard), len(sums.slope)))
     rows[:, :AXES] = slopes
     sums.add(rows, standard)
@@ -291,9 +280,7 @@ def _add_travel(
     """How far a hand took the part: of a sheet that slides in its plane no cloud says it."""
     rows, start = np.zeros((1, len(sums.slope))), way[:3].mean(axis=0)
     gone = positions[before + 1] - positions[before]
-    travel = float(np.linalg.norm(way[-1] - way[0]))
-    carried = END_ERROR if is_of_two_ends(way) else 0.0
-    scale = math.hypot(HAND, CREEP * math.sqrt(travel / CREEP_TRAVEL), carried)
+    scale = travel_deviation(way)
 
     def error(screw: Screw) -> float:
         went = float(screw.position_of(start, way)[-3:].mean())
@@ -310,50 +297,17 @@ def _add_travel(
     sums.add(rows, standard)
 
 
-def _whiten(screw: Screw, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes and residuals of a hand's way: a random walk, white noise, an offset not known."""
-    way = way[np.unique(np.linspace(0, len(way) - 1, MOMENTS).astype(int))]
-    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
-    walk = CREEP**2 / CREEP_TRAVEL * np.minimum.outer(gone, gone)
-    if is_of_two_ends(way):
-        walk += END_ERROR**2 * np.minimum.outer(gone > 0.0, gone > 0.0)
-    root = np.linalg.cholesky(walk + HAND**2 * np.eye(len(way)) + 1.0)
-    base = screw.strays(way)
-    varied = [screw.varied(STEP * one).strays(way) - base for one in np.eye(AXES)]
-    white = np.linalg.solve(root, np.concatenate([base, *varied], axis=1))
-    standard, *slopes = np.split(white, AXES + 1, axis=1)
-    return np.stack([one.T.ravel() / STEP for one in slopes], axis=1), standard.T.ravel()
-
-
-def is_of_two_ends(way: Float[np.ndarray, "times 3"]) -> bool:
-    """Whether only the ends of a way are known, as what carries the part moved meanwhile."""
-    way = np.round(way, 9)
-    return bool(np.all(np.all(way == way[0], axis=1) | np.all(way == way[-1], axis=1)))
-
-
 def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
     """How far a way is from one that a joint allows, as far as that is known: about 1 of its own.
 
     The squared Mahalanobis distance of its errors, for each of them: those of the hand, and what
     the covariance of the joint leaves open.
     """
-    slopes, standard = _whiten(estimate.screw, way)
+    slopes, standard = whiten(estimate.screw, way)
     known = np.linalg.inv(estimate.covariance + 1e-10 * np.eye(AXES))
     left = slopes.T @ standard
     explained = left @ np.linalg.solve(known + slopes.T @ slopes, left)
     return float((standard @ standard - explained) / len(standard))
-
-
-def misfit(screw: Screw, way: Float[np.ndarray, "times 3"]) -> float:
-    """How far a way is from those of a joint, for errors of the hand alone: about .5."""
-    standard = _whiten(screw, way)[1]
-    return float(standard @ standard) / len(standard)
-
-
-def way_information(screw: Screw, way: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "4 4"]:
-    """What one more way of a hand would say of a joint's four numbers (Fisher information)."""
-    rows, _ = _whiten(screw, way)
-    return rows.T @ rows
 
 
 def _pairs(

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 Points = Float[np.ndarray, "n 3"]
 FARTHEST = 6.0  # m from a hand's way to an axis: what turns about one further away slides
+AXES, STEP = 4, 1e-5  # numbers of a screw, and of their differences that give slopes (rad, m)
 TOUCH = 1e-3  # m, how well the way of a hand is known, offsets that stay apart
 
 

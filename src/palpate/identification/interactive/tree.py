@@ -28,12 +28,12 @@ from palpate.identification.interactive.refinement import (
     SURPRISE,
     Estimate,
     Sighting,
-    is_of_two_ends,
     refine,
     sighting,
     surprise,
 )
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
+from palpate.identification.interactive.ways import is_of_two_ends
 from palpate.perception.clouds import Cloud
 
 FEWEST = 40  # points of a part in a look

@@ -23,10 +23,10 @@ from palpate.identification.interactive.explanation import (
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, find_beside, reparent
 from palpate.identification.interactive.part import KNOWN, UNSURE, Part
-from palpate.identification.interactive.refinement import is_of_two_ends, misfit
 from palpate.identification.interactive.screws import screws_of_way
 from palpate.identification.interactive.splitting import split, split_off_base
 from palpate.identification.interactive.tree import FEWEST, PartTree
+from palpate.identification.interactive.ways import is_of_two_ends, misfit
 from palpate.perception.clouds import Cloud
 
 ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known

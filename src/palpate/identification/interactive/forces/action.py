@@ -25,7 +25,8 @@ LATCH = {"revolute": 0.1, "prismatic": 0.035}  # rad, m from an end: as far as a
 SHORTEST = 12  # moments of a hand's way that say something of forces
 LOOSE, DELAY = 3e-3, 5  # m that a hand goes when a part is loose, and moments before that
 STICKS, LIGHT = 0.4, 1.0  # of friction and N: what breaks it loose beyond that is a latch
-AT_REST = 10  # moments at the end of a hand's way, in which a stop holds a part
+# Moments: at the end of a hand's way, in which a stop holds a part; before it breaks loose.
+AT_REST, BROKE = 10, 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,12 +77,17 @@ class Action:
         return not any(self.moved(one) for one in self.twin.carriers(self.part))
 
     @property
-    def slack(self) -> float:
+    def lever(self) -> float:
+        """How far (m) the hand goes for each rad of a hinge; 1 of a slide."""
+        return float(np.linalg.norm(self.screw.velocity(self.start)))
+
+    @property
+    def lever_error(self) -> float:
         """The share by which the lever of the hand may be off, as the hinge may (deviation)."""
         if self.screw.joint == "prismatic":
             return 0.0
         aside = self.twin.parts[self.part].estimate.intervals[1] / 1.645
-        return aside / float(np.linalg.norm(self.screw.velocity(self.start)))
+        return aside / self.lever
 
     def moved(self, part: int) -> bool:
         """Whether a part is elsewhere after the action."""
@@ -94,7 +100,8 @@ class Action:
         part = self.twin.parts[self.part]
         reach = LATCH[part.screw.joint]
         at_end = min(abs(self.positions[0] - end) for end in part.range) < reach
-        begins = int(np.argmax(self.away > reach)) if latched and at_end else 0
+        within = np.cumsum(self.away > reach) == 0  # until it is out of reach for the first time
+        begins = int(within.sum()) if latched and at_end else 0
         rests = np.abs(self.positions - self.positions[-3:].mean()) < END[part.screw.joint]
         return slice(begins, max(begins, int(np.argmax(rests))))
 
@@ -102,16 +109,12 @@ class Action:
         """Where a stop held the part against the hand at the end of its way (rad or m), below and
         above; infinite where none did."""
         last = self.motion(links, parts, slice(-AT_REST, None))
-        weight = known.mass_share * (last.gravity + last.levers @ np.array(known.offset))
-        spring = known.pull - known.stiffness * last.positions
-        pressed = float(np.mean(last.effort + weight + spring))
-        lever = float(np.linalg.norm(self.screw.velocity(self.start)))
-        place = float(last.positions.mean())
-        part = self.twin.parts[self.part]
-        beyond = max(0.0, (part.range[1] - place) if pressed > 0.0 else (place - part.range[0]))
+        pressed = _pressed(last, known)
+        place, part = float(last.positions.mean()), self.twin.parts[self.part]
+        beyond = (part.range[1] - place) if pressed > 0.0 else (place - part.range[0])
         if (
-            abs(pressed) < (1.0 + STICKS) * known.friction + LIGHT * lever
-            or np.ptp(last.positions) * lever > LOOSE
+            abs(pressed) < known.friction + self._more_than_friction(known)
+            or np.ptp(last.positions) * self.lever > LOOSE
             or beyond > END[part.screw.joint]  # it has gone on at another time: something else did
         ):
             return -math.inf, math.inf
@@ -119,14 +122,16 @@ class Action:
         low, high = min(place, part.range[0]), max(place, part.range[1])
         return (-math.inf, high) if pressed > 0.0 else (low, math.inf)
 
-    def latch(self, known: Resistance) -> float:
+    def latch(self, known: Resistance, links: list[Link], parts: list[int]) -> float:
         """How much more than friction it took to break the part loose, N m or N; 0: no more."""
-        along = self.screw.velocity(self.start)
-        lever = float(np.linalg.norm(along))
-        loose = int(np.argmax(self.away * lever > LOOSE))
-        effort = np.abs(self.handling.forces[: max(loose - DELAY, 1)] @ along)
-        more = float(effort[-3:].mean()) - known.friction
-        return more if more > STICKS * known.friction + LIGHT * lever else 0.0
+        loose = max(int(np.argmax(self.away * self.lever > LOOSE)) - DELAY, 1)
+        before = self.motion(links, parts, slice(max(loose - BROKE, 0), loose))
+        more = abs(_pressed(before, known)) - known.friction
+        return more if more > self._more_than_friction(known) else 0.0
+
+    def _more_than_friction(self, known: Resistance) -> float:
+        """N m or N, from which on what holds a part is not friction alone."""
+        return STICKS * known.friction + LIGHT * self.lever
 
     def motion(
         self, links: list[Link], parts: list[int], chosen: slice | None = None
@@ -138,7 +143,7 @@ class Action:
         forces = handling.forces.copy()
         forces[:-1] = 0.5 * (forces[:-1] + forces[1:])
         effort = [f @ screw.velocity(at) for f, at in zip(forces, handling.points, strict=True)]
-        level = dataclasses.replace(screw, axis=level_axis(twin, self.part, screw.axis))
+        level = dataclasses.replace(screw, axis=axis_by_gravity(twin, self.part, screw.axis))
         gone = self.positions[chosen] - twin.parts[self.part].positions[self.before]
         poses, hinge = [level.pose(each) for each in gone], screw.joint == "revolute"
         weight, inertia, mass = np.zeros(len(gone)), 0.0, 0.0
@@ -168,7 +173,7 @@ class Action:
             levers,
             inertia,
             math.sqrt(inertia / mass) if hinge else 0.0,
-            self.slack,
+            self.lever_error,
         )
 
     def trial(self, span: slice, parts: list[int]) -> Trial:
@@ -195,19 +200,26 @@ class Action:
         return Trial(f"action {self.number + 1}", {each.name: each for each in channels})
 
 
-def level_axis(twin: Twin, part: int, axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """The axis of a part's joint, made upright as far as it may be so."""
-    return upright(axis, math.radians(twin.parts[part].estimate.intervals[0]))
+def _pressed(motion: JointMotion, known: Resistance) -> float:
+    """What friction and stops have to withstand, the mean of some moments at rest (N m or N)."""
+    weight = known.mass_share * (motion.gravity + motion.levers @ np.array(known.offset))
+    spring = known.pull - known.stiffness * motion.positions
+    return float(np.mean(motion.effort + weight + spring))
 
 
-def upright(axis: Float[np.ndarray, "3"], interval: float) -> Float[np.ndarray, "3"]:
-    """The axis, made vertical or level where it is so within its interval.
+def axis_by_gravity(twin: Twin, part: int, axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The axis of a part's joint, made vertical or level if it may be so; see `aligned`."""
+    return aligned(axis, math.radians(twin.parts[part].estimate.intervals[0]))
+
+
+def aligned(axis: Float[np.ndarray, "3"], interval: float) -> Float[np.ndarray, "3"]:
+    """The axis, made vertical or level, whichever is nearer, where it is so within its interval.
 
     A degree by which an axis is off would else let a part's weight turn it or make it slide.
     """
     tilt = math.asin(min(abs(float(axis[2])), 1.0))
-    if tilt < interval:
+    if tilt < min(interval, 0.25 * math.pi):
         axis = axis * (1.0, 1.0, 0.0)
-    elif 0.5 * math.pi - tilt < interval:
+    elif 0.5 * math.pi - tilt < min(interval, 0.25 * math.pi):
         axis = axis * (0.0, 0.0, 1.0)
     return axis / np.linalg.norm(axis)

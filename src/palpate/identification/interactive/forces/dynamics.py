@@ -19,13 +19,13 @@ from palpate.identification.interactive.forces.action import (
     POSITION,
     SHORTEST,
     Action,
-    level_axis,
+    axis_by_gravity,
 )
 from palpate.identification.interactive.forces.resistance import Resistance, regress
 from palpate.identification.interactive.twin import Twin
 from palpate.models.articulated.articulated import Articulated
 from palpate.models.articulated.assembly import assemble
-from palpate.models.articulated.description import Description
+from palpate.models.articulated.description import Description, Inertial
 from palpate.models.articulated.links import FREE, Link, tree_of
 from palpate.parameters import LogNormal, declare, with_values
 from palpate.recordings import Recording
@@ -86,7 +86,9 @@ class Dynamics:
         drawn = np.array([own.draws(count, random) for own in known])
         shares, damping, friction, stiffness, pull, *offset = np.moveaxis(drawn, (2, 1), (0, 1))
         shares = shares / np.array([own.mass_share for own in known])
-        rest = pull / np.where(stiffness > 0.0, stiffness, 1.0)
+        sprung = np.array([own.stiffness > 0.0 for own in known])
+        stiffness = np.where(sprung, np.maximum(stiffness, NO_SPRING), 0.0)
+        rest = pull / np.where(sprung, stiffness, 1.0)
         moved = np.stack(offset, axis=-1) - np.array([own.offset for own in known])
         model = self.model
         slides = np.asarray(model.prismatic) > 0.0
@@ -131,8 +133,9 @@ class Dynamics:
             number = place[joints[part].child]
             seen = links[number].inertial
             assert seen is not None  # of a description without faults
-            mass = float(model.mass[link])
-            inertial = dataclasses.replace(seen, mass=mass, inertia=seen.inertia * mass / seen.mass)
+            mass, centre = float(model.mass[link]), np.asarray(model.centre_of_mass[link], float)
+            shape = float(model.gyration[link]) ** 2 / seen.mass * seen.inertia
+            inertial = Inertial(mass, centre, mass * shape)
             links[number] = dataclasses.replace(links[number], inertial=inertial)
         return dataclasses.replace(description, links=tuple(links), joints=tuple(joints))
 
@@ -140,14 +143,15 @@ class Dynamics:
 def dynamics_of(twin: Twin) -> Dynamics:
     """From each action in which a hand moved a part, and nothing that carries it moved.
 
-    What happens at the end of a joint, where a stop pushes, is left out; where a latch is found to
-    pull, so is its reach. A joint ends where a stop has held it against a hand, and else nowhere.
+    What happens at the end of a joint, where a stop pushes, is left out; so is the reach of a latch
+    that is found, but not of the regression, which would lose a part's first and best moments. A
+    joint ends where a stop has held it against a hand, and else nowhere.
     Raises `PalpateError` where no such action is left.
     """
     tree = assemble(describe(twin, "twin"))
     parts = [int(name.split()[-1]) - 1 for name in tree.joints]
     links = [
-        dataclasses.replace(link, axis=level_axis(twin, part, np.asarray(link.axis)))
+        dataclasses.replace(link, axis=axis_by_gravity(twin, part, np.asarray(link.axis)))
         for link, part in zip(tree.links, parts, strict=True)
     ]
     actions = [Action(twin, number) for number, (part, _) in enumerate(twin.held)
@@ -162,7 +166,7 @@ def dynamics_of(twin: Twin) -> Dynamics:
     trials = []
     for one in actions:
         known = resistance[parts.index(one.part)]
-        span = one.span(known is not None and one.latch(known) > 0.0)
+        span = one.span(known is not None and one.latch(known, links, parts) > 0.0)
         if span.stop - span.start >= SHORTEST:
             trials.append(one.trial(span, parts))
     if not trials:
@@ -197,7 +201,7 @@ def _felt(actions: list[Action], links: list[Link], parts: list[int]) -> _Felt:
     return _Felt(
         known,
         known.mass_share * motions[0].inertia,
-        max(one.latch(known) for one in actions),
+        max(one.latch(known, links, parts) for one in actions),
         max(lower),
         min(upper),
     )
@@ -234,11 +238,16 @@ def _model(links: list[Link], resistance: list[Resistance | None], period: float
 def _centres(
     model: Articulated, moved: Float[np.ndarray, "*draws links 3"]
 ) -> dict[str, Float[np.ndarray, "..."]]:
-    """Centres of mass that have `moved` (m), and radii of gyration with which the inertia about the
-    hinges, which was felt, stays as it is."""
+    """Centres of mass that have `moved` (m), and radii of gyration with which the inertia of each
+    link about its hinge, which was felt, stays as it is. None goes further out than that allows."""
     axis, centre = np.asarray(model.axis), np.asarray(model.centre_of_mass)
-    own = np.einsum("li,lij,lj->l", axis, np.asarray(model.shape_inertia), axis)
-    own_now = own * np.square(np.asarray(model.gyration))
-    arms = [np.square(np.cross(axis, one)).sum(axis=-1) for one in (centre, centre + moved)]
-    left = np.maximum(own_now + arms[0] - arms[1], SMALLEST * own_now)
-    return {"centre_of_mass": centre + moved, "gyration": np.sqrt(left / own)}
+    shape = np.einsum("li,lij,lj->l", axis, np.asarray(model.shape_inertia), axis)
+    own = shape * np.square(np.asarray(model.gyration))
+    arm = np.square(np.cross(axis, centre)).sum(axis=-1)
+    along = np.sum((centre + moved) * axis, axis=-1, keepdims=True) * axis
+    across = centre + moved - along
+    most = arm + (1.0 - SMALLEST) * own
+    size = np.square(across).sum(axis=-1)
+    across = across * np.sqrt(np.minimum(most / np.maximum(size, most), 1.0))[..., None]
+    left = own + arm - np.square(across).sum(axis=-1)
+    return {"centre_of_mass": along + across, "gyration": np.sqrt(left / shape)}

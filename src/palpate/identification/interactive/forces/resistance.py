@@ -15,13 +15,17 @@ from scipy.optimize import nnls
 SHORT, LONG = 18, 40  # moments of a window: a share of an action, from its least to its most
 SHARE, OVERLAP = 0.25, 0.7  # of an action, and of a window
 INDEPENDENT = 2.0 * (1.0 - OVERLAP)  # of windows that overlap
-MOVES = 0.2  # of the speed of a window in each of its quarters, and of the fastest in each
+MOVES = (
+    0.2  # each quarter of a window moves by this share of their mean, each window of the fastest
+)
 EVIDENT = 20.0  # by which Bayes' information criterion has to fall for a spring
 FEWEST, BLOCKS = 5, 10  # windows that say anything, and parts of them that are left out in turn
+ROWS = 2  # windows for each unknown, of which a spring or the centre of mass may be told
 LIGHTEST = 0.005  # of the masses that were guessed
 LEAST = 0.02  # of what the hand gave: less damping or friction than that is not told from none
 ROUGH = 0.04  # of an inertia: how well a part is known by its shape and axis
-CENTRE = 0.2  # of a part's radius of gyration about its hinge: how well its centre of mass is known
+# Of the radius of gyration about a hinge: how well the centre of mass of what turns is known.
+CENTRE = 0.2
 # What the jackknife does not see, as a factor of standard deviations: from eighteen appliances of
 # seeds 600006 to 600009, which no figure is measured on.
 INFLATION = 2.0
@@ -34,8 +38,8 @@ class JointMotion(NamedTuple):
     `effort` (N m or N) is that of the hand and `gravity` what weight does, and `levers` (N m/m) how
     much more it does for each metre that the part's centre of mass is elsewhere, along the axes of
     its link; `inertia` (kg m^2 or kg) is of the parts that it moves. The last three are for masses
-    that are guessed. `radius` (m) is that of gyration about the hinge, 0 of a slide, and `slack` by
-    which share the lever of the hand may be off, as the hinge may (standard deviation).
+    that are guessed. `radius` (m) is that of gyration about the hinge, 0 of a slide, and
+    `lever_error` the share by which the lever of the hand may be off (standard deviation).
     """
 
     times: Float[np.ndarray, " times"]
@@ -45,7 +49,7 @@ class JointMotion(NamedTuple):
     levers: Float[np.ndarray, "times 3"]
     inertia: float
     radius: float
-    slack: float = 0.0
+    lever_error: float = 0.0
 
 
 class Resistance(NamedTuple):
@@ -84,8 +88,8 @@ def regress(actions: Sequence[JointMotion]) -> Resistance | None:
     Where in a part its mass is nobody has seen: its weight is fitted too, from what boxes say of it
     (ridge regression). A spring is only believed where Bayes' information criterion falls by
     `EVIDENT`. How far the numbers are to be trusted is told by how they change when a tenth of the
-    windows is left out (jackknife of blocks: Kuensch 1989, Annals of Statistics 17:3), and by what
-    the boxes leave open.
+    windows is left out (jackknife of blocks: Kuensch 1989, Annals of Statistics 17:3), by what the
+    boxes leave open, and by how well levers and shapes are known.
     """
     table = np.array([row for action in actions for row in _rows(action)])
     table = table.reshape(-1, PARAMETERS + 1)
@@ -95,11 +99,14 @@ def regress(actions: Sequence[JointMotion]) -> Resistance | None:
         return None
     # effort = share (inertia acceleration - gravity) + damping velocity + friction sign
     #        + stiffness position - pull - share levers offset
-    turns = [OFFSET, OFFSET + 1, OFFSET + 2] if actions[0].radius else []
-    plain, sprung = [0, 1, 2, *turns], [0, 1, 2, 3, 4, *turns]
-    prior = _prior(table, plain, CENTRE * actions[0].radius)
-    evident = _fit(table, sprung, prior)[1] < _fit(table, plain, prior)[1] - EVIDENT
-    columns = sprung if evident else plain
+    centre = [OFFSET, OFFSET + 1, OFFSET + 2] if np.any(table[:, OFFSET:PARAMETERS]) else []
+    columns, sprung = [0, 1, 2, *centre], [0, 1, 2, 3, 4, *centre]
+    spread = CENTRE * actions[0].radius
+    prior = _prior(table, columns, spread)
+    if len(table) >= ROWS * len(sprung):
+        plain = _fit(table, columns, prior)[1]
+        if _fit(table, sprung, prior)[1] < plain - EVIDENT:
+            columns, prior = sprung, _prior(table, sprung, spread)
     values = _fit(table, columns, prior)[0]
     blocks = np.array_split(np.arange(len(table)), min(BLOCKS, len(table)))
     left_out = [_fit(np.delete(table, one, axis=0), columns, prior)[0] for one in blocks]
@@ -114,12 +121,15 @@ def regress(actions: Sequence[JointMotion]) -> Resistance | None:
     covariance[:3, :3] += np.diag([ROUGH * values[0], *least[1:]]) ** 2
     covariance *= INFLATION**2
     covariance += _left_open(table, columns, prior)
-    wrong = max(action.slack for action in actions) * values  # all that a force is held against
+    wrong = max(action.lever_error for action in actions) * values  # all that forces tell
     covariance += np.outer(wrong, wrong)
-    scale = np.append(np.ones(OFFSET), np.full(3, 1.0 / values[0]))
-    size, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
+    values[OFFSET:] /= values[0]
+    slopes = np.eye(PARAMETERS)  # of the centre itself, not times the share of masses
+    slopes[OFFSET:, OFFSET:] /= values[0]
+    slopes[OFFSET:, 0] = -values[OFFSET:] / values[0]
+    size, vectors = np.linalg.eigh(slopes @ covariance @ slopes.T)
     root = (vectors * np.sqrt(np.maximum(size, 0.0))) @ vectors.T
-    share, damping, friction, stiffness, pull, *offset = (values * scale).tolist()
+    share, damping, friction, stiffness, pull, *offset = values.tolist()
     return Resistance(share, damping, friction, stiffness, pull, (*offset,), root)
 
 
@@ -139,19 +149,25 @@ class _Prior(NamedTuple):
 def _prior(table: np.ndarray, columns: list[int], spread: float) -> _Prior:
     """With what rows leave over where the centre may be anywhere: rows that share moments say less
     than as many others, and errors of the axis are in all of them."""
-    values, _ = _fit(table, columns, _Prior(1e9, 0.0))
+    free = _Prior(1e9, 0.0)
+    alone = _fit(table, [one for one in columns if one < OFFSET], free)[0]
+    many = len(table) >= ROWS * len(columns)  # of fewer, as many unknowns leave nothing over
+    values = _fit(table, columns, free)[0] if many else alone
     left = table[:, -1] - table[:, :PARAMETERS] @ values
-    freedom = max(len(table) - len(columns), 1)
+    freedom = max(len(table) - int(np.count_nonzero(values)), 1)
     error = INFLATION * float(np.sqrt(left @ left / freedom / INDEPENDENT))
-    return _Prior(spread * max(values[0], LIGHTEST), error)
+    return _Prior(spread * max(values[0], alone[0], LIGHTEST), error)
 
 
 def _left_open(table: np.ndarray, columns: list[int], prior: _Prior) -> np.ndarray:
     """The covariance that is due to the prior: what it is taken to say may as well be otherwise."""
-    rows = prior.rows(columns)
-    inverse = np.linalg.pinv(table[:, columns].T @ table[:, columns] + rows.T @ rows)
-    found = np.zeros((PARAMETERS, PARAMETERS))
-    found[np.ix_(columns, columns)] = prior.error**2 * inverse @ (rows.T @ rows) @ inverse
+    rows, used = prior.rows(columns), table[:, columns]
+    scale = np.maximum(np.abs(used).max(axis=0), 1e-12)
+    rows, used = rows / scale, used / scale
+    inverse = np.linalg.pinv(used.T @ used + rows.T @ rows, rcond=1e-10, hermitian=True)
+    inverse *= prior.error / np.outer(scale, scale)
+    found, rows = np.zeros((PARAMETERS, PARAMETERS)), rows * scale
+    found[np.ix_(columns, columns)] = inverse @ (rows.T @ rows) @ inverse
     return found
 
 

@@ -23,7 +23,7 @@ POINTS = 100  # of each look that accounts are compared by, about
 # there, as a part that opens hides much and bares more
 CONCEALED = 0.6
 OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
-ENOUGH = 0.78  # the same: less than nearly all is explained
+ENOUGH = 0.82  # the same, whatever parts cost: less than nearly all is explained
 AS_GOOD, HANGS = 0.003, 0.008  # the same: what hanging a part lower may cost, and on another gain
 NEARLY = 0.02  # of evidence, for each of a part's points: to be seen less is not to be seen as well
 BETTER = 0.03  # the same: how much more the account backwards has to explain
@@ -37,11 +37,10 @@ def reconsider(twin: Twin) -> Twin:
     The latter is not tried where all pulls are explained, and nearly all that was seen.
     """
     twin = correct_parents(twin)
-    known = explained(twin)
-    if known > ENOUGH and not _share_unexplained(twin):
+    if _evidence_of_looks(twin) > ENOUGH and not _share_unexplained(twin):
         return twin
     other = correct_parents(explain_backwards(twin))
-    return other if explained(other) > known + BETTER else twin
+    return other if explained(other) > explained(twin) + BETTER else twin
 
 
 def correct_parents(twin: Twin) -> Twin:
@@ -95,8 +94,14 @@ def _with_parent(twin: Twin, number: int, parent: int) -> Twin | None:
 
 
 def explained(twin: Twin) -> float:
+    """The evidence of all looks, less what parts and unexplained pulls cost."""
+    cost = OF_PART * len(twin.parts) + OF_PULLS * _share_unexplained(twin)
+    return _evidence_of_looks(twin) - cost
+
+
+def _evidence_of_looks(twin: Twin) -> float:
     """How much likelier the likeliest label of a point makes another look (logarithm), the mean of
-    points and pairs of looks, less what parts and unexplained pulls cost."""
+    points and pairs of looks."""
     found = []
     for look, cloud in enumerate(twin.looks):
         others = [other for other in range(len(twin.looks)) if other != look]
@@ -108,8 +113,7 @@ def explained(twin: Twin) -> float:
         seen = [twin.looks[other] for other in others]
         best = scores(cloud, seen, motions, step, hidden=CONCEALED).max(axis=0)
         found.append(float(best.mean()) / max(len(others), 1))
-    cost = OF_PART * len(twin.parts) + OF_PULLS * _share_unexplained(twin)
-    return float(np.mean(found)) - cost
+    return float(np.mean(found))
 
 
 def _share_unexplained(twin: Twin) -> float:

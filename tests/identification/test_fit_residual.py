@@ -168,13 +168,16 @@ def test_a_cut_off_fit_goes_on_to_the_same_result(tmp_path, monkeypatch):
         np.testing.assert_array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize(("count", "judges"), [(5, 4), (8, 4), (16, 4), (40, 10)])
-def test_few_trials_rather_judge_than_teach(count, judges):
+@pytest.mark.parametrize(
+    ("count", "share", "judges"),
+    [(5, 0.25, 4), (8, 0.25, 4), (16, 0.25, 4), (40, 0.25, 10), (5, 0.95, 4), (8, 0.99, 7)],
+)
+def test_few_trials_rather_judge_than_teach(count, share, judges):
     """Few held-out trials agree by chance too often: by two of them, one correction in three made
-    the motion of an oven worse."""
+    the motion of an oven worse. One at least is learnt from."""
     ones = np.ones((count, 1, 1))
     aligned = Aligned(0.1, ones, ones, np.ones(count, int))
-    fitted, held_out = residual._split_trials(aligned, ResidualSettings())
+    fitted, held_out = residual._split_trials(aligned, ResidualSettings(held_out=share))
     assert len(held_out) == judges
     assert sorted([*fitted, *held_out]) == list(range(count))
 

@@ -11,6 +11,7 @@ import pytest
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.forces import action as forces
+from palpate.identification.interactive.forces import resistance
 from palpate.identification.interactive.forces.action import FORCE, POSITION, Action, aligned
 from palpate.identification.interactive.forces.dynamics import _centres, dynamics_of
 from palpate.identification.interactive.forces.resistance import JointMotion, regress
@@ -108,6 +109,23 @@ def test_the_centre_of_mass_is_told_by_its_weight():
     assert abs(free.friction - FRICTION) < 2.0 * free.deviation[2]
 
 
+def test_what_the_prior_says_may_as_well_be_otherwise():
+    """What the centre of mass leaves open is what other numbers would be with another one."""
+    felt = [motion(weight=0.6, hangs=0.05, seed=seed) for seed in (0, 1)]
+    table = np.array([row for one in felt for row in resistance._rows(one)])
+    columns, prior = [0, 1, 2, 5, 6, 7], resistance._Prior(0.08, 0.01)
+    assert not table[:, 6].any()  # along its axis, of which a hinge tells nothing
+    rows, used = prior.rows(columns), table[:, columns]
+    wanted = np.zeros((6, 6))
+    for axis in range(3):
+        moved = np.concatenate([np.zeros(len(used)), prior.error * np.eye(3)[axis]])
+        shift = np.linalg.lstsq(np.concatenate([used, rows]), moved, rcond=None)[0]
+        wanted += np.outer(shift, shift)
+    found = resistance._left_open(table, columns, prior)[np.ix_(columns, columns)]
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
+    assert found[4, 4] == pytest.approx(0.08**2)
+
+
 def test_a_joint_that_rests_tells_nothing():
     still = motion()
     assert regress([]) is None
@@ -123,7 +141,7 @@ def test_draws_spread_as_far_as_is_known_and_nothing_is_negative():
     assert drawn[:, 2].std() == pytest.approx(known.deviation[2], rel=0.1)
 
 
-def test_axes_are_made_aligned_only_within_their_interval():
+def test_axes_are_made_vertical_or_level_only_within_their_interval():
     tilted = np.array([math.cos(0.02), 0.0, math.sin(0.02)])
     assert aligned(tilted, 0.03) == pytest.approx([1.0, 0.0, 0.0])
     assert aligned(tilted, 0.01) == pytest.approx(tilted)

@@ -153,7 +153,7 @@ def check_correctable(model: Model, aligned: Aligned) -> None:
 def _split_trials(aligned: Aligned, settings: ResidualSettings) -> tuple[np.ndarray, np.ndarray]:
     count = len(aligned.length)
     order = np.random.default_rng(settings.seed).permutation(count)
-    judges = max(JUDGES, round(settings.held_out * count))
+    judges = min(max(JUDGES, round(settings.held_out * count)), count - 1)
     return np.sort(order[judges:]), np.sort(order[:judges])
 
 

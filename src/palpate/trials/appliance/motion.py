@@ -61,7 +61,7 @@ def motions(
     """Of each real part that was found with its kind of joint; `corrected` is its model with a
     network on top.
 
-    None of one that no force of the hand moves by `LEAST` of its range, or that is hidden. The
+    None of one that no force of the hand moves as far as was drawn, or that is hidden. The
     world is as it was in the twin's last look, and is left as it is.
     """
     random = np.random.default_rng([seed, 11])

@@ -53,6 +53,7 @@ class Action:
 
     @cached_property
     def screw(self) -> Screw:
+        """The joint of the part, where it was before."""
         return self.twin.screw(self.part, self.before)
 
     @cached_property

@@ -75,7 +75,7 @@ class Dynamics:
             if own is not None and own.stiffness > 0.0:
                 said.append(
                     f"{of}: a spring of {own.stiffness:.2g} N m/rad or N/m, at rest at "
-                    f"{own.pull / own.stiffness:.2g} rad or m"
+                    f"{own.pull / own.stiffness:.2g} rad or m; a URDF does not have it"
                 )
         return said
 
@@ -115,7 +115,8 @@ class Dynamics:
     def describe_with(
         self, description: Description, model: Articulated | None = None
     ) -> Description:
-        """A twin's description with what was felt, or with what the `model` was identified as."""
+        """A twin's description with what was felt, or with what the `model` was identified as; but
+        for springs, which a description does not have."""
         model = model or self.model
         links, joints = list(description.links), list(description.joints)
         place = {link.name: number for number, link in enumerate(links)}

@@ -161,12 +161,12 @@ def _prior(table: np.ndarray, columns: list[int], spread: float) -> _Prior:
 
 def _left_open(table: np.ndarray, columns: list[int], prior: _Prior) -> np.ndarray:
     """The covariance that is due to the prior: what it is taken to say may as well be otherwise."""
-    rows, used = prior.rows(columns), table[:, columns]
-    scale = np.maximum(np.abs(used).max(axis=0), 1e-12)
-    rows, used = rows / scale, used / scale
-    inverse = np.linalg.pinv(used.T @ used + rows.T @ rows, rcond=1e-10, hermitian=True)
+    rows = prior.rows(columns)
+    used = np.concatenate([table[:, columns], rows])
+    scale = np.maximum(np.abs(used).max(axis=0), 1e-12)  # else small columns are lost in rounding
+    inverse = np.linalg.pinv((used / scale).T @ (used / scale), rcond=1e-10, hermitian=True)
     inverse *= prior.error / np.outer(scale, scale)
-    found, rows = np.zeros((PARAMETERS, PARAMETERS)), rows * scale
+    found = np.zeros((PARAMETERS, PARAMETERS))
     found[np.ix_(columns, columns)] = inverse @ (rows.T @ rows) @ inverse
     return found
 

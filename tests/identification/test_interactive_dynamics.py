@@ -12,8 +12,19 @@ from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.forces import action as forces
 from palpate.identification.interactive.forces import resistance
-from palpate.identification.interactive.forces.action import FORCE, POSITION, Action, aligned
-from palpate.identification.interactive.forces.dynamics import _centres, dynamics_of
+from palpate.identification.interactive.forces.action import (
+    FORCE,
+    POSITION,
+    Action,
+    aligned,
+    weight_at,
+)
+from palpate.identification.interactive.forces.dynamics import (
+    UNKNOWN,
+    _centres,
+    _unfelt,
+    dynamics_of,
+)
 from palpate.identification.interactive.forces.resistance import JointMotion, regress
 from palpate.identification.interactive.twin import Twin
 from palpate.learning.active import CHOICES
@@ -269,6 +280,31 @@ def test_weight_grows_with_the_way_to_the_centre_of_mass(known, monkeypatch):
         other = dataclasses.replace(links[0], centre_of_mass=links[0].centre_of_mass + moved)
         weight = Action(twin, number).motion([other], found.parts).gravity
         assert weight - felt.gravity == pytest.approx(felt.levers @ moved, abs=1e-6)
+
+
+def test_what_rests_is_held_by_friction_or_by_a_stop(known, monkeypatch):
+    """Of a part that no hand has felt: as if a door turned about a level axis."""
+    _, twin, found = known
+    monkeypatch.setattr(forces, "GRAVITY", (50.0, -80.0, 0.0))
+    links = assemble(describe(twin, "door")).links
+    number = next(n for n, (part, _) in enumerate(twin.held)
+                  if part == 0 and twin.handled[n].moved)  # fmt: skip
+    before = twin.held[number][1]
+    felt = Action(twin, number).motion(links, found.parts, slice(0, 3)).gravity.mean()
+    weight = weight_at(twin, 0, before, links, found.parts)
+    assert weight == pytest.approx(felt, rel=0.02)
+    other, place = twin.copy(), twin.parts[0].positions[before]
+    other.parts[0].positions = [place] * len(other.looks)  # it is at an end, for all one knows
+    guessed = _unfelt(other, 0, links, found.parts)
+    assert guessed.guess.friction == UNKNOWN.friction < abs(weight)
+    ends = (-math.inf, place) if weight > 0.0 else (place, math.inf)
+    assert (guessed.lower, guessed.upper) == ends
+    held = [look + 1 for _, look in twin.held]
+    for look, beyond in zip(held[:2], (-0.5, 0.5), strict=True):  # a hand has taken it further
+        other.parts[0].positions[look] = place + beyond
+    guessed = _unfelt(other, 0, links, found.parts)
+    assert guessed.guess.friction == pytest.approx(abs(weight))
+    assert (guessed.lower, guessed.upper) == (-math.inf, math.inf)
 
 
 def test_a_lid_is_not_latched_by_its_weight(known, monkeypatch):

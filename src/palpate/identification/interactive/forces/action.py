@@ -208,6 +208,19 @@ def _pressed(motion: JointMotion, known: Resistance) -> float:
     return float(np.mean(motion.effort + weight + spring))
 
 
+def weight_at(twin: Twin, part: int, look: int, links: list[Link], parts: list[int]) -> float:
+    """What weight does at a part's joint in a look (N m or N), by the masses of some links, which
+    are of these `parts`."""
+    screw, found = twin.screw(part, look), 0.0
+    level = dataclasses.replace(screw, axis=axis_by_gravity(twin, part, screw.axis))
+    for link, other in zip(links, parts, strict=True):
+        if other == part or part in twin.carriers(other):
+            own = twin.parts[other].screw.point + np.asarray(link.centre_of_mass)
+            centre = twin.pose(other, look).at(own[None])
+            found += link.mass * float(level.velocity(centre)[0] @ np.array(GRAVITY))
+    return found
+
+
 def axis_by_gravity(twin: Twin, part: int, axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """The axis of a part's joint, made vertical or level if it may be so; see `aligned`."""
     return aligned(axis, math.radians(twin.parts[part].estimate.intervals[0]))

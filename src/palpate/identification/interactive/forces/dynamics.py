@@ -16,10 +16,12 @@ from jaxtyping import Float
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.forces.action import (
+    END,
     POSITION,
     SHORTEST,
     Action,
     axis_by_gravity,
+    weight_at,
 )
 from palpate.identification.interactive.forces.resistance import Resistance, regress
 from palpate.identification.interactive.twin import Twin
@@ -82,7 +84,10 @@ class Dynamics:
     def draws(self, count: int, seed: int) -> Articulated:
         """As many models as one with a batch axis, from what is known of each joint."""
         random = np.random.default_rng(seed)
-        known = [own or UNKNOWN for own in self.resistance]
+        known = [
+            own or UNKNOWN._replace(friction=float(friction))
+            for own, friction in zip(self.resistance, self.model.friction, strict=True)
+        ]
         drawn = np.array([own.draws(count, random) for own in known])
         shares, damping, friction, stiffness, pull, *offset = np.moveaxis(drawn, (2, 1), (0, 1))
         shares = shares / np.array([own.mass_share for own in known])
@@ -159,6 +164,10 @@ def dynamics_of(twin: Twin) -> Dynamics:
                if part >= 0 and twin.handled[number].moved]  # fmt: skip
     actions = [one for one in actions if one.alone]
     found = [_felt([one for one in actions if one.part == part], links, parts) for part in parts]
+    found = [
+        _unfelt(twin, part, links, parts) if one.resistance is None else one
+        for part, one in zip(parts, found, strict=True)
+    ]
     resistance = [one.resistance for one in found]
     links = [
         dataclasses.replace(link, lower=max(one.lower, -FREE), upper=min(one.upper, FREE))
@@ -177,7 +186,7 @@ def dynamics_of(twin: Twin) -> Dynamics:
         )
     period = float(f"{np.median(np.diff(trials[0][POSITION].time)):.5g}")
     recording = Recording(tuple(trials), {"source": "actions on an appliance"})
-    model = _model(links, resistance, period)
+    model = _model(links, [one.resistance or one.guess for one in found], period)
     inertia, latches = [one.inertia for one in found], [one.latch for one in found]
     return Dynamics(recording, model, parts, resistance, inertia, latches)
 
@@ -190,6 +199,27 @@ class _Felt(NamedTuple):
     latch: float = 0.0
     lower: float = -math.inf
     upper: float = math.inf
+    guess: Resistance = UNKNOWN
+
+
+def _unfelt(twin: Twin, part: int, links: list[Link], parts: list[int]) -> _Felt:
+    """Of a joint at which no hand felt anything: where the part was seen to rest, friction holds
+    its weight, or a stop if that is an end of what was seen of its range."""
+    one, friction = twin.parts[part], UNKNOWN.friction
+    (low, high), margin = one.range, END[one.screw.joint]
+    lower, upper = -math.inf, math.inf
+    held = [before + 1 for _, before in twin.held]  # looks in which a hand still holds something
+    for look in range(len(twin.looks)):
+        if look in held:
+            continue
+        place, weight = one.positions[look], weight_at(twin, part, look, links, parts)
+        if place > high - margin and weight > friction:
+            upper = high
+        elif place < low + margin and -weight > friction:
+            lower = low
+        else:
+            friction = max(friction, abs(weight))
+    return _Felt(lower=lower, upper=upper, guess=UNKNOWN._replace(friction=friction))
 
 
 def _felt(actions: list[Action], links: list[Link], parts: list[int]) -> _Felt:
@@ -208,9 +238,8 @@ def _felt(actions: list[Action], links: list[Link], parts: list[int]) -> _Felt:
     )
 
 
-def _model(links: list[Link], resistance: list[Resistance | None], period: float) -> Articulated:
-    """The tree as the regression says."""
-    known = [one or UNKNOWN for one in resistance]
+def _model(links: list[Link], known: list[Resistance], period: float) -> Articulated:
+    """The tree with what is known of each joint, or guessed."""
     sprung = any(one.stiffness for one in known)
     started = [
         dataclasses.replace(

@@ -1,16 +1,18 @@
 """What was done to a door with a flap, explained once more from the last pull to the first."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
 
-from palpate.identification.interactive import hindsight
+from palpate.identification.interactive import account, hindsight
 from palpate.identification.interactive.hindsight import (
     correct_parents,
+    drop_needless,
     explain_backwards,
-    explained,
     reconsider,
+    take_further,
 )
 from palpate.identification.interactive.insertion import hang
 from palpate.identification.interactive.twin import Twin
@@ -69,23 +71,23 @@ def test_an_account_backwards_is_of_the_same_looks_and_pulls(room, twin) -> None
 def test_nothing_is_reconsidered_where_all_pulls_are_explained(twin, monkeypatch) -> None:
     assert [part for part, _ in twin.held] == [0, 1]
     assert reconsider(twin) is twin
-    monkeypatch.setattr(hindsight, "OF_PART", 1.0)  # many parts, as a cabinet has, are no reason to
+    monkeypatch.setattr(account, "OF_PART", 0.1)  # many parts, as a cabinet has, are no reason to
     monkeypatch.setattr(hindsight, "explain_backwards", lambda _: pytest.fail("it was tried"))
     assert reconsider(twin) is twin
 
 
 def test_a_part_hangs_on_what_explains_all_looks(room, twin, monkeypatch) -> None:
     assert correct_parents(twin) is twin
-    whole, flap = explained(twin), twin.parts[1]
+    whole, flap = twin.explained(), twin.parts[1]
     twin.parts[1] = hang(twin, flap, -1, flap.shown)  # as if it had moved by itself each time
     places = np.linspace(-2.0, 2.0, 81)
     for look in range(len(twin.looks)):
         twin.parts[1].positions[look] = float(places[twin.seen_at(1, look, places).argmax()])
-    assert explained(twin) < whole - hindsight.HANGS
+    assert twin.explained() < whole - hindsight.HANGS
     kept = [list(part.positions) for part in twin.parts]
     other = correct_parents(twin)
     assert [part.parent for part in other.parts] == [-1, 0]
-    assert explained(other) == pytest.approx(whole, abs=hindsight.BETTER)
+    assert other.explained() == pytest.approx(whole, abs=hindsight.BETTER)
     assert room.error(other, 1, 1)[0] < 4.0
     assert [part.positions for part in twin.parts] == kept  # it has been left as it was
     assert reconsider(twin).parts[1].parent == 0
@@ -99,14 +101,14 @@ def test_a_part_hangs_on_what_explains_all_looks(room, twin, monkeypatch) -> Non
 
 @pytest.mark.parametrize("held", [-1, 0], ids=["unexplained", "as-if-the-door-was-pulled"])
 def test_what_explains_more_is_believed(room, twin, held) -> None:
-    whole = explained(twin)
+    whole = twin.explained()
     twin.remove(1, -1)
     assert [part for part, _ in twin.held] == [0, -1]
     twin.held[1] = held, twin.held[1][1]
-    assert explained(twin) < whole - hindsight.BETTER
+    assert twin.explained() < whole - hindsight.BETTER
     other = reconsider(twin)
     assert [part.parent for part in other.parts] == [-1, 0]
-    assert explained(other) == pytest.approx(whole, abs=hindsight.BETTER)
+    assert other.explained() == pytest.approx(whole, abs=hindsight.BETTER)
     assert room.error(other, 1, 1)[0] < 4.0
 
 
@@ -114,12 +116,67 @@ def test_what_explains_less_is_not_believed(twin, monkeypatch) -> None:
     first = Twin()
     for look in twin.looks:
         first.look(look)
-    whole = explained(twin)
+    whole = twin.explained()
     twin.held[0] = -1, twin.held[0][1]
-    assert explained(twin) == pytest.approx(whole - 0.5 * hindsight.OF_PULLS, abs=1e-9)
+    assert twin.explained() == pytest.approx(whole - 0.5 * account.OF_PULLS, abs=1e-9)
     monkeypatch.setattr(hindsight, "explain_backwards", lambda _: first)
     assert reconsider(twin) is twin
     # a part that explains nothing costs
-    alone = explained(twin)
+    alone = twin.explained()
     twin.parts.append(twin.parts[1])
-    assert explained(twin) == pytest.approx(alone - hindsight.OF_PART, abs=1e-9)
+    assert twin.explained() == pytest.approx(alone - account.OF_PART, abs=1e-9)
+    other = drop_needless(twin)
+    assert len(other.parts) == 2
+    assert other.explained() == pytest.approx(alone, abs=1e-9)
+    assert drop_needless(other) is other
+    monkeypatch.setattr(Twin, "was_felt_by_itself", lambda *_: True)
+    assert drop_needless(twin) is twin
+
+
+def test_what_was_known_before_is_believed_again(room, twin) -> None:
+    known = twin.copy()
+    room.pull(twin, DOOR, PLACES[2], (-0.7, 0.7))
+    assert twin.adds_to(known)
+    whole, kept = twin.explained(), [list(part.positions) for part in known.parts]
+    screw = known.parts[1].screw
+    wrong = dataclasses.replace(screw, axis=np.array([1.0, 0.0, 0.0]))
+    twin.parts[1].estimate = dataclasses.replace(twin.parts[1].estimate, screw=wrong)
+    for look in range(len(twin.looks)):
+        twin.relabel(look)
+    assert not twin.adds_to(known)
+    assert twin.explained() < whole - hindsight.CLEARER
+    twin.earlier.append(known)
+    other = reconsider(twin)
+    assert other.explained() == pytest.approx(whole, abs=hindsight.BETTER)
+    assert [part for part, _ in other.held] == [0, 1, 0]
+    assert len(other.parts[0].ways) == 2
+    assert room.error(other, 1, 1)[0] < 4.0
+    assert [part.positions for part in known.parts] == kept  # it has been left as it was
+    assert take_further(known, twin).looks == twin.looks
+
+
+def test_what_no_longer_holds_is_kept_as_it_was(room, twin) -> None:
+    known = twin.copy()
+    assert twin.adds_to(known)
+    for change in (
+        lambda one: one.remove(1, -1),
+        lambda one: setattr(one.parts[1], "parent", -1),
+        lambda one: one.parts[1].settle(
+            dataclasses.replace(
+                one.parts[1].estimate,
+                screw=dataclasses.replace(one.parts[1].screw, joint="prismatic"),
+            )
+        ),
+    ):
+        other = twin.copy()
+        change(other)
+        assert not other.adds_to(known)
+    assert [len(one.parts) for one in twin.earlier] == [1]  # before the last pull
+    room.pull(twin, DOOR, PLACES[2], (-0.7, 0.7))
+    assert [len(one.parts) for one in twin.earlier] == [2]  # what was added to is let go
+    assert len(twin.earlier[0].held) == 2
+    assert not twin.earlier[0].earlier
+    twin.remove(1, -1)
+    room.pull(twin, DOOR, (-0.7, 0.7), PLACES[2])
+    assert len(twin.earlier[0].parts) == 2
+    assert len(twin.earlier) == 2

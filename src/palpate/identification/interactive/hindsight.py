@@ -1,10 +1,12 @@
-"""All that was done explained once more: on what each part hangs, and from the last to the first.
+"""All that was done explained once more, when nothing more is to come.
 
-A part on a wrong one seems to move when that one does, though no hand holds it. On what it hangs is
-told best by all looks together.
+On what each part hangs is told best by all looks together: on a wrong one it seems to move when
+that one does, though no hand holds it. What was believed before some push, and then given up, may
+explain more of all looks than what took its place; and a part that no hand has felt may explain no
+more than it costs.
 
 Which part a pull is of depends on what is known by then: a pull that moved two joints tells little
-before one of them is known. Backwards in time other pulls come first. Both accounts are of the same
+before one of them is known. Backwards in time other pulls come first. All accounts are of the same
 looks and ways, so that how well they explain those compares them.
 """
 
@@ -12,53 +14,127 @@ import dataclasses
 
 import numpy as np
 
-from palpate.identification.interactive.explanation import FURTHER
+from palpate.identification.interactive.account import evidence_of_looks
+from palpate.identification.interactive.explanation import EXPLAINED, FURTHER
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, STILLER, hang
-from palpate.identification.interactive.labels import scores
+from palpate.identification.interactive.refinement import SURPRISE, surprise
 from palpate.identification.interactive.twin import Twin
 
-POINTS = 100  # of each look that accounts are compared by, about
-# of evidence, for each point: what is hidden where it has gone is nearly as likely as what is seen
-# there, as a part that opens hides much and bares more
-CONCEALED = 0.6
-OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
-ENOUGH = 0.82  # the same, whatever parts cost: less than nearly all is explained
+ENOUGH = 0.82  # of evidence, for each point, whatever parts cost: less than nearly all is explained
 AS_GOOD, HANGS = 0.003, 0.008  # the same: what hanging a part lower may cost, and on another gain
 NEARLY = 0.02  # of evidence, for each of a part's points: to be seen less is not to be seen as well
-BETTER = 0.03  # the same: how much more the account backwards has to explain
+# the same: how much more what was known earlier, or the account backwards, has to explain
+CLEARER, BETTER = 0.01, 0.03
+FEWER = 1  # parts than are known now: what was known earlier and had less explains less
 
 
 def reconsider(twin: Twin) -> Twin:
-    """The twin with each part on what it hangs on, or what is believed of the same looks and
-    handlings when they are taken from the last to the first, if that explains more of what was
-    seen.
+    """The twin with each part on what it hangs on, or what explains more of what was seen.
 
-    The latter is not tried where all pulls are explained, and nearly all that was seen.
+    That may be what was believed before some push, or what is believed of the same looks and
+    handlings when they are taken from the last to the first; the latter is not tried where all
+    pulls are explained, and nearly all that was seen.
     """
-    twin = correct_parents(twin)
-    if _evidence_of_looks(twin) > ENOUGH and not _share_unexplained(twin):
+    twin = drop_needless(_with_what_was_known(correct_parents(twin)))
+    if evidence_of_looks(twin) > ENOUGH and not twin.share_unexplained:
         return twin
-    other = correct_parents(explain_backwards(twin))
-    return other if explained(other) > explained(twin) + BETTER else twin
+    other = drop_needless(correct_parents(explain_backwards(twin)))
+    return other if other.explained() > twin.explained() + BETTER else twin
+
+
+def _with_what_was_known(twin: Twin) -> Twin:
+    """The twin, or what was believed before something no longer held, if that explains more."""
+    best = twin
+    for known in twin.earlier:
+        if len(known.parts) + FEWER >= len(twin.parts) and not twin.adds_to(known):
+            other = take_further(known, twin)
+            if other.explained() > best.explained() + CLEARER:
+                best = other
+    return best if best is twin else _fitted(best)
+
+
+def take_further(known: Twin, twin: Twin) -> Twin:
+    """What was known after some of a twin's looks, in all of them: only where parts are is found
+    in those that came after."""
+    other = known.copy()
+    for look in twin.looks[len(other.looks) :]:
+        other.add_look(look)
+        other.relabel(len(other.looks) - 1)
+    for look in range(len(known.looks)):
+        other.relabel(look)  # those that came after tell of them, too
+    other.handled = list(twin.handled)
+    for number in range(len(known.held), len(twin.held)):
+        before, handling = twin.held[number][1], twin.handled[number]
+        part = _part_that_went(other, before, handling)
+        other.held.append((part, before))
+        if part >= 0 and handling.moved:
+            one, way = other.parts[part], (before, handling.points)
+            if surprise(one.estimate, other.way_from(one.parent, *way)) <= SURPRISE:
+                one.ways.append(way)
+    return other
+
+
+def _fitted(twin: Twin) -> Twin:
+    """The twin with its joints fitted to all looks, if that explains as much."""
+    other = twin.copy()
+    other.refit(-1)
+    for look in range(len(other.looks)):
+        other.relabel(look)
+    return other if other.explained() >= twin.explained() else twin
+
+
+def drop_needless(twin: Twin) -> Twin:
+    """The twin without parts that explain no more than they cost, and that no hand has felt."""
+    for number in reversed(range(len(twin.parts))):
+        if twin.was_felt_by_itself(number):
+            continue
+        other = twin.copy()
+        held = [part == number for part, _ in other.held]
+        other.remove(number, other.parts[number].parent)
+        for look in range(len(other.looks)):
+            other.relabel(look)
+        other.held = [
+            (_part_that_went(other, before, handling), before) if lost else (part, before)
+            for (part, before), lost, handling in zip(other.held, held, other.handled, strict=True)
+        ]
+        if other.explained() > twin.explained():
+            twin = other
+    return twin
+
+
+def _part_that_went(twin: Twin, before: int, handling: Handling) -> int:
+    """The part that has gone from one look to the next as the hand has, -1: none; of one that has
+    not moved what it was put to."""
+    if not handling.moved:
+        nearest = twin.looks[before].tree.query(handling.push.point)[1]
+        return int(twin.labels[before][nearest])
+    start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
+    missed = [
+        float(np.linalg.norm(twin.motion(part, before, before + 1).at(start[None])[0] - end))
+        for part in range(len(twin.parts))
+    ]
+    if not missed or min(missed) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
+        return -1
+    return int(np.argmin(missed))
 
 
 def correct_parents(twin: Twin) -> Twin:
     """The twin, with each part on what makes all looks likeliest; of two doors above each other on
     one hinge, which may as well hang on each other, both on what stands still."""
-    known, tried = explained(twin), set()
+    known, tried = twin.explained(), set()
     while options := [one for one in _other_parents(twin) if one not in tried]:
         part, parent = options[0]
         tried.add(options[0])
         if (other := _with_parent(twin, part, parent)) is None:
             continue
         least = known + (-AS_GOOD if parent in (-1, *twin.carriers(part)) else HANGS)
-        if explained(other) < least:
+        if other.explained() < least:
             continue
         for look in range(len(other.looks)):
             other.relabel(look)
         other.refit(-1)
-        if (settled := explained(other)) > least:  # its joint may have been lost meanwhile
+        if (settled := other.explained()) > least:  # its joint may have been lost meanwhile
             twin, known = other, settled
     return twin
 
@@ -91,37 +167,6 @@ def _with_parent(twin: Twin, number: int, parent: int) -> Twin | None:
         there += other.find(number, look, beyond=FURTHER)
         here += float(twin.seen_at(number, look, np.array([part.positions[look]]))[0])
     return other if there - here > -NEARLY * len(other.looks) else None
-
-
-def explained(twin: Twin) -> float:
-    """The evidence of all looks, less what parts and unexplained pulls cost."""
-    cost = OF_PART * len(twin.parts) + OF_PULLS * _share_unexplained(twin)
-    return _evidence_of_looks(twin) - cost
-
-
-def _evidence_of_looks(twin: Twin) -> float:
-    """How much likelier the likeliest label of a point makes another look (logarithm), the mean of
-    points and pairs of looks."""
-    found = []
-    for look, cloud in enumerate(twin.looks):
-        others = [other for other in range(len(twin.looks)) if other != look]
-        motions = [
-            [twin.motion(part, look, other) for other in others]
-            for part in range(-1, len(twin.parts))
-        ]
-        step = max(1, len(cloud.points) // POINTS)
-        seen = [twin.looks[other] for other in others]
-        best = scores(cloud, seen, motions, step, hidden=CONCEALED).max(axis=0)
-        found.append(float(best.mean()) / max(len(others), 1))
-    return float(np.mean(found))
-
-
-def _share_unexplained(twin: Twin) -> float:
-    """The share of the pulls that moved something which are of no part that is known."""
-    held = [
-        part for handling, (part, _) in zip(twin.handled, twin.held, strict=True) if handling.moved
-    ]
-    return float(np.mean(np.array(held) < 0)) if held else 0.0
 
 
 def explain_backwards(twin: Twin) -> Twin:

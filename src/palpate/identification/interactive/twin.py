@@ -10,6 +10,7 @@ import dataclasses
 
 import numpy as np
 
+from palpate.identification.interactive.account import explained
 from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
 from palpate.identification.interactive.explanation import (
@@ -23,12 +24,13 @@ from palpate.identification.interactive.explanation import (
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, find_beside, reparent
 from palpate.identification.interactive.part import KNOWN, UNSURE, Part
-from palpate.identification.interactive.screws import screws_of_way
+from palpate.identification.interactive.screws import Screw, screws_of_way
 from palpate.identification.interactive.splitting import split, split_off_base
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.identification.interactive.ways import is_of_two_ends, misfit
 from palpate.perception.clouds import Cloud
 
+ELSEWHERE = 5.0, 0.05  # deg and m between two joints that nobody would take for one
 ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known
 
 
@@ -36,19 +38,22 @@ class Twin(PartTree):
     """Takes one handling after the other with `observe`.
 
     `held` has of each the part that the hand held (-1: none, or none that is known), and the number
-    of the look before.
+    of the look before. `earlier` are twins as they were before the last handling, and before those
+    from which on what was known no longer held.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.handled: list[Handling] = []
         self.held: list[tuple[int, int]] = []
+        self.earlier: list[Twin] = []
 
     def copy(self) -> "Twin":
         """Another one of the same looks, of which all that is believed may change by itself."""
         other = copy.copy(self)
         other.looks, other.labels = list(self.looks), list(self.labels)
         other.handled, other.held = list(self.handled), list(self.held)
+        other.earlier = list(self.earlier)
         other.parts = [
             dataclasses.replace(
                 part, positions=list(part.positions), seen=dict(part.seen), ways=list(part.ways)
@@ -57,8 +62,37 @@ class Twin(PartTree):
         ]
         return other
 
+    @property
+    def share_unexplained(self) -> float:
+        """The share of the pulls that moved something which are of no part that is known."""
+        held = [part for one, (part, _) in zip(self.handled, self.held, strict=True) if one.moved]
+        return float(np.mean(np.array(held) < 0)) if held else 0.0
+
+    def explained(self) -> float:
+        """How much of what was seen is explained, see `account`."""
+        return explained(self, self.share_unexplained)
+
     def observe(self, handling: Handling) -> None:
         """Explain what was seen and felt."""
+        if self.parts:
+            known = self.copy()
+            known.earlier = []
+            if self.earlier and self.adds_to(self.earlier[-1]):
+                self.earlier.pop()
+            self.earlier.append(known)
+        self._learn(handling)
+
+    def adds_to(self, known: "Twin") -> bool:
+        """Whether all that was known before still holds."""
+        return len(self.parts) >= len(known.parts) and all(
+            one.parent == old.parent
+            and one.screw.joint == old.screw.joint
+            and not (old.estimate.refutes(one.screw) and _is_elsewhere(one.screw, old.screw))
+            for one, old in zip(self.parts, known.parts, strict=False)
+        )
+
+    def _learn(self, handling: Handling) -> None:
+        """Explain a handling by a joint that is known, or a part that is new."""
         before = self.add_look(handling.before)
         after = self.add_look(handling.after, still=not handling.moved)
         self.handled.append(handling)
@@ -268,3 +302,12 @@ class Twin(PartTree):
         if handling.travel > TELLS and discover(self, before, after, handling, carried=carried):
             return len(self.parts) - 1, True
         return -1, False
+
+
+def _is_elsewhere(screw: Screw, other: Screw) -> bool:
+    """Whether two joints of one kind are clearly not the same one."""
+    turned = float(
+        np.degrees(np.arcsin(min(np.linalg.norm(np.cross(screw.axis, other.axis)), 1.0)))
+    )
+    aside = float(np.linalg.norm(np.cross(screw.point - other.point, other.axis)))
+    return turned > ELSEWHERE[0] or (aside > ELSEWHERE[1] and screw.joint == "revolute")

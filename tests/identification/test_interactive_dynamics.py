@@ -11,7 +11,7 @@ import pytest
 from palpate.errors import PalpateError
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.forces import action as forces
-from palpate.identification.interactive.forces import resistance
+from palpate.identification.interactive.forces import dynamics, resistance
 from palpate.identification.interactive.forces.action import (
     FORCE,
     POSITION,
@@ -282,10 +282,11 @@ def test_weight_grows_with_the_way_to_the_centre_of_mass(known, monkeypatch):
         assert weight - felt.gravity == pytest.approx(felt.levers @ moved, abs=1e-6)
 
 
-def test_what_rests_is_held_by_friction_or_by_a_stop(known, monkeypatch):
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_rests_is_held_by_friction_or_by_a_stop(known, monkeypatch, sign):
     """Of a part that no hand has felt: as if a door turned about a level axis."""
     _, twin, found = known
-    monkeypatch.setattr(forces, "GRAVITY", (50.0, -80.0, 0.0))
+    monkeypatch.setattr(forces, "GRAVITY", (sign * 50.0, sign * -80.0, 0.0))
     links = assemble(describe(twin, "door")).links
     number = next(n for n, (part, _) in enumerate(twin.held)
                   if part == 0 and twin.handled[n].moved)  # fmt: skip
@@ -305,6 +306,23 @@ def test_what_rests_is_held_by_friction_or_by_a_stop(known, monkeypatch):
     guessed = _unfelt(other, 0, links, found.parts)
     assert guessed.guess.friction == pytest.approx(abs(weight))
     assert (guessed.lower, guessed.upper) == (-math.inf, math.inf)
+
+
+def test_what_nobody_has_felt_does_not_fall_in_the_model(known, monkeypatch):
+    _, twin, _ = known
+    monkeypatch.setattr(dynamics, "regress", lambda _: None)
+    monkeypatch.setattr(forces, "GRAVITY", (50.0, -80.0, 0.0))
+    found = dynamics_of(twin)
+    links = assemble(describe(twin, "door")).links
+    free = [look for look in range(len(twin.looks))
+            if look not in [before + 1 for _, before in twin.held]]  # fmt: skip
+    weights = {look: weight_at(twin, 0, look, links, found.parts) for look in free}
+    friction = float(found.model.friction[0])
+    for look, weight in weights.items():
+        end = found.model.upper[0] if weight > 0.0 else found.model.lower[0]
+        held = abs(float(end) - twin.parts[0].positions[look]) < 0.05
+        assert held or friction >= abs(weight) * 0.999
+    assert found.draws(4, 0).friction.shape == (4, 1)
 
 
 def test_a_lid_is_not_latched_by_its_weight(known, monkeypatch):

@@ -264,17 +264,23 @@ def joint_of_ways(tree: PartTree, part: Part, ways: list[Way]) -> Estimate | Non
     return min(found, key=lambda one: one.criterion, default=None)
 
 
+def missed_by(tree: PartTree, before: int, after: int, handling: Handling) -> dict[int, float]:
+    """Of each part that has moved by itself from one look to another, how far (m) from where the
+    hand ended it has taken what the hand took hold of."""
+    start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
+    return {
+        number: float(np.linalg.norm(tree.motion(number, before, after).at(start[None])[0] - end))
+        for number, part in enumerate(tree.parts)
+        if abs(part.positions[after] - part.positions[before]) > LEAST_MOTION
+    }
+
+
 def _by_clouds(tree: PartTree, before: int, after: int, handling: Handling) -> int:
     """The part that the clouds show to have moved as the hand has, which has one way more.
 
     Its joint allows that way: else what moved is something on it, or under it, as well.
     """
-    start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
-    misses = {
-        number: float(np.linalg.norm(tree.motion(number, before, after).at(start[None])[0] - end))
-        for number, part in enumerate(tree.parts)
-        if abs(part.positions[after] - part.positions[before]) > LEAST_MOTION
-    }
+    misses = missed_by(tree, before, after, handling)
     if not misses or min(misses.values()) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
         return -1
     part = min(misses, key=lambda number: misses[number])

@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 
 from palpate.identification.interactive.account import evidence_of_looks
-from palpate.identification.interactive.explanation import EXPLAINED, FURTHER
+from palpate.identification.interactive.explanation import EXPLAINED, FURTHER, missed_by
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, STILLER, hang
 from palpate.identification.interactive.refinement import SURPRISE, surprise
@@ -45,13 +45,13 @@ def reconsider(twin: Twin) -> Twin:
 
 def _with_what_was_known(twin: Twin) -> Twin:
     """The twin, or what was believed before something no longer held, if that explains more."""
-    best = twin
-    for known in twin.earlier:
-        if len(known.parts) + FEWER >= len(twin.parts) and not twin.adds_to(known):
-            other = take_further(known, twin)
-            if other.explained() > best.explained() + CLEARER:
-                best = other
-    return best if best is twin else _fitted(best)
+    others = [
+        take_further(known, twin)
+        for known in twin.earlier
+        if len(known.parts) + FEWER >= len(twin.parts) and not twin.adds_to(known)
+    ]
+    best = max(others, key=Twin.explained, default=twin)
+    return _fitted(best) if best.explained() > twin.explained() + CLEARER else twin
 
 
 def take_further(known: Twin, twin: Twin) -> Twin:
@@ -61,8 +61,8 @@ def take_further(known: Twin, twin: Twin) -> Twin:
     for look in twin.looks[len(other.looks) :]:
         other.add_look(look)
         other.relabel(len(other.looks) - 1)
-    for look in range(len(known.looks)):
-        other.relabel(look)  # those that came after tell of them, too
+    for look in range(len(other.looks)):
+        other.relabel(look)  # those that came after tell of it, too
     other.handled = list(twin.handled)
     for number in range(len(known.held), len(twin.held)):
         before, handling = twin.held[number][1], twin.handled[number]
@@ -109,14 +109,10 @@ def _part_that_went(twin: Twin, before: int, handling: Handling) -> int:
     if not handling.moved:
         nearest = twin.looks[before].tree.query(handling.push.point)[1]
         return int(twin.labels[before][nearest])
-    start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
-    missed = [
-        float(np.linalg.norm(twin.motion(part, before, before + 1).at(start[None])[0] - end))
-        for part in range(len(twin.parts))
-    ]
-    if not missed or min(missed) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
+    missed = missed_by(twin, before, before + 1, handling)
+    if not missed or min(missed.values()) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
         return -1
-    return int(np.argmin(missed))
+    return min(missed, key=missed.__getitem__)
 
 
 def correct_parents(twin: Twin) -> Twin:
@@ -215,4 +211,5 @@ def _in_order_of(other: Twin, twin: Twin) -> Twin:
     held = [part for part, _ in reversed(other.held)]
     other.held = [(part, before) for part, (_, before) in zip(held, twin.held, strict=True)]
     other.looks, other.handled = list(twin.looks), list(twin.handled)
+    other.earlier = []  # of looks in the other order
     return other

@@ -26,7 +26,7 @@ def interact(
     world: ApplianceWorld, choose: Choice, pushes: int, seed: int, longest: float = LONGEST
 ) -> Iterator[Step]:
     """Look; then choose a push, do it for `longest` s at most and explain what happened, again and
-    again; in the end all at once, if a pull is not explained."""
+    again; in the end all at once."""
     random = np.random.default_rng([seed, 7])
     twin = Twin()
     began = time.perf_counter()

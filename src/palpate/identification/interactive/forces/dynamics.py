@@ -151,7 +151,7 @@ def dynamics_of(twin: Twin) -> Dynamics:
 
     What happens at the end of a joint, where a stop pushes, is left out; so is the reach of a latch
     that is found, but not of the regression, which would lose a part's first and best moments. A
-    joint ends where a stop has held it against a hand, and else nowhere.
+    joint ends where a stop has held it against a hand or, if no hand felt it, against its weight.
     Raises `PalpateError` where no such action is left.
     """
     tree = assemble(describe(twin, "twin"))
@@ -164,8 +164,9 @@ def dynamics_of(twin: Twin) -> Dynamics:
                if part >= 0 and twin.handled[number].moved]  # fmt: skip
     actions = [one for one in actions if one.alone]
     found = [_felt([one for one in actions if one.part == part], links, parts) for part in parts]
+    weighed = [_weighed(link, one.resistance) for link, one in zip(links, found, strict=True)]
     found = [
-        _unfelt(twin, part, links, parts) if one.resistance is None else one
+        _unfelt(twin, part, weighed, parts) if one.resistance is None else one
         for part, one in zip(parts, found, strict=True)
     ]
     resistance = [one.resistance for one in found]
@@ -202,24 +203,35 @@ class _Felt(NamedTuple):
     guess: Resistance = UNKNOWN
 
 
+def _weighed(link: Link, known: Resistance | None) -> Link:
+    """A link with the mass that was felt, and where that is."""
+    if known is None:
+        return link
+    centre = np.asarray(link.centre_of_mass) + np.array(known.offset)
+    return dataclasses.replace(link, mass=link.mass * known.mass_share, centre_of_mass=centre)
+
+
 def _unfelt(twin: Twin, part: int, links: list[Link], parts: list[int]) -> _Felt:
     """Of a joint at which no hand felt anything: where the part was seen to rest, friction holds
     its weight, or a stop if that is an end of what was seen of its range."""
-    one, friction = twin.parts[part], UNKNOWN.friction
+    one, held = twin.parts[part], [before + 1 for _, before in twin.held]
     (low, high), margin = one.range, END[one.screw.joint]
-    lower, upper = -math.inf, math.inf
-    held = [before + 1 for _, before in twin.held]  # looks in which a hand still holds something
-    for look in range(len(twin.looks)):
-        if look in held:
-            continue
-        place, weight = one.positions[look], weight_at(twin, part, look, links, parts)
-        if place > high - margin and weight > friction:
-            upper = high
-        elif place < low + margin and -weight > friction:
-            lower = low
-        else:
-            friction = max(friction, abs(weight))
-    return _Felt(lower=lower, upper=upper, guess=UNKNOWN._replace(friction=friction))
+    rests = [
+        (one.positions[look], weight_at(twin, part, look, links, parts))
+        for look in range(len(twin.looks))
+        if look not in held  # by a hand, that or another part
+    ]
+    upper = [place > high - margin and weight > 0.0 for place, weight in rests]
+    lower = [place < low + margin and weight < 0.0 for place, weight in rests]
+    free = [abs(weight) for (_, weight), *at_end in zip(rests, upper, lower, strict=True)
+            if not any(at_end)]  # fmt: skip
+    friction = max([UNKNOWN.friction, *free])
+    stopped = [abs(weight) > friction for _, weight in rests]
+    return _Felt(
+        lower=low if np.any(np.logical_and(stopped, lower)) else -math.inf,
+        upper=high if np.any(np.logical_and(stopped, upper)) else math.inf,
+        guess=UNKNOWN._replace(friction=friction),
+    )
 
 
 def _felt(actions: list[Action], links: list[Link], parts: list[int]) -> _Felt:

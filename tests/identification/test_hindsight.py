@@ -6,7 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from palpate.identification.interactive import account, hindsight
+from palpate.identification.interactive import hindsight
+from palpate.identification.interactive import twin as beliefs
 from palpate.identification.interactive.hindsight import (
     correct_parents,
     drop_needless,
@@ -71,7 +72,7 @@ def test_an_account_backwards_is_of_the_same_looks_and_pulls(room, twin) -> None
 def test_nothing_is_reconsidered_where_all_pulls_are_explained(twin, monkeypatch) -> None:
     assert [part for part, _ in twin.held] == [0, 1]
     assert reconsider(twin) is twin
-    monkeypatch.setattr(account, "OF_PART", 0.1)  # many parts, as a cabinet has, are no reason to
+    monkeypatch.setattr(beliefs, "OF_PART", 0.1)  # many parts, as a cabinet has, are no reason to
     monkeypatch.setattr(hindsight, "explain_backwards", lambda _: pytest.fail("it was tried"))
     assert reconsider(twin) is twin
 
@@ -118,13 +119,13 @@ def test_what_explains_less_is_not_believed(twin, monkeypatch) -> None:
         first.look(look)
     whole = twin.explained()
     twin.held[0] = -1, twin.held[0][1]
-    assert twin.explained() == pytest.approx(whole - 0.5 * account.OF_PULLS, abs=1e-9)
+    assert twin.explained() == pytest.approx(whole - 0.5 * beliefs.OF_PULLS, abs=1e-9)
     monkeypatch.setattr(hindsight, "explain_backwards", lambda _: first)
     assert reconsider(twin) is twin
     # a part that explains nothing costs
     alone = twin.explained()
     twin.parts.append(twin.parts[1])
-    assert twin.explained() == pytest.approx(alone - account.OF_PART, abs=1e-9)
+    assert twin.explained() == pytest.approx(alone - beliefs.OF_PART, abs=1e-9)
     other = drop_needless(twin)
     assert len(other.parts) == 2
     assert other.explained() == pytest.approx(alone, abs=1e-9)

@@ -14,7 +14,6 @@ import dataclasses
 
 import numpy as np
 
-from palpate.identification.interactive.account import evidence_of_looks
 from palpate.identification.interactive.explanation import EXPLAINED, FURTHER, missed_by
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, STILLER, hang
@@ -37,7 +36,7 @@ def reconsider(twin: Twin) -> Twin:
     pulls are explained, and nearly all that was seen.
     """
     twin = drop_needless(_with_what_was_known(correct_parents(twin)))
-    if evidence_of_looks(twin) > ENOUGH and not twin.share_unexplained:
+    if twin.evidence_of_looks() > ENOUGH and not twin.share_unexplained:
         return twin
     other = drop_needless(correct_parents(explain_backwards(twin)))
     return other if other.explained() > twin.explained() + BETTER else twin

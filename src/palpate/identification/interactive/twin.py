@@ -10,7 +10,6 @@ import dataclasses
 
 import numpy as np
 
-from palpate.identification.interactive.account import explained
 from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
 from palpate.identification.interactive.explanation import (
@@ -23,6 +22,7 @@ from palpate.identification.interactive.explanation import (
 )
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, find_beside, reparent
+from palpate.identification.interactive.labels import scores
 from palpate.identification.interactive.part import KNOWN, UNSURE, Part
 from palpate.identification.interactive.screws import Screw, screws_of_way
 from palpate.identification.interactive.splitting import split, split_off_base
@@ -30,6 +30,11 @@ from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.identification.interactive.ways import is_of_two_ends, misfit
 from palpate.perception.clouds import Cloud
 
+POINTS = 100  # of each look by which it is told how much is explained, about
+# of evidence, for each point: what is hidden where it has gone is nearly as likely as what is seen
+# there, as a part that opens hides much and bares more
+CONCEALED = 0.6
+OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
 ELSEWHERE = 5.0, 0.05  # deg and m between two joints that nobody would take for one
 ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known
 
@@ -69,8 +74,25 @@ class Twin(PartTree):
         return float(np.mean(np.array(held) < 0)) if held else 0.0
 
     def explained(self) -> float:
-        """How much of what was seen is explained, see `account`."""
-        return explained(self, self.share_unexplained)
+        """The evidence of all looks, less what parts and unexplained pulls cost."""
+        cost = OF_PART * len(self.parts) + OF_PULLS * self.share_unexplained
+        return self.evidence_of_looks() - cost
+
+    def evidence_of_looks(self) -> float:
+        """How much likelier the likeliest label of a point makes another look (logarithm), the mean
+        of points and pairs of looks."""
+        found = []
+        for look, cloud in enumerate(self.looks):
+            others = [other for other in range(len(self.looks)) if other != look]
+            motions = [
+                [self.motion(part, look, other) for other in others]
+                for part in range(-1, len(self.parts))
+            ]
+            step = max(1, len(cloud.points) // POINTS)
+            seen = [self.looks[other] for other in others]
+            best = scores(cloud, seen, motions, step, hidden=CONCEALED).max(axis=0)
+            found.append(float(best.mean()) / max(len(others), 1))
+        return float(np.mean(found))
 
     def observe(self, handling: Handling) -> None:
         """Explain what was seen and felt."""

@@ -86,11 +86,17 @@ class Visibility:
         self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
     ) -> Bool[np.ndarray, " n"]:
         """Whether a camera that a surface would have faced at a point saw nothing around there."""
+        found = np.zeros(len(points), bool)
+        if not self._blank.any():
+            return found
         local = self._turned(points) - self._shift
         inside, pixel = self._pixels(local, self._cameras)
-        along = np.sum(local * self._turned(normals), axis=0)
+        view, some = np.nonzero(inside & self._blank[pixel])
+        local, out = local[:, view, some], np.vecdot(self._turn[:, view], normals[some])
+        along = np.sum(local * out, axis=0)
         facing = along < -FACING * np.sqrt(np.sum(local * local, axis=0))
-        return np.any(inside & facing & self._blank[pixel], axis=0)
+        found[some[facing]] = True
+        return found
 
     def _surfaces(
         self,

@@ -157,6 +157,60 @@ def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(room, monkeypatch
     assert sign * part.positions[look] == pytest.approx(0.9, abs=0.05)
 
 
+def test_where_a_part_never_was_it_is_if_it_is_clearly_nowhere_else(room, monkeypatch) -> None:
+    twin = known_door(room)
+    part = twin.parts[0]
+    sign = np.sign(part.positions[-1])
+    look = len(twin.looks) - 1
+
+    def seen_at(part, look, positions, others=None, fewest=None):
+        """Edge-on at -0.9, and in the open everywhere else."""
+        return np.where(np.abs(sign * positions - 0.9) < 0.1, -0.4, -2.9)
+
+    monkeypatch.setattr(twin, "seen_at", seen_at)
+    twin.find(0, look)
+    assert sign * part.positions[look] == pytest.approx(0.9, abs=0.11)
+
+
+@pytest.mark.parametrize("slope", [-0.1, 0.1])
+def test_where_looks_hardly_tell_a_part_is_where_the_hand_took_it(room, monkeypatch, slope) -> None:
+    twin = known_door(room)
+    look = len(twin.looks) - 1
+
+    def seen_at(part, look, positions, others=None, fewest=None):
+        return 0.8 + slope * positions
+
+    monkeypatch.setattr(twin, "seen_at", seen_at)
+    monkeypatch.setattr(twin, "_align", lambda *given: None)
+    twin.find(0, look, around=0.2)
+    assert twin.parts[0].positions[look] == pytest.approx(0.2)
+
+
+def test_where_a_part_began_is_told_by_both_looks_and_the_hand_together(room, monkeypatch) -> None:
+    twin, notes = known_door(room), Notes()
+    part = twin.parts[0]
+    sign = np.sign(part.positions[-1])
+    room.at(-0.75, 0.0)
+    twin.look(room.look())
+    notes.look(twin.looks[-1])
+    room.pull(notes, DOOR, (-0.75, 0.0), (-0.3, 0.0))
+    (handling,) = notes.handled
+    before = len(twin.looks) - 1
+    after = twin.add_look(handling.after)
+    part.positions[before] = part.positions[after] = sign * 0.6
+
+    def seen_at(part, look, positions, others=None, fewest=None):
+        """Each look by itself leaves open where it is within half a radian."""
+        middle = 0.95 if look == before else 0.1
+        return 0.8 - np.maximum(4.0 * (np.abs(sign * positions - middle) - 0.2), 0.0)
+
+    monkeypatch.setattr(twin, "seen_at", seen_at)
+    monkeypatch.setattr(twin, "_align", lambda *given: None)
+    assert find_moved_part(twin, before, after, handling) == 0
+    places = sign * np.array(part.positions)[[before, after]]
+    assert places == pytest.approx([0.75, 0.3], abs=0.05)
+
+
 def test_where_a_hand_takes_a_part_from_corrects_where_it_was_believed_to_be(room) -> None:
     twin, notes = known_door(room), Notes()
     part = twin.parts[0]

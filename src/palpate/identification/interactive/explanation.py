@@ -16,6 +16,7 @@ from palpate.identification.interactive.ways import MOMENTS, Way, misfit
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 FURTHER = 1.5  # rad or m that a part may have been beyond where it was seen
+NEAR = 0.5  # the same, of one that a hand takes
 MISFIT = 1.1  # of each of a hand's ways, for the joint that they say is theirs: at most .91 of 85
 SHORT = 0.05  # m that a hand went: a way so short fits many joints
 TOGETHER = 0.02  # of the travel: how far two joints may miss the hand, beside the metres below
@@ -98,39 +99,52 @@ def _by_way(tree: PartTree, before: int, after: int, handling: Handling) -> int:
 def _follows_hand(tree: PartTree, part: int, before: int, after: int, handling: Handling) -> bool:
     """Whether a look shows a part where a hand has taken it, and nothing else has moved.
 
-    It is there from now on, or where it was found without the hand. Where the hand says that it
-    began elsewhere than was believed, and it is seen better there, it did. If not, nothing changes.
+    It is there from now on, and was before where both looks show it best. If not, nothing changes.
     """
     screw, one, labels = tree.screw(part, before), tree.parts[part], tree.labels[before]
-    start, alone = handling.points[:3].mean(axis=0), one.positions[after]
+    start, kept = handling.points[:3].mean(axis=0), (one.positions[before], one.positions[after])
     gone = float(screw.position_of(start, handling.points)[-3:].mean())
-    around = one.positions[before] + gone
-    tree.find(part, after, around, tree.points_of_others(part, after, before))
-    missed = abs(one.positions[after] - one.positions[before] - gone)
-    arm = float(np.linalg.norm(screw.velocity(start)))
-    began, moved_back = one.positions[before], alone - gone
-    if missed * arm > EXPLAINED[0] and _may_have_been(tree, part, before, moved_back, start):
-        one.positions[before], one.positions[after], missed = moved_back, alone, 0.0
+    began = _began_at(tree, part, before, gone, start)
+    if began != one.positions[before]:
+        one.positions[before] = began
         tree.relabel(before)
+    tree.find(part, after, began + gone, tree.points_of_others(part, after, before))
+    missed = abs(one.positions[after] - began - gone) * np.linalg.norm(screw.velocity(start))
     own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
-    if missed * arm < EXPLAINED[0] + 2.0 * EXPLAINED[1] * handling.travel and not any(
+    if missed < EXPLAINED[0] + 2.0 * EXPLAINED[1] * handling.travel and not any(
         tree.much_is_left(candidate, look, own) for look in (before, after)
     ):
         return True
-    one.positions[before], one.positions[after] = began, alone
+    one.positions[before], one.positions[after] = kept
     tree.put_labels(before, labels)
     return False
 
 
-def _may_have_been(
-    tree: PartTree, part: int, look: int, position: float, hand: Float[np.ndarray, "3"]
-) -> bool:
-    """Whether a part may have been at another position (rad or m) in a look than was believed: at
-    the hand (m), and seen better there."""
+def _began_at(
+    tree: PartTree, part: int, before: int, gone: float, hand: Float[np.ndarray, "3"]
+) -> float:
+    """Where a part was when a hand took it (m) and it went so far (rad or m): where it was believed
+    to be, unless it is clearly better seen at the hand before, and so far from there after.
+
+    Of a sheet that slides each look by itself leaves open where it is.
+    """
     one = tree.parts[part]
-    there, here = tree.seen_at(part, look, np.array([position, one.positions[look]]))
-    points = tree.pose(one.parent, look).at(one.screw.pose(position).at(one.support[0]))
-    return bool(there > here and np.linalg.norm(points - hand, axis=1).min() < BESIDE)
+    low, high = one.range
+    step = 0.04 if one.screw.joint == "revolute" else 0.01
+    tried = np.array([one.positions[before], *np.arange(low - NEAR, high + NEAR, step)])
+    pose = tree.pose(one.parent, before)
+    at_hand = [
+        np.linalg.norm(
+            (pose @ one.screw.pose(float(place))).at(one.support[0]) - hand, axis=1
+        ).min()
+        < BESIDE
+        for place in tried
+    ]
+    at_hand[0] = True
+    seen = tree.seen_at(part, before, tried) + tree.seen_at(part, before + 1, tried + gone)
+    seen[~np.array(at_hand)] = -np.inf
+    seen[0] += NOT_MOVED
+    return float(tried[seen.argmax()])
 
 
 def _by_two_joints(tree: PartTree, before: int, after: int, handling: Handling) -> int:

@@ -49,7 +49,7 @@ ALONG_NORMALS = 0.2  # least share of its squared motion that is along normals: 
 FARTHEST = 0.15  # rad or m that it is moved so
 # points that say well enough about where a part is, and where exactly, before all say whether
 ROUGHLY, FINELY = 60, 200
-CLEARLY = 0.12  # as `NOT_MOVED`: of a new part, which is moved so
+CLEARLY = 0.12  # as `NOT_MOVED`: of a new part, and beside where a hand says that one is
 # of evidence, and as `NOT_MOVED`: of a position in which hardly anything of it is seen
 UNSEEN, NOT_HIDDEN = -0.35, 1.5
 HAND_TELLS = 0.5  # of evidence, for each point: how much worse one may be that a hand's way says
@@ -119,10 +119,11 @@ class PartTree(Kinematics):
 
         Returns the evidence of the look, for each point, for the likeliest position that was tried.
 
-        `around` is where a hand has taken it: there it is, unless it clearly has not moved. What
-        closes flush with another surface is as well seen where it was, when it has gone. Points
-        of `others` are not the part's, wherever it is. It is sought `beyond` (rad or m) where it
-        was seen, less by default, or no further than it `creeps` by itself.
+        `around` is where a hand has taken it: there it is, or clearly better seen near it, unless
+        it clearly has not moved. What closes flush with another surface is as well seen where it
+        was, when it has gone. Points of `others` are not the part's, wherever it is. It is sought
+        `beyond` (rad or m) where it was seen, less by default, or no further than it `creeps` by
+        itself.
 
         The joint of a `new` part may be a little wrong, so that its points meet something a little
         elsewhere: it is where it was, unless clearly more of it is seen there.
@@ -140,12 +141,16 @@ class PartTree(Kinematics):
         seen = self.seen_at(part, look, tried, others, ROUGHLY)
         if around is None:  # where it never was, it is only if it is seen there
             strange = (tried < one.range[0] - step) | (tried > one.range[1] + step)
-            seen[strange & (seen < 0.0)] = -np.inf
+            least = min(0.0, seen[~strange].max() + NOT_HIDDEN)  # or it is clearly nowhere else
+            seen[strange & (seen < least)] = -np.inf
         best = tried[seen.argmax()]
         for _ in range(2):
             tried = np.linspace(best - step, best + step, 7)
             best = tried[self.seen_at(part, look, tried, others, FINELY).argmax()]
             step /= 3.0
+        if around is not None:
+            there, here = self.seen_at(part, look, np.array([best, around]), others)
+            best = best if there > here + CLEARLY else around
         there, here = self.seen_at(part, look, np.array([best, last]), others)
         ahead = NOT_MOVED if there > UNSEEN else NOT_HIDDEN
         if around is not None:

@@ -139,3 +139,11 @@ def test_what_takes_half_of_a_force_moves_half_as_easily_and_withstands_half():
     whole = posterior(certain(1), FRONT, [Pull(LEFT_EDGE, OUT, False, 0.0, True)])
     carried = posterior(certain(1), FRONT, [Pull(LEFT_EDGE, OUT, False, 0.0, True, 0.5)])
     assert chance(whole, LEFT_EDGE, OUT) == 0.0 < chance(carried, LEFT_EDGE, OUT)
+
+
+def test_where_all_corners_stand_still_a_leaf_between_posts_is_tried():
+    corners = [np.array([0.0, y, z]) for y in (-0.29, 0.29) for z in (-0.19, 0.19)]
+    pulls = [Pull(corner, OUT, moved=False, travel=0.0, ended=False) for corner in corners]
+    after = posterior(prior(0.9, FRONT), FRONT, pulls)
+    inner, outer = np.array([0.0, 0.17, 0.0]), np.array([0.0, 0.29, 0.0])
+    assert chance(after, inner, OUT) > 0.1 > chance(after, outer, OUT)

@@ -157,19 +157,22 @@ def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(room, monkeypatch
     assert sign * part.positions[look] == pytest.approx(0.9, abs=0.05)
 
 
-def test_where_a_part_never_was_it_is_if_it_is_clearly_nowhere_else(room, monkeypatch) -> None:
+@pytest.mark.parametrize(("there", "place"), [(-0.3, 0.9), (-0.4, 0.5)])
+def test_where_a_part_never_was_it_is_if_a_little_is_seen_there_and_it_is_nowhere_else(
+    room, monkeypatch, there, place
+) -> None:
     twin = known_door(room)
     part = twin.parts[0]
     sign = np.sign(part.positions[-1])
     look = len(twin.looks) - 1
 
     def seen_at(part, look, positions, others=None, fewest=None):
-        """Edge-on at -0.9, and in the open everywhere else."""
-        return np.where(np.abs(sign * positions - 0.9) < 0.1, -0.4, -2.9)
+        """Edge-on at -0.9, or hidden there, and in the open everywhere else."""
+        return np.where(np.abs(sign * positions - 0.9) < 0.1, there, -2.9)
 
     monkeypatch.setattr(twin, "seen_at", seen_at)
     twin.find(0, look)
-    assert sign * part.positions[look] == pytest.approx(0.9, abs=0.11)
+    assert sign * part.positions[look] == pytest.approx(place, abs=0.11)
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.1])

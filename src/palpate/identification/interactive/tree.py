@@ -141,7 +141,8 @@ class PartTree(Kinematics):
         seen = self.seen_at(part, look, tried, others, ROUGHLY)
         if around is None:  # where it never was, it is only if it is seen there
             strange = (tried < one.range[0] - step) | (tried > one.range[1] + step)
-            least = min(0.0, seen[~strange].max() + NOT_HIDDEN)  # or it is clearly nowhere else
+            # or a little of it, and it is clearly nowhere else
+            least = min(0.0, max(seen[~strange].max() + NOT_HIDDEN, UNSEEN))
             seen[strange & (seen < least)] = -np.inf
         best = tried[seen.argmax()]
         for _ in range(2):

@@ -73,3 +73,13 @@ def test_a_varied_screw_is_turned_and_moved_by_as_much():
     varied = HINGE.varied(by)
     assert math.acos(varied.axis @ HINGE.axis) == pytest.approx(math.hypot(0.01, 0.02), rel=1e-3)
     assert np.linalg.norm(varied.point - HINGE.point) == pytest.approx(0.05)
+
+
+def test_axes_are_as_far_apart_as_their_lines_whichever_way_they_point() -> None:
+    upright = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    tilt = math.radians(30.0)
+    other = Screw(
+        "revolute", -np.array([0.0, math.sin(tilt), math.cos(tilt)]), np.array([0.3, 0.4, 7.0])
+    )
+    assert upright.distance_to(other) == pytest.approx((30.0, 0.5))
+    assert upright.distance_to(upright) == (0.0, 0.0)

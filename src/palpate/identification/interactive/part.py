@@ -114,7 +114,6 @@ def support_of(
 def is_same_hinge(hinge: Screw, other: Screw, turned: float = 0.0, aside: float = 0.0) -> bool:
     """Whether another joint turns about the same line as a hinge, as well as edges are known, or
     less well by as much as the other is `turned` (deg) and `aside` (m)."""
-    away = np.linalg.norm(np.cross(hinge.point - other.point, other.axis))
-    angle = np.degrees(np.arccos(min(abs(float(hinge.axis @ other.axis)), 1.0)))
+    angle, away = other.distance_to(hinge)
     alike = angle < min(np.degrees(np.arccos(LIKE)) + turned, UNSURE)
     return other.joint == "revolute" and bool(alike and away < HINGE + aside)

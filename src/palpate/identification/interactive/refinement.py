@@ -80,13 +80,9 @@ class Estimate:
         """Whether a joint of its kind is too far away to be the same; of another it cannot say."""
         if screw.joint != self.screw.joint:
             return False
-        sine = float(np.linalg.norm(np.cross(self.screw.axis, screw.axis)))
-        aside = float(np.linalg.norm(np.cross(screw.point - self.screw.point, self.screw.axis)))
-        turned, away = self.intervals
-        slides = screw.joint == "prismatic"
-        return math.degrees(math.asin(min(sine, 1.0))) > REFUTED * turned or (
-            aside > REFUTED * away and not slides
-        )
+        turned, aside = self.screw.distance_to(screw)
+        most, away = REFUTED * np.array(self.intervals)
+        return bool(turned > most or (aside > away and screw.joint == "revolute"))
 
 
 def sighting(cloud: Cloud, chosen: Int[np.ndarray, " n"], back: Pose) -> Sighting:

@@ -107,6 +107,13 @@ class Screw:
         point = self.point + by[2] * first + by[3] * second
         return dataclasses.replace(self, axis=axis / np.linalg.norm(axis), point=point)
 
+    def distance_to(self, other: "Screw") -> tuple[float, float]:
+        """Degrees between its axis and another one, whichever way they point, and how far (m) from
+        its axis the other's point is."""
+        sine = float(np.linalg.norm(np.cross(self.axis, other.axis)))
+        aside = float(np.linalg.norm(np.cross(other.point - self.point, self.axis)))
+        return math.degrees(math.asin(min(sine, 1.0))), aside
+
     def near(self, place: Float[np.ndarray, "3"]) -> "Screw":
         """The same, with the point of its axis that is nearest to a place."""
         along = float((place - self.point) @ self.axis)

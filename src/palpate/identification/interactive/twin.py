@@ -328,8 +328,5 @@ class Twin(PartTree):
 
 def _is_elsewhere(screw: Screw, other: Screw) -> bool:
     """Whether two joints of one kind are clearly not the same one."""
-    turned = float(
-        np.degrees(np.arcsin(min(np.linalg.norm(np.cross(screw.axis, other.axis)), 1.0)))
-    )
-    aside = float(np.linalg.norm(np.cross(screw.point - other.point, other.axis)))
+    turned, aside = other.distance_to(screw)
     return turned > ELSEWHERE[0] or (aside > ELSEWHERE[1] and screw.joint == "revolute")

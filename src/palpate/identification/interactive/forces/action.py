@@ -153,8 +153,7 @@ class Action:
             if other != self.part and self.part not in twin.carriers(other):
                 continue
             pose = twin.pose(other, self.before)
-            own = twin.parts[other].screw.point + np.asarray(link.centre_of_mass)
-            centre = pose.at(own[None])[0]
+            centre = centre_of_mass(twin, other, self.before, link)
             arm = screw.velocity(centre)
             inertia += link.mass * float(arm @ arm)
             mass += link.mass
@@ -215,10 +214,15 @@ def weight_at(twin: Twin, part: int, look: int, links: list[Link], parts: list[i
     level = dataclasses.replace(screw, axis=axis_by_gravity(twin, part, screw.axis))
     for link, other in zip(links, parts, strict=True):
         if other == part or part in twin.carriers(other):
-            own = twin.parts[other].screw.point + np.asarray(link.centre_of_mass)
-            centre = twin.pose(other, look).at(own[None])
-            found += link.mass * float(level.velocity(centre)[0] @ np.array(GRAVITY))
+            velocity = level.velocity(centre_of_mass(twin, other, look, link))
+            found += link.mass * float(velocity @ np.array(GRAVITY))
     return found
+
+
+def centre_of_mass(twin: Twin, part: int, look: int, link: Link) -> Float[np.ndarray, "3"]:
+    """Where a part's centre of mass is in a look (m), by its link."""
+    own = twin.parts[part].screw.point + np.asarray(link.centre_of_mass)
+    return twin.pose(part, look).at(own[None])[0]
 
 
 def axis_by_gravity(twin: Twin, part: int, axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

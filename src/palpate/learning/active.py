@@ -36,7 +36,9 @@ from palpate.perception.clouds import Cloud
 from palpate.perception.surface_features import features_of
 from palpate.perception.surfaces import STANDS_OFF, Surface, surfaces
 
-JOINT = 25.0  # nats that a joint is worth which was not known
+# Nats that a joint is worth which was not known. Of 8 looked-at appliances with a part left over 4
+# were found whole with this, and none with 15, as known parts were pulled once more instead.
+JOINT = 25.0
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
 # What is left where a hand took something that no joint explained, within as many m.
 TRIED_BEFORE, NEAR_IT = 0.4, 0.15

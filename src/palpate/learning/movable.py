@@ -22,6 +22,7 @@ JOINTS = 7
 LEVER, LEAST_LEVER = 2.0, 0.1
 # Pieces of a surface, from one share of a side of its rectangle to another, and how many parts are
 # such a piece along either side; the others are all of their surface, 130 of 200 generated ones.
+# The last is a leaf between its posts; how those below .5 share what is left is not measured.
 SPANS = {(0.0, 0.5): 0.045, (0.5, 1.0): 0.045}
 SPANS |= dict.fromkeys([(0.0, 0.25), (0.75, 1.0), (0.0, 0.75), (0.25, 1.0), (0.15, 0.85)], 0.018)
 ALL = (0.0, 1.0)

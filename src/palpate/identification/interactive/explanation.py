@@ -133,17 +133,12 @@ def _began_at(
     step = 0.04 if one.screw.joint == "revolute" else 0.01
     tried = np.array([one.positions[before], *np.arange(low - NEAR, high + NEAR, step)])
     pose = tree.pose(one.parent, before)
-    at_hand = [
-        np.linalg.norm(
-            (pose @ one.screw.pose(float(place))).at(one.support[0]) - hand, axis=1
-        ).min()
-        < BESIDE
-        for place in tried
-    ]
-    at_hand[0] = True
+    points = [(pose @ one.screw.pose(float(place))).at(one.support[0]) for place in tried]
+    away = np.array([np.linalg.norm(each - hand, axis=1).min() for each in points])
     seen = tree.seen_at(part, before, tried) + tree.seen_at(part, before + 1, tried + gone)
-    seen[~np.array(at_hand)] = -np.inf
-    seen[0] += NOT_MOVED
+    believed = seen[0] + NOT_MOVED
+    seen[away >= BESIDE] = -np.inf
+    seen[0] = believed
     return float(tried[seen.argmax()])
 
 

@@ -115,7 +115,8 @@ class PartTree(Kinematics):
         new: bool = False,
     ) -> float:
         """Where a part is in a look: where it was, unless another position is clearly better, and
-        there where its points meet what was seen. Where it never was it is only if it is seen.
+        there where its points meet what was seen. Where it never was it is only if it is seen, or
+        a little of it and it is clearly nowhere else.
 
         Returns the evidence of the look, for each point, for the likeliest position that was tried.
 
@@ -139,9 +140,8 @@ class PartTree(Kinematics):
             low, high = around - turn, around + turn
         tried = np.arange(low, high, step)
         seen = self.seen_at(part, look, tried, others, ROUGHLY)
-        if around is None:  # where it never was, it is only if it is seen there
+        if around is None:
             strange = (tried < one.range[0] - step) | (tried > one.range[1] + step)
-            # or a little of it, and it is clearly nowhere else
             least = min(0.0, max(seen[~strange].max() + NOT_HIDDEN, UNSEEN))
             seen[strange & (seen < least)] = -np.inf
         best = tried[seen.argmax()]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.numerics.pinhole import DepthImage, Pinhole
-from palpate.perception.clouds import Cloud, cloud_of
+from palpate.perception.clouds import Cloud, cloud_of, extent_of
 from palpate.perception.surface_features import FEATURES, features_of
 from palpate.perception.surfaces import surfaces
 from palpate.worlds.depth import DepthSensor, depth_image
@@ -93,7 +93,30 @@ def test_features_tell_a_board_that_stands_free_from_a_wall(cloud):
     assert board["height"] > wall["height"]
     assert board["fills its rectangle"] > 0.7
     assert abs(board["faces up"]) < 0.05
-    assert board["on a part"] == board["largest of its part"] == 0.0
+    of_parts = ("on a part", "largest of its part", "of its part", "turned against its part")
+    assert all(board[name] == 0.0 for name in (*of_parts, "before its part"))
+
+
+def test_of_a_part_features_tell_what_is_not_in_line_with_its_largest_surface(cloud):
+    board, wall = found_at(cloud, 0.3), found_at(cloud, 0.0)
+    cosine, sine = math.cos(0.3), math.sin(0.3)
+    ajar = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    every = [
+        dataclasses.replace(wall, part=0),
+        dataclasses.replace(board, part=0, normal=ajar @ board.normal),
+        dataclasses.replace(board, part=1),
+    ]
+    largest, flap, other = (
+        dict(zip(FEATURES, row, strict=True)) for row in features_of(cloud, every)
+    )
+    assert largest["of its part"] == other["of its part"] == 1.0
+    assert largest["turned against its part"] == other["turned against its part"] == 0.0
+    assert largest["before its part"] == other["before its part"] == 0.0
+    assert flap["of its part"] == pytest.approx(board.area / wall.area)
+    assert flap["turned against its part"] == pytest.approx(0.3, abs=0.03)
+    away, extent = float((board.centre - wall.centre) @ wall.normal), extent_of(cloud.points)
+    assert away == pytest.approx(0.3, abs=0.02)
+    assert flap["before its part"] == pytest.approx(away / extent)
 
 
 def test_what_is_turned_stands_off_the_axes_of_its_scene_wherever_that_is_turned(cloud):

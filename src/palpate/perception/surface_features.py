@@ -44,6 +44,9 @@ FEATURES = (
     "out of the middle",  # along its normal
     "on a part",  # that is known
     "largest of its part",
+    "of its part",  # share of the area of the largest
+    "turned against its part",  # rad, from the largest
+    "before its part",  # along the normal of the largest
     "stands off what is around it",  # from -1 to 1
 )
 
@@ -61,7 +64,8 @@ def features_of(cloud: Cloud, every: Sequence[Surface]) -> Float[np.ndarray, "su
     for one in every:
         toward, away = cameras - one.centre, one.centre - middle
         size = np.maximum(one.high - one.low, LEAST)
-        largest = one.part >= 0 and one.area >= areas[parts == one.part].max()
+        largest = every[int(np.argmax(np.where(parts == one.part, areas, 0.0)))]
+        turned = math.acos(float(np.clip(one.normal @ largest.normal, -1.0, 1.0)))
         found.append([
             one.normal @ toward / np.linalg.norm(toward),
             *_surroundings(cloud, one),
@@ -76,7 +80,10 @@ def features_of(cloud: Cloud, every: Sequence[Surface]) -> Float[np.ndarray, "su
             one.area / np.prod(size),
             away @ one.normal / extent,
             float(one.part >= 0),
-            float(largest),
+            float(one.part >= 0 and one is largest),
+            one.area / largest.area if one.part >= 0 else 0.0,
+            turned if one.part >= 0 else 0.0,
+            (one.centre - largest.centre) @ largest.normal / extent if one.part >= 0 else 0.0,
             _step_around(cloud, one),
         ])  # fmt: skip
     return np.array(found)

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from depth_scenes import depth_of
-from palpate.identification.interactive import splitting
 from palpate.identification.interactive import twin as twin_module
+from palpate.identification.interactive.edges import splitting
+from palpate.identification.interactive.edges.splitting import split
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.labels import prior, scores, smooth_labels
 from palpate.identification.interactive.part import Part
 from palpate.identification.interactive.refinement import refine
 from palpate.identification.interactive.screws import NOWHERE, Screw
-from palpate.identification.interactive.splitting import split
 from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import Pinhole
@@ -77,6 +77,7 @@ def room() -> Room:
 
 def test_a_way_of_two_unknown_joints_is_no_part_by_itself(room, monkeypatch) -> None:
     monkeypatch.setattr(twin_module, "split_off_base", lambda *_: False)
+    monkeypatch.setattr(twin_module, "discover_pair", lambda *_: -1)
     twin = Twin()
     room.at(0.0, 0.0)
     twin.look(room.look())

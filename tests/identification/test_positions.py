@@ -5,6 +5,7 @@ import pytest
 
 from palpate.identification.interactive import explanation
 from palpate.identification.interactive import twin as twin_module
+from palpate.identification.interactive.edges import folding
 from palpate.identification.interactive.explanation import find_moved_part
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.twin import Twin
@@ -112,7 +113,8 @@ def test_a_new_part_that_explains_nothing_leaves_all_as_it_was(room, monkeypatch
     twin = Twin()
     room.at(0.0, 0.0)
     twin.look(room.look())
-    monkeypatch.setattr(twin_module, "FEWEST", 10**6)
+    for module in (twin_module, folding):
+        monkeypatch.setattr(module, "FEWEST", 10**6)
     room.pull(twin, DOOR, (0.0, 0.0), (-0.5, 0.0))
     assert not twin.parts
     assert twin.held == [(-1, 0)]

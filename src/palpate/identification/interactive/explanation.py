@@ -10,7 +10,7 @@ from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import FREE, LEAST_MOTION, evidence
 from palpate.identification.interactive.part import Candidate, Part
 from palpate.identification.interactive.refinement import SURPRISE, Estimate, refine, surprise
-from palpate.identification.interactive.screws import NOWHERE, screws_of_way
+from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
 from palpate.identification.interactive.tree import NOT_MOVED, PartTree
 from palpate.identification.interactive.ways import MOMENTS, Way, misfit
 
@@ -24,12 +24,13 @@ OPEN = -1.0  # of evidence, for each point: what has less is not where it is bel
 IN_THE_WAY = 0.05  # share of a part's points that cameras look through: hardly any where it is
 STEPS = 5  # of Gauss-Newton at each moment of a hand's way
 SMALL, DAMPED, MOST_STEP = 1e-5, 1e-5, 0.2  # rad or m, m^2, rad or m
+ELSEWHERE = 0.15  # rad or m that a carrier is at least from where it was believed to be
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 
 
 def find_moved_part(tree: PartTree, before: int, after: int, handling: Handling) -> int:
     """The part that moved with the hand, which has one way more; -1 if none that is known has."""
-    for explain in (_by_way, _by_two_joints, _by_clouds, _by_all_ways):
+    for explain in (_by_way, _by_two_joints, _by_clouds, _by_all_ways, _by_way_elsewhere):
         if (part := explain(tree, before, after, handling)) >= 0:
             return part
     return -1
@@ -197,24 +198,41 @@ def two_positions(
     tree: PartTree, part: int, before: int, handling: Handling
 ) -> tuple[float, float] | None:
     """Where the hand has taken a part's carrier and the part on it (rad or m); None if their joints
-    do not let it go there.
+    do not let it go there."""
+    carrier, one = tree.parts[tree.parts[part].parent], tree.parts[part]
+    start = tree.pose(part, before).inverse.at(handling.points[:3].mean(axis=0)[None])
+    most = EXPLAINED[0] + TOGETHER * handling.travel
+    return positions_along(
+        tree.pose(carrier.parent, before),
+        (carrier.screw, one.screw),
+        (carrier.positions[before], one.positions[before]),
+        start,
+        handling.points,
+        most * (0.5 if one.provisional else 1.0),
+    )
 
-    Three coordinates of each point of its way are to be explained by two positions (Gauss-Newton,
+
+def positions_along(
+    base: Pose,
+    joints: tuple[Screw, Screw],
+    began: tuple[float, float],
+    start: Float[np.ndarray, "1 3"],
+    way: Float[np.ndarray, "times 3"],
+    most: float,
+) -> tuple[float, float] | None:
+    """Where a hand has taken two joints, one on what the other carries (rad or m), that a hand held
+    at a point of what both carry; None if they miss its way by more than the `most` (m).
+
+    Three coordinates of each point of the way are to be explained by two positions (Gauss-Newton,
     from those of the point before).
     """
-    upper, lower = tree.parts[tree.parts[part].parent], tree.parts[part]
-    base = tree.pose(upper.parent, before)
-    places = np.array([upper.positions[before], lower.positions[before]])
-    way = handling.points[np.linspace(0, len(handling.points) - 1, MOMENTS).astype(int)]
-    start = tree.pose(part, before).inverse.at(handling.points[:3].mean(axis=0)[None])
+    places = np.array(began)
 
     def there(at: np.ndarray) -> np.ndarray:
-        pose = base @ upper.screw.pose(float(at[0])) @ lower.screw.pose(float(at[1]))
+        pose = base @ joints[0].pose(float(at[0])) @ joints[1].pose(float(at[1]))
         return pose.at(start)[0]
 
-    most = EXPLAINED[0] + TOGETHER * handling.travel
-    most *= 0.5 if lower.provisional else 1.0
-    for point in way:
+    for point in way[np.linspace(0, len(way) - 1, MOMENTS).astype(int)]:
         for _ in range(STEPS):
             here = there(places)
             slopes = np.stack([there(places + one) - here for one in SMALL * np.eye(2)], axis=1)
@@ -241,6 +259,8 @@ def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) ->
         # two joints that move at once may do as one, elsewhere
         if joint is None or one.estimate.refutes(joint.screw):
             continue
+        if one.edge is not None and joint.screw.joint == "prismatic":
+            continue
         kept, labels = (one.estimate, one.positions), tree.labels[before]
         one.settle(dataclasses.replace(joint, positions=np.array(one.positions_of(joint.screw))))
         if _follows_hand(tree, part, before, after, handling) and not _is_in_the_way(
@@ -258,6 +278,35 @@ def _is_in_the_way(tree: PartTree, part: int, look: int) -> bool:
     pose, (points, normals) = tree.pose(part, look), tree.parts[part].support
     seen = evidence(tree.looks[look], pose.at(points), pose.turned(normals))
     return bool(np.mean(seen == FREE) > IN_THE_WAY)
+
+
+def _by_way_elsewhere(tree: PartTree, before: int, after: int, handling: Handling) -> int:
+    """The part that went as its joint lets it on a carrier that was, before and after, where it was
+    in another look: what is on a carrier may hide where that is."""
+    for part, one in enumerate(tree.parts):
+        if one.parent < 0:
+            continue
+        carrier = tree.parts[one.parent]
+        kept = list(carrier.positions), list(one.positions)
+        for place in np.unique(np.round(kept[0], 1)):
+            if abs(place - kept[0][before]) < ELSEWHERE:
+                continue
+            carrier.positions, one.positions = list(kept[0]), list(kept[1])
+            carrier.positions[before] = carrier.positions[after] = float(place)
+            if (
+                surprise(one.estimate, tree.way_from(one.parent, before, handling.points))
+                > SURPRISE
+            ):
+                continue
+            for look in (before, after):
+                tree.find(part, look, beyond=FURTHER)
+            if _are_seen(tree, (one.parent, part), before) and _follows_hand(
+                tree, part, before, after, handling
+            ):
+                one.ways.append((before, handling.points))
+                return part
+        carrier.positions, one.positions = kept
+    return -1
 
 
 def joint_of_ways(tree: PartTree, part: Part, ways: list[Way]) -> Estimate | None:

@@ -17,7 +17,7 @@ from palpate.identification.interactive.labels import (
 )
 from palpate.identification.interactive.part import Candidate, Part, support_of
 from palpate.identification.interactive.refinement import Estimate
-from palpate.identification.interactive.screws import Pose
+from palpate.identification.interactive.screws import Pose, Screw
 from palpate.identification.interactive.tree import FEWEST, THICK, PartTree
 
 WITHIN = 0.6  # share of a part's points that make it a part of another
@@ -39,6 +39,7 @@ class Discovery:
     estimate: Estimate
     masks: list[Int[np.ndarray, " _"]]
     gain: float = 0.0
+    edge: Screw | None = None
 
 
 def candidate_of(estimate: Estimate, back: Pose, before: int, after: int) -> Candidate:
@@ -70,7 +71,8 @@ def insert(
     seen = {before: masks[0], after: masks[1]}
     ways = [] if way is None else [(before, way)]
     guessed = new.carrier >= 0 and way is not None
-    tree.parts.append(Part(parent, estimate, positions, seen, ways, support, guessed))
+    edge = None if new.edge is None else new.edge.moved(back)
+    tree.parts.append(Part(parent, estimate, positions, seen, ways, support, guessed, edge))
     for look, mask in seen.items():
         tree.labels[look] = np.where(np.isin(tree.labels[look], same), number, tree.labels[look])
         tree.labels[look][mask] = number
@@ -81,7 +83,7 @@ def insert(
         others = np.isin(tree.labels[look], strange) | tree.points_of_others(number, look, known)
         tree.parts[number].positions[look] = tree.parts[number].positions[look + step]
         # a pull that told nothing may have moved it, and far
-        beyond = FURTHER if look < before else None
+        beyond = FURTHER if look < before and new.edge is None else None
         tree.find(number, look, others=others, beyond=beyond, new=True)
     for child in carried:
         if tree.parts[child].parent == parent:
@@ -228,6 +230,7 @@ def hang(tree: PartTree, part: Part, parent: int, look: int) -> Part:
         parent=parent,
         positions=list(part.positions),
         estimate=dataclasses.replace(part.estimate, screw=part.screw.moved(onto)),
+        edge=None if part.edge is None else part.edge.moved(onto),
         support=(onto.at(part.support[0]), onto.turned(part.support[1])),
     )
 

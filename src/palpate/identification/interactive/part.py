@@ -36,6 +36,7 @@ class Part:
     ways: list[tuple[int, np.ndarray]]  # a look before, and a hand's way in the world after it
     support: Support  # points and normals, as described
     provisional: bool = False  # found by the ends of one way, on a carrier that moved as well
+    edge: Screw | None = None  # that its hinge was taken to be at, as its joint is described
 
     @property
     def screw(self) -> Screw:

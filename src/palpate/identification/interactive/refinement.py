@@ -36,6 +36,9 @@ SETTLED = 1e-4  # rad and m by which a round changes a joint that needs no more 
 SURPRISE = 1.0  # of a hand's way, for the joint that it moves: twice what is usual
 NEAR = 0.025, 0.05  # m beside noise, from a point to its surface: late and early
 FLAT, IS_FLAT = 0.015, 0.8  # m beside noise from a plane, and share of points: of what is flat
+# rad and m that a hinge is off the edge that was taken for it: less, until a hand has felt it, as
+# looks that show its part from two sides pull it further away
+AT_EDGE, FELT_AT_EDGE = (math.radians(1.0), 0.005), (math.radians(3.0), 0.015)
 OUT_OF_PLANE = math.radians(2.0), 0.03  # rad and m that the hinge of a board is out of its plane
 
 
@@ -97,8 +100,10 @@ def refine(
     positions: Float[np.ndarray, " looks"],
     seen: Sequence[Sighting | None],
     ways: Sequence[Way],
+    edge: Screw | None = None,
 ) -> Estimate:
-    """The joint that explains what was seen of its part, from a first guess.
+    """The joint that explains what was seen of its part, from a first guess, and with its hinge
+    about at an `edge` where one was seen.
 
     Looks in which a part was not seen have None, and keep their position unless a hand began or
     ended there. The position in the look before the first way stays as it is, or if the part was
@@ -128,6 +133,8 @@ def refine(
         for pair in pairs:
             _add_pair(sums, screw, positions, pair, seen, chosen, column, NEAR[number < COARSE])
         _add_planes(sums, screw, planes)
+        if edge is not None and screw.joint == "revolute":
+            _add_edge(sums, screw, edge, FELT_AT_EDGE if felt else AT_EDGE)
         for before, way in ways:
             _add_way(sums, screw, way)
             _add_travel(sums, screw, positions, column, before, way)
@@ -248,6 +255,21 @@ def _add_planes(sums: _Sums, screw: Screw, planes: list[tuple[np.ndarray, np.nda
         aside = np.vecdot(normals, screw.point - places)
         return np.concatenate([normals @ screw.axis, aside]) / scale
 
+    standard = errors(screw)
+    rows = np.zeros((len(standard), len(sums.slope)))
+    for axis, one in enumerate(np.eye(AXES)):
+        rows[:, axis] = (errors(screw.varied(STEP * one)) - standard) / STEP
+    sums.add(rows, standard)
+
+
+def _add_edge(sums: _Sums, screw: Screw, edge: Screw, off: tuple[float, float]) -> None:
+    """A hinge is at an edge that was seen, about: what looks and ways say more exactly wins."""
+
+    def errors(screw: Screw) -> Float[np.ndarray, "4"]:
+        across, near = np.array(edge.across), screw.near(edge.point)
+        return np.concatenate([across @ screw.axis, across @ (near.point - edge.point)]) / scale
+
+    scale = np.repeat(off, 2)
     standard = errors(screw)
     rows = np.zeros((len(standard), len(sums.slope)))
     for axis, one in enumerate(np.eye(AXES)):

@@ -5,7 +5,7 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 Points = Float[np.ndarray, "n 3"]
 FARTHEST = 6.0  # m from a hand's way to an axis: what turns about one further away slides
@@ -113,6 +113,17 @@ class Screw:
         sine = float(np.linalg.norm(np.cross(self.axis, other.axis)))
         aside = float(np.linalg.norm(np.cross(other.point - self.point, self.axis)))
         return math.degrees(math.asin(min(sine, 1.0))), aside
+
+    def is_beyond(
+        self, points: Points, carried: Float[np.ndarray, "3"], carrier: Float[np.ndarray, "3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Which points are nearer to the half plane from its axis through a place of what it
+        carries than to that through a place of the carrier."""
+        ways = []
+        for place in (carried, carrier):
+            away = place - self.near(place).point
+            ways.append(away / max(float(np.linalg.norm(away)), 1e-6))
+        return (points - self.point) @ (ways[0] - ways[1]) > 0.0
 
     def near(self, place: Float[np.ndarray, "3"]) -> "Screw":
         """The same, with the point of its axis that is nearest to a place."""

@@ -42,6 +42,7 @@ UNEXPLAINED = -2.0  # of evidence: a point that is in the open by every label
 NOTHING = -2  # in the place of a label: nothing was seen there
 LEFT = 0.35, 0.02  # of the points of a part, and of all: to be left unexplained is much
 NOT_MOVED = 0.3  # of evidence, for each point: how much better a new position has to be
+BEYOND = 1.0  # of scores: how much likelier a point is to be of what is on its side of a hinge
 THICK = 0.03  # m from one side of a part to the other
 REACHES = 0.05, 0.05, 0.025, 0.025  # m from a part's points to the surface that they are to meet
 LEAST_MET = 0.4  # share of its points that meet one
@@ -257,6 +258,10 @@ class PartTree(Kinematics):
             for part, one in enumerate(self.parts):
                 if one.parent >= 0:
                     given[part + 1] += self._height_evidence(part, look, alone)
+                    if one.edge is not None:
+                        beyond = self._is_beyond(part, look)
+                        given[one.parent + 1, beyond] -= BEYOND
+                        given[part + 1, ~beyond] -= BEYOND
         given += prior(cloud, given, motions)
         given[0] = np.maximum(given[0], UNKNOWN * sum(weights))
         return smooth_labels(cloud, given)
@@ -291,6 +296,13 @@ class PartTree(Kinematics):
             given, part + 1, self.parts[part].parent + 1,
         )  # fmt: skip
 
+    def _is_beyond(self, part: int, look: int) -> Bool[np.ndarray, " points"]:
+        """Which points of a look are on a part's side of its hinge: of what it and its carrier
+        explain as well, these are the part's, and the others its carrier's."""
+        hinge, carrier = self.screw(part, look), self.screw(self.parts[part].parent, look)
+        own = self.pose(part, look).at(self.parts[part].support[0]).mean(axis=0)
+        return hinge.is_beyond(self.looks[look].points, own, carrier.near(hinge.point).point)
+
     def unexplained(self, candidate: Candidate, look: int) -> Bool[np.ndarray, " points"]:
         """Which points of a look neither stand still nor are of a part, by the other look."""
         return self.scores(look, candidate).max(axis=0) < UNEXPLAINED
@@ -316,14 +328,14 @@ class PartTree(Kinematics):
         """Every joint anew from all looks, from root to leaf.
 
         Of the part that was handled last (-1: none), the line and the circle of its longest way
-        stand against the joint that it had.
+        stand against the joint that it had, unless that is at an edge.
         """
         for number in self.ordered():
             part = self.parts[number]
             found = [self.estimate(part)]
             ways = [self.way_from(part.parent, *way) for way in part.ways]
             whole = [way for way in ways if not is_of_two_ends(way)]  # of two ends: any
-            if number == last and len(ways) > 1 and whole:
+            if number == last and len(ways) > 1 and whole and part.edge is None:
                 longest = max(whole, key=lambda way: float(np.linalg.norm(way[-1] - way[0])))
                 found += [
                     self.estimate(part, screw)
@@ -380,4 +392,7 @@ class PartTree(Kinematics):
                 seen[look] = sighting(self.looks[look], chosen, back)
         positions = part.positions if screw is None else part.positions_of(screw)
         ways = [(look, self.way_from(part.parent, look, way)) for look, way in part.ways]
-        return refine(screw or part.screw, np.array(positions), seen, ways)
+        if part.edge is not None and part.parent >= 0:  # its edge says more than a hidden carrier
+            shown = self.parts[part.parent].seen
+            ways = [(look, way) for look, way in ways if len(shown.get(look + 1, ())) >= FEWEST]
+        return refine(screw or part.screw, np.array(positions), seen, ways, part.edge)

@@ -7,12 +7,16 @@ carries it.
 
 import copy
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
+from palpate.identification.interactive.edges.folding import discover_pair
+from palpate.identification.interactive.edges.splitting import split, split_off_base
 from palpate.identification.interactive.explanation import (
+    BESIDE,
     FURTHER,
     MISFIT,
     find_moved_part,
@@ -25,7 +29,6 @@ from palpate.identification.interactive.insertion import CARRIED, find_beside, r
 from palpate.identification.interactive.labels import scores
 from palpate.identification.interactive.part import KNOWN, UNSURE, Part
 from palpate.identification.interactive.screws import Screw, screws_of_way
-from palpate.identification.interactive.splitting import split, split_off_base
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.identification.interactive.ways import is_of_two_ends, misfit
 from palpate.perception.clouds import Cloud
@@ -34,6 +37,7 @@ POINTS = 100  # of each look by which it is told how much is explained, about
 # of evidence, for each point: what is hidden where it has gone is nearly as likely as what is seen
 # there, as a part that opens hides much and bares more
 CONCEALED = 0.6
+AS_GOOD = 0.03  # the same: what it may cost to have a part less
 OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
 ELSEWHERE = 5.0, 0.05  # deg and m between two joints that nobody would take for one
 ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known
@@ -137,9 +141,8 @@ class Twin(PartTree):
             self._explain_earlier()
             self.refit(-1)
         self._merge()
-        if handling.moved and self.held[-1][0] < 0 and split_off_base(self, before, after):
-            self._explain_earlier()
-            self.refit(-1)
+        if handling.moved and self.held[-1][0] < 0:
+            self._explain_by_edges(before, after, handling)
         # where nothing has moved, another look only has other noise
         if any(one.moved for one in self.handled[-2:]) and split(self, [before, after]):
             self._explain_earlier()
@@ -165,6 +168,17 @@ class Twin(PartTree):
         moved = self.renumbering(part, heir)
         self.held = [(int(moved[held + 1]), look) for held, look in self.held]
         super().remove(part, heir)
+
+    def _was_held_at(self, number: int, parts: Sequence[int]) -> bool:
+        """Whether a hand took hold of a part where one of others was."""
+        return any(
+            np.linalg.norm(
+                self.pose(one, look).at(self.parts[one].support[0]) - way[0], axis=1
+            ).min()
+            < BESIDE
+            for look, way in self.parts[number].ways
+            for one in parts
+        )
 
     def _is_first_way(self) -> bool:
         """Whether the hand has just held, for the first time, a part that clouds alone had shown:
@@ -233,6 +247,45 @@ class Twin(PartTree):
         """Whether its carrier moved in all ways that a hand has taken a part."""
         ways = [self.way_from(part.parent, *way) for way in part.ways]
         return bool(ways) and all(map(is_of_two_ends, ways))
+
+    def _explain_by_edges(self, before: int, after: int, handling: Handling) -> None:
+        """Explain a pull that told nothing by hinges at edges of what was seen."""
+        part = discover_pair(self, before, after, handling)
+        if part < 0 and not split_off_base(self, before, after):
+            return
+        if part >= 0:
+            self.held[-1] = part, before
+        if part == len(self.parts) - 1:
+            self._drop_guesses()
+        self._explain_earlier()
+        self.refit(-1)
+        if self.held[-1][0] >= 0:
+            self._drop_replaced()
+
+    def _drop_replaced(self) -> None:
+        """Take out parts that a hand took where it has now held two joints, if these explain all
+        pulls as well: a pull that moves both may look like one of another joint."""
+        held = self.held[-1][0]
+        pair = (held, *self.carriers(held))
+        for number in reversed(range(len(self.parts))):
+            if number in pair or not self._was_held_at(number, pair):
+                continue
+            other = self.copy()
+            lost = [index for index, (one, _) in enumerate(other.held) if one == number]
+            other.remove(number, other.parts[number].parent)
+            for index in lost:
+                other.held[index] = -1, other.held[index][1]
+            for look in range(len(other.looks)):
+                other.relabel(look)
+            other._explain_earlier()
+            other.refit(-1)
+            if (
+                len(other.parts) < len(self.parts)
+                and other.share_unexplained <= self.share_unexplained
+                and other.explained() > self.explained() - AS_GOOD
+            ):
+                self.__dict__.update(other.__dict__)
+                return
 
     def _drop_refuted(self, before: int, handling: Handling) -> bool:
         """Take out parts of whose joints next to nothing is known, if the hand was put to them and

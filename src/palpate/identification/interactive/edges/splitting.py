@@ -7,13 +7,12 @@ the door either, that is found in the same way, as a part of what stood still.
 """
 
 import dataclasses
-from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from palpate.identification.interactive.duplicates import merge_same
+from palpate.identification.interactive.edges.pieces import STRANGE, Piece, edges_of, pieces_of
 from palpate.identification.interactive.explanation import FURTHER
 from palpate.identification.interactive.insertion import Discovery, insert
 from palpate.identification.interactive.labels import (
@@ -27,16 +26,12 @@ from palpate.identification.interactive.part import UNSURE, Part, is_same_hinge
 from palpate.identification.interactive.refinement import NEAR, refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.tree import FEWEST, UNEXPLAINED, PartTree
-from palpate.perception.clouds import Cloud
-from palpate.perception.surfaces import Surface, surfaces
 
 MOVED = 0.15  # rad or m that a carrier has moved between two looks, or a part on it
-STRANGE = 0.35  # share of a piece's points that no known motion explains
 MEETS = 0.6  # share of a piece's points that meet a surface where the joint takes it
 # the same, of what stood still: its hinge is not quite at its edge, and it may fold
 PARTLY_MEETS = 0.25
 GAIN = 1.0  # of evidence, for each point: how much better a joint on a carrier explains a piece
-POINTS = 120  # of a piece, by which it is tried
 TURNS, FINER = np.arange(-2.2, 2.21, 0.1), np.linspace(-0.075, 0.075, 7)  # rad
 TRIED = 3  # of the options, the best
 LEAST_EVIDENCE = 500.0  # of evidence, of all points and looks
@@ -44,16 +39,6 @@ SURE = 5.0, 0.03  # deg and m: 90 % intervals of a joint that is known well enou
 LARGEST = 0.5  # of a carrier's points in a look: a piece that is larger is no part on it
 GROWN = 2.5  # of a piece's points: a part that takes more there is not what was tried
 MOST = 0.75  # share of a carrier's points that a part on it may take
-
-
-class Piece(NamedTuple):
-    """A flat piece of a cloud, and the points by which it is tried."""
-
-    surface: Surface
-    members: Int[np.ndarray, " n"]
-
-
-_SOUGHT: WeakKeyDictionary[Cloud, list[Piece]] = WeakKeyDictionary()
 
 
 @dataclasses.dataclass
@@ -101,7 +86,7 @@ def split_off_base(tree: PartTree, before: int, after: int) -> bool:
     the last part then. For a pull that told nothing, as at a flap of a door that is not known."""
     found: Options = {}
     for look, other in ((before, after), (after, before)):
-        if pieces := _pieces(tree.looks[look]):
+        if pieces := pieces_of(tree.looks[look]):
             known = _evidence_of_pieces(tree, look, other, pieces)
             _try_edges(tree, look, other, pieces, known, [-1], found)
     return _insert_best(tree, found)
@@ -114,18 +99,6 @@ def _insert_best(tree: PartTree, found: Options) -> bool:
     return any(_insert(tree, option) for option in options[:TRIED])
 
 
-def _pieces(cloud: Cloud) -> list[Piece]:
-    """The flat pieces of a look, whatever they are of; sought once."""
-    if cloud not in _SOUGHT:
-        whole = np.zeros(len(cloud.points), int)
-        _SOUGHT[cloud] = [
-            Piece(one, one.members[:: max(1, len(one.members) // POINTS)])
-            for one in surfaces(cloud, whole, np.random.default_rng(0))
-            if len(one.members) >= FEWEST
-        ]
-    return _SOUGHT[cloud]
-
-
 def _add_options(tree: PartTree, look: int, other: int, found: Options) -> None:
     """Hinges on known parts of what another look does not show where those have gone."""
     moved = [
@@ -133,7 +106,7 @@ def _add_options(tree: PartTree, look: int, other: int, found: Options) -> None:
         for number, part in enumerate(tree.parts)
         if abs(part.positions[look] - part.positions[other]) > MOVED and _is_sure(part)
     ]
-    pieces = _pieces(tree.looks[look]) if moved else []
+    pieces = pieces_of(tree.looks[look]) if moved else []
     if not pieces:
         return
     known = _evidence_of_pieces(tree, look, other, pieces)
@@ -180,7 +153,7 @@ def _try_edges(
                 (look, number, carrier),
                 [
                     Option(look, pieces[number], carrier, screw)
-                    for screw in _edges(pieces[number].surface)
+                    for screw in edges_of(pieces[number].surface)
                     # about the carrier's own hinge it would be beside the carrier, not on it
                     if carrier < 0 or not is_same_hinge(screw, tree.screw(carrier, look))
                 ],
@@ -205,18 +178,6 @@ def _evidence_of_pieces(
     points, normals = tree.looks[look].points[chosen], tree.looks[look].normals[chosen]
     each = evidence_of_poses(tree.looks[other], points, normals, motions)
     return np.split(each, ends, axis=1)
-
-
-def _edges(surface: Surface) -> list[Screw]:
-    """Hinges at the four edges of a piece."""
-    middle, found = 0.5 * (surface.low + surface.high), []
-    for side in (0, 1):
-        for end in (surface.low[side], surface.high[side]):
-            place = middle.copy()
-            place[side] = end
-            point = surface.centre + place @ surface.sides
-            found.append(Screw("revolute", surface.sides[1 - side], point))
-    return found
 
 
 def _find_explained(tree: PartTree, look: int, other: int) -> Bool[np.ndarray, " points"]:

@@ -1,0 +1,1 @@
+"""Hinges at edges of flat pieces: of what has moved as no known joint moves."""

@@ -121,14 +121,15 @@ class HingePair(NamedTuple):
 
 def grips(looks: tuple[Cloud, Cloud], places: tuple[Vector, Vector]) -> list[Grip]:
     """What a hand may hold at its places before and after: either side may be seen after."""
-    near = [_pieces_at(look, place) for look, place in zip(looks, places, strict=True)]
+    before, after = map(_pieces_at, looks, places)
     return [
         Grip(
             (first.surface.normal, side * second.surface.normal),
             (edges_of(first.surface), edges_of(second.surface)),
             places,
         )
-        for first, second, side in itertools.product(*near, (1.0, -1.0))
+        for first, second in itertools.product(before, after)
+        for side in (1.0, -1.0)
     ]
 
 

@@ -236,10 +236,7 @@ class Twin(PartTree):
         for number in reversed(range(last)):
             part = self.parts[number]
             if number in carried or (part.provisional and len(part.ways) == 1):
-                held = [index for index, (one, _) in enumerate(self.held) if one == number]
-                self.remove(number, part.parent)
-                for index in held:
-                    self.held[index] = -1, self.held[index][1]
+                self._forget(number)
         for look in range(len(self.looks)) if carried else ():
             self.relabel(look)
 
@@ -271,10 +268,7 @@ class Twin(PartTree):
             if number in pair or not self._was_held_at(number, pair):
                 continue
             other = self.copy()
-            lost = [index for index, (one, _) in enumerate(other.held) if one == number]
-            other.remove(number, other.parts[number].parent)
-            for index in lost:
-                other.held[index] = -1, other.held[index][1]
+            other._forget(number)
             for look in range(len(other.looks)):
                 other.relabel(look)
             other._explain_earlier()
@@ -284,8 +278,14 @@ class Twin(PartTree):
                 and other.share_unexplained <= self.share_unexplained
                 and other.explained() > self.explained() - AS_GOOD
             ):
-                self.__dict__.update(other.__dict__)
+                self.parts, self.labels, self.held = other.parts, other.labels, other.held
                 return
+
+    def _forget(self, number: int) -> None:
+        """Take a part out; what hands did with it is of none that is known."""
+        before = [look for part, look in self.held if part == number]
+        self.remove(number, self.parts[number].parent)
+        self.held = [(-1 if look in before else part, look) for part, look in self.held]
 
     def _drop_refuted(self, before: int, handling: Handling) -> bool:
         """Take out parts of whose joints next to nothing is known, if the hand was put to them and

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.twin import Twin
 from rooms import Room
 
@@ -50,10 +49,3 @@ def opened(chest: Chest) -> Twin:
     chest.pull(twin, LEAF, (0.7, 0.0), (0.05, 0.0))
     assert [len(part.ways) for part in twin.parts] == [2]
     return twin
-
-
-class Notes(Twin):
-    """A twin that only writes down what a hand has done."""
-
-    def observe(self, handling: Handling) -> None:
-        self.handled.append(handling)

@@ -86,3 +86,10 @@ class Room:
         """Degrees, and cm, from a part's joint to the true one."""
         found = twin.screw(part, len(twin.looks) - 1)
         return difference(found, self.data.xaxis[joint], self.data.xanchor[joint])
+
+
+class Notes(Twin):
+    """A twin that only writes down what a hand has done."""
+
+    def observe(self, handling: Handling) -> None:
+        self.handled.append(handling)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from chests import CHEST_LID, DEEP, LEAF, LID, Chest, Notes, opened
+from chests import CHEST_LID, DEEP, LEAF, LID, Chest, opened
 from palpate.identification.interactive import twin as twin_module
 from palpate.identification.interactive.duplicates import drop_explained
 from palpate.identification.interactive.edges.splitting import split_off_base
@@ -13,6 +13,7 @@ from palpate.identification.interactive.explanation import find_moved_part
 from palpate.identification.interactive.part import support_of
 from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import ANYWHERE, Twin
+from rooms import Notes
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 

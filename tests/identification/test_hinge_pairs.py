@@ -6,15 +6,16 @@ import math
 import numpy as np
 import pytest
 
-from chests import DEEP, LEAF, LID, Chest, Notes, opened
+from chests import DEEP, LEAF, LID, Chest, opened
 from palpate.identification.interactive.edges import folding, hinge_pairs
 from palpate.identification.interactive.edges.folding import Remainder, discover_pair
 from palpate.identification.interactive.edges.hinge_pairs import Grip, HingePair
 from palpate.identification.interactive.explanation import find_moved_part
+from palpate.identification.interactive.labels import ON
 from palpate.identification.interactive.refinement import AT_EDGE, FELT_AT_EDGE, refine
 from palpate.identification.interactive.screws import Screw
 from palpate.identification.interactive.twin import Twin
-from rooms import FLAP, Room
+from rooms import FLAP, Notes, Room
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
@@ -202,6 +203,8 @@ def test_a_remainder_is_what_is_not_explained_yet_each_point_for_some() -> None:
     moved, stood = rest.values([pair, still]) / [pair.weight, still.weight]
     assert stood == 0.0
     assert moved > folding.LEAST_EVIDENCE
+    nothing = Remainder.of((looks[0], looks[1]), [np.full_like(each, ON) for each in known])
+    assert nothing.values([pair]).tolist() == [0.0]
 
 
 def test_a_leaf_goes_as_its_joint_lets_it_though_its_lid_was_believed_elsewhere() -> None:
@@ -250,6 +253,15 @@ def test_a_part_that_a_pull_of_two_joints_was_taken_for_goes_once_both_are_known
     twin.parts.append(far)
     twin._drop_replaced()
     assert twin.parts[-1] is far
+
+
+def test_only_what_was_done_with_a_part_is_forgotten_with_it() -> None:
+    twin = opened(Chest(LID))
+    twin.parts.append(dataclasses.replace(twin.parts[0]))
+    # nothing moved between the last two: they were done after the same look
+    twin.held = [(0, 0), (1, 2), (0, 2)]
+    twin._forget(0)
+    assert twin.held == [(-1, 0), (0, 2), (-1, 2)]
 
 
 def test_a_part_at_an_edge_stays_a_hinge(monkeypatch) -> None:

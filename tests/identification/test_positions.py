@@ -9,7 +9,7 @@ from palpate.identification.interactive.edges import folding
 from palpate.identification.interactive.explanation import find_moved_part
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.twin import Twin
-from rooms import DOOR, Room
+from rooms import DOOR, Notes, Room
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
@@ -40,13 +40,6 @@ class Drawers(Room):
 
     def place(self, body: int) -> np.ndarray:
         return np.array([-0.1, 0.2, 0.0])
-
-
-class Notes(Twin):
-    """A twin that only writes down what a hand has done."""
-
-    def observe(self, handling: Handling) -> None:
-        self.handled.append(handling)
 
 
 def known_door(room: Room) -> Twin:

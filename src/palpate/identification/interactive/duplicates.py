@@ -59,7 +59,10 @@ def drop_explained(tree: PartTree) -> None:
             continue
         for other in others:
             if (
-                not (other == part.parent and (part.edge or tree.was_felt_by_itself(number)))
+                not (
+                    other == part.parent
+                    and (part.edge is not None or tree.was_felt_by_itself(number))
+                )
                 and _were_alike(tree, number, other)
                 and _explains(tree, other, number)
             ):

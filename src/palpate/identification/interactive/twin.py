@@ -283,9 +283,11 @@ class Twin(PartTree):
 
     def _forget(self, number: int) -> None:
         """Take a part out; what hands did with it is of none that is known."""
-        before = [look for part, look in self.held if part == number]
+        lost = [part == number for part, _ in self.held]
         self.remove(number, self.parts[number].parent)
-        self.held = [(-1 if look in before else part, look) for part, look in self.held]
+        self.held = [
+            (-1 if gone else part, look) for gone, (part, look) in zip(lost, self.held, strict=True)
+        ]
 
     def _drop_refuted(self, before: int, handling: Handling) -> bool:
         """Take out parts of whose joints next to nothing is known, if the hand was put to them and

@@ -61,7 +61,7 @@ class Remainder:
             each = evidence_of_poses(
                 self.looks[1 - look], cloud.points[own], cloud.normals[own], poses
             )
-            best = each.reshape(len(pairs), 2, -1).max(axis=1)
+            best = each.reshape(len(pairs), 2, len(own)).max(axis=1)
             total += self.weights[look] * np.maximum(best - self.known[look], 0.0).sum(axis=1)
         return total * np.array([one.weight for one in pairs])
 

@@ -40,11 +40,18 @@ def test_the_hand_says_how_far_a_sheet_has_slid_in_its_plane() -> None:
     way = np.linspace((0.5, 0.2, 0.01), (0.6, 0.2, 0.01), 40)
     way = np.concatenate([way[:1], way[:1], way, way[-1:], way[-1:]])  # at rest at both ends
     screw = Screw("prismatic", np.array([1.0, 0.0, 0.0]), way[0])
-    for guess in (0.1, 0.16):
+    for guess in (0.0, 0.1, 0.16):
         found = refine(screw, np.array([0.0, guess]), [sheet(0.0), sheet(0.0)], [(0, way)])
         assert found.positions[1] == pytest.approx(0.1, abs=2e-3)
     alone = refine(screw, np.array([0.0, 0.16]), [sheet(0.0), sheet(0.0)], [])
     assert alone.positions[1] == pytest.approx(0.16, abs=2e-3)  # no cloud says it
+
+
+def test_looks_that_show_a_part_at_one_place_move_together() -> None:
+    slide = Screw("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3))
+    seen = [boxed(0.0), *[boxed(0.1)] * 3]
+    found = refine(slide, np.array([0.0, 0.095, 0.0952, 0.0954]), seen, [])
+    assert found.positions == pytest.approx([0.0, 0.1, 0.1, 0.1], abs=1e-3)
 
 
 def test_where_a_hand_began_is_not_known_if_the_part_was_not_seen_there() -> None:

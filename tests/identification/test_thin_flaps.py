@@ -1,5 +1,6 @@
 """A door with a flap that stands off it by no more than a look is noisy."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -35,6 +36,7 @@ SCENE = """
 FLAP = np.array([0.024, 0.05, 1.1])  # the middle of its face, as all is closed
 DOOR = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.0, -0.3, 0.0]))
 HINGE = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.017, -0.07, 0.0]))
+FLAT = Estimate(DOOR, np.zeros(2), 1e-6 * np.eye(4), 0.0, 100.0)  # of the door, before it opens
 # Of the door and of the flap, rad; both open as they turn the negative way.
 CLOSED = (0.0, 0.0), (0.0, 0.0), (-0.3, 0.0), (0.0, 0.0), (-0.5, 0.0), (0.0, 0.0)
 OPENED = (0.0, 0.0), (0.0, -1.0), (-0.4, -1.0), (-0.4, 0.0)
@@ -165,9 +167,43 @@ def test_two_parts_on_one_hinge_of_a_door_are_the_one_that_is_known_better():
     assert tree.parts[2].screw.point == pytest.approx(aside.point)
 
 
+def door_and_other(places: tuple[float, float], other: Part) -> PartTree:
+    """A tree of a door, in two looks, and of another part on its hinge."""
+    tree = tree_of(looks_at(((0.0, 0.0), (-0.5, 0.0)), (-1.2,)), ((0.0, 0.0), (-0.5, 0.0)))
+    tree.parts[0].support = surface_of_door(0.3)
+    tree.parts[1] = dataclasses.replace(
+        other,
+        estimate=dataclasses.replace(tree.parts[0].estimate, positions=np.array(places)),
+        positions=list(places),
+    )
+    return tree
+
+
+def surface_of_door(above: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals of what is within .3 m of a height (m, from the middle of the door)."""
+    across, up = np.meshgrid(np.linspace(-0.25, 0.25, 12), np.linspace(-0.25, 0.25, 12))
+    points = np.stack([np.full(144, 0.01), across.ravel(), 1.0 + above + up.ravel()], axis=1)
+    return points, np.tile([1.0, 0.0, 0.0], (144, 1))
+
+
 def test_doors_above_each_other_on_one_hinge_stay_two():
-    tree = tree_of([], ())
-    tree.parts[1].parent = -1
-    tree.parts[1].estimate = tree.parts[0].estimate
+    above = Part(-1, FLAT, [], {}, [], surface_of_door(-0.3))
+    tree = door_and_other((0.0, -0.5), above)
     merge_same(tree)
     assert len(tree.parts) == 2
+
+
+def test_a_door_that_was_found_twice_is_one():
+    again = Part(-1, FLAT, [], {}, [], surface_of_door(0.3))
+    tree = door_and_other((-0.5, -0.9), again)  # it was open at -0.5 as well, in another look
+    merge_same(tree)
+    assert len(tree.parts) == 1
+
+
+def test_what_turns_about_the_hinge_of_its_carrier_is_its_carrier():
+    on_door = Part(0, FLAT, [], {}, [], surface_of_door(0.3))
+    tree = door_and_other((0.0, 0.2), on_door)
+    door = tree.parts[0]
+    merge_same(tree)
+    assert tree.parts == [door]
+    assert door.parent == -1

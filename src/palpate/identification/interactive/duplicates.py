@@ -13,16 +13,19 @@ LOSS = 0.5  # of evidence, for each point of a part: less is lost where another 
 
 
 def merge_same(tree: PartTree) -> None:
-    """Of parts that turn about one hinge on the same carrier keep the one that is known best.
+    """Of parts that turn about one hinge keep the one that is known best.
 
     They are one part, which went further than it was sought, or showed its other side. What stands
-    still may have two doors above each other on one hinge.
+    still may have two doors above each other on one hinge, which are never at one place; and what
+    turns about the hinge of its carrier, where that has been, is its carrier.
     """
     for number in reversed(range(len(tree.parts))):
         part = tree.parts[number]
         for other, one in enumerate(tree.parts[:number]):
-            if 0 <= part.parent == one.parent and _may_be_same(part, one):
+            if _are_same(tree, number, other):
                 known = min(part, one, key=lambda each: each.estimate.intervals[0])
+                if part.parent != one.parent:
+                    known = one if part.parent == other else part
                 known.ways = one.ways + part.ways
                 shown = {look for each in (part, one) for look in each.seen}
                 tree.remove(*((other, number) if known is part else (number, other)))
@@ -33,11 +36,20 @@ def merge_same(tree: PartTree) -> None:
                 break
 
 
-def _may_be_same(part: Part, other: Part) -> bool:
-    """Whether two parts turn about one hinge, as well as both are known."""
-    turned, aside = np.add(part.estimate.intervals, other.estimate.intervals)
-    return part.screw.joint == "revolute" and is_same_hinge(
-        part.screw, other.screw, float(turned), float(aside)
+def _are_same(tree: PartTree, number: int, other: int) -> bool:
+    """Whether two parts turn about one hinge, as well as those beside each other are known, and
+    have been at one place, as far as something else may turn about that hinge as well."""
+    part, one = tree.parts[number], tree.parts[other]
+    if part.screw.joint != "revolute":
+        return False
+    if part.parent == one.parent:
+        turned, aside = np.add(part.estimate.intervals, one.estimate.intervals)
+        same = is_same_hinge(part.screw, one.screw, float(turned), float(aside))
+        return same and (part.parent >= 0 or _were_alike(tree, number, other))
+    return (
+        (part.parent == other or one.parent == number)
+        and is_same_hinge(part.screw, one.screw)
+        and _were_alike(tree, number, other)
     )
 
 

@@ -107,23 +107,26 @@ def refine(
 
     Looks in which a part was not seen have None, and keep their position unless a hand began or
     ended there. The position in the look before the first way stays as it is, or if the part was
-    not seen there, in the first look with it: it says where the joint's zero is.
+    not seen there, in the first look with it: it says where the joint's zero is. Looks that show it
+    at one place move together.
     """
-    pairs = _pairs(positions, seen)
+    alike = _alike(positions, seen, ways)
+    pairs = _pairs(positions, list(dict.fromkeys(alike.values())))
     shown = sorted({look for pair in pairs for look in pair})
     random = np.random.default_rng(0)
     chosen = {look: _subset(seen[look], random) for look in shown}
     handled = {before + gone for before, _ in ways for gone in (0, 1)}
-    used = [*shown, *sorted(handled - set(shown))]
-    if ways and ways[0][0] in shown:
-        used.remove(ways[0][0])
-        used.insert(0, ways[0][0])
+    used = [*shown, *sorted({alike.get(look, look) for look in handled} - set(shown))]
+    if ways and (zero := alike.get(ways[0][0])) in shown:
+        used.remove(zero)
+        used.insert(0, zero)
     felt = any(not is_of_two_ends(way) for _, way in ways)
     planes = [] if felt else [one for look in shown if (one := _plane_of(seen[look])) is not None]
     column = {look: AXES + number for number, look in enumerate(used[1:])}
+    unknown = AXES + len(column)
+    column |= {look: column[first] for look, first in alike.items() if first in column}
     middle = np.mean([way.mean(axis=0) for _, way in ways], axis=0) if ways else screw.point
     screw, positions = screw.near(middle), np.array(positions, float)
-    unknown = AXES + len(column)
     # what nothing says anything of stays as it is; where a slide's axis is, nothing can say
     prior = np.full(unknown, 1e-2)
     prior[:2], prior[2:AXES] = 1.0, 1.0 if screw.joint == "revolute" else 1e6
@@ -328,15 +331,31 @@ def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
     return float((standard @ standard - explained) / len(standard))
 
 
-def _pairs(
-    positions: Float[np.ndarray, " looks"], seen: Sequence[Sighting | None]
-) -> list[tuple[int, int]]:
-    """Looks to compare: neighbours among those in which the part is at different places."""
+def _alike(
+    positions: Float[np.ndarray, " looks"], seen: Sequence[Sighting | None], ways: Sequence[Way]
+) -> dict[int, int]:
+    """Of looks that show a part, one that shows it at the same place: that or each other's.
+
+    Where a hand took it, the look after is left out, if it is not seen to be elsewhere then.
+    """
     known = [look for look, one in enumerate(seen) if one is not None and len(one.points) >= FEWEST]
-    distinct: list[int] = []
+    found: dict[int, int] = {}
+    first = -1
     for look in sorted(known, key=lambda look: positions[look]):
-        if not distinct or positions[look] - positions[distinct[-1]] > LEAST:
-            distinct.append(look)
+        if first < 0 or positions[look] - positions[first] > LEAST:
+            first = look
+        found[look] = first
+    for before, _ in ways:
+        if before in found and found.get(before + 1) == found[before]:
+            first = found.pop(before + 1)
+            if first == before + 1:
+                found = {look: before if one == first else one for look, one in found.items()}
+    return found
+
+
+def _pairs(positions: Float[np.ndarray, " looks"], distinct: list[int]) -> list[tuple[int, int]]:
+    """Looks to compare: neighbours among those in which a part is at different places."""
+    distinct = sorted(distinct, key=lambda look: positions[look])
     found = [*itertools.pairwise(distinct), *zip(distinct, distinct[2:], strict=False)]
     if len(distinct) > 3:
         found.append((distinct[0], distinct[-1]))

@@ -52,7 +52,7 @@ FARTHEST = 0.15  # rad or m that it is moved so
 ROUGHLY, FINELY = 60, 200
 CLEARLY = 0.12  # as `NOT_MOVED`: of a new part, and beside where a hand says that one is
 # of evidence, and as `NOT_MOVED`: of a position in which hardly anything of it is seen
-UNSEEN, NOT_HIDDEN = -0.35, 1.5
+UNSEEN, NOT_HIDDEN = -0.35, 1.0
 HAND_TELLS = 0.5  # of evidence, for each point: how much worse one may be that a hand's way says
 
 

@@ -42,7 +42,9 @@ CLOSED = (0.0, 0.0), (0.0, 0.0), (-0.3, 0.0), (0.0, 0.0), (-0.5, 0.0), (0.0, 0.0
 OPENED = (0.0, 0.0), (0.0, -1.0), (-0.4, -1.0), (-0.4, 0.0)
 
 
-def looks_at(places: tuple[tuple[float, float], ...], sides: tuple[float, ...]) -> list[Cloud]:
+def looks_at(
+    places: tuple[tuple[float, float], ...], sides: tuple[float, ...], scene: str = SCENE
+) -> list[Cloud]:
     """Of one camera on each side (m)."""
     cameras = [
         Pinhole.looking_at((0.0, 0.0, 1.0), (2.0, side, 1.3), 320, 240, math.radians(58))
@@ -50,7 +52,7 @@ def looks_at(places: tuple[tuple[float, float], ...], sides: tuple[float, ...]) 
     ]
     return [
         cloud_of(
-            [depth_of(SCENE, place, one, 10 * seed + view) for view, one in enumerate(cameras)]
+            [depth_of(scene, place, one, 10 * seed + view) for view, one in enumerate(cameras)]
         )
         for seed, place in enumerate(places)
     ]
@@ -189,6 +191,37 @@ def surface_of_door(above: float) -> tuple[np.ndarray, np.ndarray]:
 def test_doors_above_each_other_on_one_hinge_stay_two():
     above = Part(-1, FLAT, [], {}, [], surface_of_door(-0.3))
     tree = door_and_other((0.0, -0.5), above)
+    merge_same(tree)
+    assert len(tree.parts) == 2
+
+
+def test_doors_on_one_post_stay_two():
+    scene = """
+    <mujoco><worldbody>
+      <geom type="box" size=".02 .9 .7" pos="-.3 0 1"/>
+      <body pos="0 0 1">
+        <joint axis="0 0 1"/>
+        <geom type="box" size=".01 .3 .4" pos="0 .31 0"/>
+      </body>
+      <body pos="0 0 1">
+        <joint axis="0 0 -1"/>
+        <geom type="box" size=".01 .3 .4" pos="0 -.31 0"/>
+      </body>
+    </worldbody></mujoco>
+    """
+    opened = (0.0, 0.0), (-1.5, 0.0), (-1.5, -1.5)
+    tree = PartTree()
+    tree.looks = looks_at(opened, (0.0,), scene)
+    tree.labels = [np.full(len(look.points), -1) for look in tree.looks]
+    for number, (side, turn) in enumerate(((1.0, 1.0), (-1.0, -1.0))):
+        hinge = Screw("revolute", np.array([0.0, 0.0, turn]), np.zeros(3))
+        points, normals = surface_of_door(0.0)
+        points = points + np.array([0.0, 0.3 * side, 0.0])
+        positions = [place[number] for place in opened]
+        estimate = Estimate(hinge, np.array(positions), 1e-6 * np.eye(4), 0.0, 100.0)
+        tree.parts.append(Part(-1, estimate, positions, {}, [], (points, normals)))
+    for look in range(3):
+        tree.relabel(look)
     merge_same(tree)
     assert len(tree.parts) == 2
 

@@ -15,9 +15,8 @@ LOSS = 0.5  # of evidence, for each point of a part: less is lost where another 
 def merge_same(tree: PartTree) -> None:
     """Of parts that turn about one hinge keep the one that is known best.
 
-    They are one part, which went further than it was sought, or showed its other side. What stands
-    still may have two doors above each other on one hinge, which are never at one place; and what
-    turns about the hinge of its carrier, where that has been, is its carrier.
+    They are one part, which went further than it was sought, or showed its other side; what turns
+    about the hinge of its carrier, where that has been, is its carrier.
     """
     for number in reversed(range(len(tree.parts))):
         part = tree.parts[number]
@@ -37,19 +36,26 @@ def merge_same(tree: PartTree) -> None:
 
 
 def _are_same(tree: PartTree, number: int, other: int) -> bool:
-    """Whether two parts turn about one hinge, as well as those beside each other are known, and
-    have been at one place, as far as something else may turn about that hinge as well."""
+    """Whether two parts turn about one hinge, as well as those beside each other are known.
+
+    As doors on one post or above each other do so as well, one of them has to explain what was seen
+    of the other, unless both are on a part that moves.
+    """
     part, one = tree.parts[number], tree.parts[other]
     if part.screw.joint != "revolute":
         return False
     if part.parent == one.parent:
         turned, aside = np.add(part.estimate.intervals, one.estimate.intervals)
         same = is_same_hinge(part.screw, one.screw, float(turned), float(aside))
-        return same and (part.parent >= 0 or _were_alike(tree, number, other))
+        if part.parent >= 0:
+            return same
+    else:
+        carried = part.parent == other or one.parent == number
+        same = carried and is_same_hinge(part.screw, one.screw)
     return (
-        (part.parent == other or one.parent == number)
-        and is_same_hinge(part.screw, one.screw)
+        same
         and _were_alike(tree, number, other)
+        and (_explains(tree, other, number) or _explains(tree, number, other))
     )
 
 

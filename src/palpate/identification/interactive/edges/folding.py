@@ -171,6 +171,8 @@ def _insert(
         tree.parts[carrier].positions[after] = tree.parts[carrier].positions[before] + turn
     if held in tree.parts:
         number = tree.parts.index(held)
+        if number in tree.carriers(carrier):  # it was taken for a part of what it carries
+            tree.parts[carrier] = hang(tree, tree.parts[carrier], -1, before)
         turn = _signed(tree.screw(number, before), pair.carried, pair.carried_turn)
         if held.parent != carrier:
             tree.parts[number] = held = hang(tree, held, carrier, before)

@@ -276,3 +276,31 @@ def test_a_part_at_an_edge_stays_a_hinge(monkeypatch) -> None:
     lid.edge = None
     twin.refit(0)
     assert len(asked) > 2
+
+
+def test_a_carrier_that_was_put_on_what_it_carries_stands_on_what_is_still(monkeypatch) -> None:
+    twin, notes = opened(Chest(LID)), Notes()
+    chest = Chest(LID)
+    chest.at(0.05, 0.0)
+    notes.look(chest.look())
+    chest.pull(notes, LEAF, (0.05, 0.0), (0.3, -0.5))
+    (pulled,) = notes.handled
+    before, after = twin.add_look(pulled.before), twin.add_look(pulled.after)
+    (lid,) = twin.parts
+    grip = Grip((UP, UP), ([], []), (HAND, HAND))
+    pair = HingePair(ALONG, 0.2, twin.screw(0, before), -0.5, grip)
+    own = [np.arange(200)] * 2
+
+    def insert(tree, *_, **__) -> None:
+        estimate = dataclasses.replace(lid.estimate, screw=ALONG)
+        new = dataclasses.replace(lid, parent=0, estimate=estimate, positions=[0.0] * (after + 1))
+        tree.parts.append(new)
+
+    for name, other in (
+        ("_best_pair", lambda *_: pair),
+        ("_own_points", lambda *_: (own, own)),
+        ("insert", insert),
+    ):
+        monkeypatch.setattr(folding, name, other)
+    assert discover_pair(twin, before, after, pulled) == 0
+    assert [part.parent for part in twin.parts] == [1, -1]

@@ -36,10 +36,12 @@ def merge_same(tree: PartTree) -> None:
 
 
 def _are_same(tree: PartTree, number: int, other: int) -> bool:
-    """Whether two parts turn about one hinge, as well as those beside each other are known.
+    """Whether two parts are one: on one carrier or on each other, and about one hinge.
 
-    As doors on one post or above each other do so as well, one of them has to explain what was seen
-    of the other, unless both are on a part that moves.
+    On one carrier hinges may differ by as much as they are uncertain. On a part that moves that is
+    enough. What stands still may have doors on one post or above each other: there, and for a part
+    on the other one, they also have to have been at one place, and one of them has to explain what
+    was seen of the other.
     """
     part, one = tree.parts[number], tree.parts[other]
     if part.screw.joint != "revolute":

@@ -334,9 +334,10 @@ def surprise(estimate: Estimate, way: Float[np.ndarray, "times 3"]) -> float:
 def _alike(
     positions: Float[np.ndarray, " looks"], seen: Sequence[Sighting | None], ways: Sequence[Way]
 ) -> dict[int, int]:
-    """Of looks that show a part, one that shows it at the same place: that or each other's.
+    """For each look that shows a part, the look that stands for all with it at the same place.
 
-    Where a hand took it, the look after is left out, if it is not seen to be elsewhere then.
+    Positions (rad or m) up to `LEAST` from each other are one place. Before and after a hand took
+    the part they are never one: the look after is left out then, as only the hand says how far.
     """
     known = [look for look, one in enumerate(seen) if one is not None and len(one.points) >= FEWEST]
     found: dict[int, int] = {}

@@ -124,7 +124,8 @@ STAGES = {
     ],
     "perception": [
         *("perception.velocity", "perception.image_folder", "perception.rope.tracking"),
-        *("perception.rope.marker_observer", "perception.clouds", "perception.surfaces"),
+        *("perception.rope.nodes", "perception.rope.marker_observer"),
+        *("perception.clouds", "perception.surfaces"),
         *("perception.visibility", "perception.surface_features", "perception.point_files"),
     ],
     "trials": [

@@ -81,13 +81,13 @@ def test_the_contract_has_the_filter(tmp_path):
     rope.stand_behind("passivity", 1.0)
     assert [channel.name for channel in rope.sensors] == ["gripper", "markers", "tank"]
     file = tmp_path / "policy.json"
-    write_contract(file, rope.policy, rope.manifest, "policy.onnx", rope.filter)
+    write_contract(file, rope, "policy.onnx")
     told = json.loads(file.read_text())["filter"]
     made = filter_of(told["name"], told["numbers"])
     assert isinstance(made, PassivityFilter)
     assert (made.tank.initial, made.tank.upper, made.fastest) == (1.0, 1.0, 1.5)
     assert "last channel, `tank`" in told["level"]
-    write_contract(file, rope.policy, rope.manifest, "policy.onnx")
+    write_contract(file, deployment_of(rope_policy(), manifest()), "policy.onnx")
     assert "filter" not in json.loads(file.read_text())
 
 

@@ -57,7 +57,7 @@ def run(options: Export) -> Path:
         for name in differences:
             write_bytes(targets[name], (run.path / name).read_bytes())
         if isinstance(policy, CommandPolicy):
-            write_contract(beside, policy, manifest, target.name, deployment.filter)
+            write_contract(beside, deployment, target.name)
         else:
             reflex = targets[REFLEX].name if REFLEX in differences else None
             write_actor_contract(beside, policy, deployment, target.name, reflex)

@@ -35,17 +35,9 @@ LEVEL = "J: what is left in its tank, which `palpate serve` is sent as its last 
 _TRAINED = ("command", "seed", "training", "model", "machine", "wall_time_s")
 
 
-def write_contract(
-    path: str | Path,
-    policy: CommandPolicy,
-    manifest: Mapping[str, Any],
-    file: str,
-    robot_filter: RobotFilter | None = None,
-) -> None:
-    """Write the contract of the policy, whose manifest this is, exported as `file`.
-
-    `robot_filter` is the filter of energy that the robot's program has to have.
-    """
+def write_contract(path: str | Path, deployment: Deployment[CommandPolicy], file: str) -> None:
+    """Write the contract of the deployment's policy, exported as `file`."""
+    policy, manifest = deployment.policy, deployment.manifest
     action = {"shape": ["batch", *policy.action_shape], "dtype": "float32"}
     content = {
         **_head(policy, manifest, file),
@@ -70,9 +62,10 @@ def write_contract(
             "method": "sum of weight x position over the last frames, oldest first, one a period",
             "weights_per_s": VelocityEstimator(policy.period).weights,
         },
+        **deployment.contract(),
         "trained": _training_of(manifest),
     }
-    write_json(path, content | _filter_of(robot_filter))
+    write_json(path, content | _filter_of(deployment.filter))
 
 
 def write_actor_contract(

@@ -119,6 +119,10 @@ class Deployment(Generic[Policy]):
             return ActorDecision(self.policy, self.scaling)
         return ChannelDecision(self.policy)
 
+    def contract(self) -> dict[str, Any]:
+        """What the contract of an exported network says beside what all say, by key."""
+        return {}
+
     def check(self) -> Check:
         """What tells possible states of `sensors` from impossible ones."""
         return ChannelCheck(self.sensors, self.period)

@@ -16,11 +16,17 @@ from palpate.families.rope.chain_check import ChainCheck
 from palpate.families.rope.counterpart import recorded_markers, rope_for, with_markers
 from palpate.family import check_name
 from palpate.networks import Channel, CommandPolicy
-from palpate.perception.rope.nodes import at_nodes
+from palpate.perception.rope.nodes import SMOOTHED, at_nodes, smooth_lengths
 from palpate.perception.velocity import VelocityEstimator
 from palpate.runs import Figure
 from palpate.safety.filters import FILTERS, OF_IMPEDANCES, PASSIVITY
 from palpate.trials.rope.stabilization import settling_time
+
+SEGMENTS = (
+    "each from one node to the next keeps its direction, and its length is length += "
+    "(1 - exp(-period_s / smoothed_over_s)) (seen - length), from what is seen first; relative "
+    "positions are their sums from the gripper, and velocities are those of these positions"
+)
 
 Network = Callable[[np.ndarray, np.ndarray], np.ndarray]  # features and command to a command
 
@@ -28,8 +34,9 @@ Network = Callable[[np.ndarray, np.ndarray], np.ndarray]  # features and command
 class RopeDecision:
     """A rope's policy, fed as in training: node positions relative to the gripper and velocities.
 
-    The nodes lie among the markers as `at_nodes` says; at the gripper its encoder is believed, not
-    its marker. Velocities are `VelocityEstimator`'s, of the last frames.
+    The nodes lie among the markers as `at_nodes` says, with lengths as `smooth_lengths` has them;
+    at the gripper its encoder is believed, not its marker. Velocities are `VelocityEstimator`'s, of
+    the last frames.
 
     Args:
         policy: trained for `palpate.tasks.RopeStabilization`.
@@ -44,6 +51,7 @@ class RopeDecision:
         nodes = nodes_of(policy)
         at_nodes(np.zeros((markers, 3)), nodes)  # which says now if there are too few
         self._network = network or NetworkDecision(policy)
+        self._period = policy.period
         self._weights = np.asarray(VelocityEstimator(policy.period).weights, np.float32)
         self._window = np.zeros((len(self._weights), nodes, 3), np.float32)
         self._features = np.empty((2, nodes - 1, 3), np.float32)
@@ -59,7 +67,9 @@ class RopeDecision:
         window[:-1] = window[1:]
         window[-1] = at_nodes(values["markers"], len(window[-1]))
         window[-1, 0] = values["gripper"]
-        if not self._started:
+        if self._started:
+            window[-1] = smooth_lengths(window[-2], window[-1], self._period)
+        else:
             window[:-1] = window[-1]
             self._started = True
 
@@ -85,6 +95,10 @@ class RopeDeployment(Deployment[CommandPolicy]):
 
     def decision(self) -> RopeDecision:
         return RopeDecision(self.policy, self.markers)
+
+    def contract(self) -> dict[str, Any]:
+        """See `Deployment.contract`: how positions are smoothed before anything is made of them."""
+        return {"segments": {"method": SEGMENTS, "smoothed_over_s": SMOOTHED}}
 
     def check(self) -> ChainCheck:
         """See `Deployment.check`. Raises `PalpateError` where the segments' length is unknown."""

@@ -9,7 +9,7 @@ import numpy as np
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
 from palpate.perception.rope.marker_observer import MarkerObserver
-from palpate.perception.rope.nodes import at_nodes
+from palpate.perception.rope.nodes import at_nodes, smooth_lengths
 from palpate.perception.velocity import VelocityEstimator
 from palpate.tasks.rope import RopeStabilization
 from palpate.tasks.rope.stabilization import HangingRopeTask
@@ -20,13 +20,13 @@ from palpate.worlds.rope.rope import RopeObservation
 class RopeObserver:
     """Markers as a camera sees them to states of a model with that many segments.
 
-    The nodes lie among the markers as `at_nodes` says. Where the gripper is, its encoder says
-    better than its marker. What is carried is a window of positions (frames, worlds, nodes, 3)
-    in m, from which velocities are estimated.
+    The nodes lie among the markers as `at_nodes` says, with lengths as `smooth_lengths` has them.
+    Where the gripper is, its encoder says better than its marker. What is carried is a window of
+    positions (frames, worlds, nodes, 3) in m, from which velocities are estimated.
     """
 
     def __init__(self, segments: int, period: float):
-        self._segments = segments
+        self._segments, self._period = segments, period
         self.estimator = VelocityEstimator(period)
 
     def start(self, observation: RopeObservation) -> np.ndarray:
@@ -37,13 +37,13 @@ class RopeObserver:
         self, window: np.ndarray, observation: RopeObservation
     ) -> tuple[np.ndarray, RopeState]:
         """The next window, and the states (worlds, nodes, 3); once for each new observation."""
-        positions = self.positions(observation)
+        positions = smooth_lengths(window[-1], self.positions(observation), self._period)
         window = np.concatenate([window[1:], positions[None]])
         weights = self.estimator.weights.astype(np.float32)
         return window, RopeState(jnp.asarray(positions), jnp.tensordot(weights, window, axes=1))
 
     def positions(self, observation: RopeObservation) -> np.ndarray:
-        """Of the nodes, (worlds, nodes, 3) in m; raises as `at_nodes`."""
+        """Of the nodes as they are seen, (worlds, nodes, 3) in m; raises as `at_nodes`."""
         positions = at_nodes(observation.markers, self._segments + 1).astype(np.float32)
         positions[:, 0] = observation.gripper_position
         return positions

@@ -17,7 +17,7 @@ from palpate.recordings.files import write_recording
 from palpate.runs import Figure
 from palpate.runs.progress import progress
 
-FIRST = 320_000  # seed of the first rope
+FIRST = 340_000  # seed of the first rope
 MARKERS, RATES = (5, 60), (20.0, 240.0)  # that ropes are drawn with
 TRIALS, LASTING = 3, 5.0  # of each recording, and s of each
 

@@ -231,9 +231,13 @@ def test_policy_is_fed_the_features_it_was_trained_on(nodes):
     task, policy = RopeStabilization(), policy_for(nodes)
     controller = LearnedController(policy, task)
     time = np.arange(12) * PERIOD
-    start = np.linspace([0, 0, 1.5], [0.6, 0, 0.7], 11)
-    rate = np.linspace([0.1, 0, 0], [0.4, -0.3, 0.2], 11)  # constant: any estimator finds it
-    frames = start + time[:, None, None] * rate
+    # carried along and turned: no segment becomes longer, which would be smoothed away
+    carried, swing, still = np.array([0.1, 0.2, 0]), 0.3 + 0.2 * time, 0 * time
+    down = np.stack([np.sin(swing), still, -np.cos(swing)], axis=1)
+    ahead = np.stack([np.cos(swing), still, np.sin(swing)], axis=1)
+    along = np.linspace(0, 1, 11)[:, None]
+    frames = (time[:, None] * carried)[:, None] + along * down[:, None]
+    rate = carried + along * 0.2 * ahead[-1]
     frames = np.stack([frames, frames[:, :, [1, 0, 2]]], axis=1)  # two worlds
     noisy = frames.copy()
     noisy[:, :, 0] += 0.1  # of the gripper the encoder is believed, not the marker

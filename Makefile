@@ -10,7 +10,7 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 PINS := pyproject.toml constraints.txt
 # A process grows to four or five gigabytes: more than two would fill a laptop. In the order of the
 # files, as the commands take longest: by the number of tests, they would come last and alone. Each
-# has a core, so its linear algebra waits for no second thread: a tenth of what the tests take.
+# has a core, so its linear algebra waits for no second thread: that took a tenth of the time.
 TESTS := OPENBLAS_NUM_THREADS=1 \
 	$(BIN)/python -m pytest --numprocesses=auto --maxprocesses=2 --dist=loadfile \
 	--no-loadscope-reorder

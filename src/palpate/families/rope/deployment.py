@@ -32,7 +32,7 @@ Network = Callable[[np.ndarray, np.ndarray], np.ndarray]  # features and command
 
 
 class RopeDecision:
-    """A rope's policy, fed as in training: node positions relative to the gripper and velocities.
+    """A rope's policy, fed as in its trials: node positions relative to the gripper and velocities.
 
     The nodes lie among the markers as `at_nodes` says, with lengths as `smooth_lengths` has them;
     at the gripper its encoder is believed, not its marker. Velocities are `VelocityEstimator`'s, of

@@ -112,8 +112,9 @@ def test_what_is_missed_and_what_is_flagged_falsely_is_counted(tmp_path, monkeyp
     found = spoilt.check_recordings(Experiment("own-rope", tmp_path, True, 0), 2)
     rate, false = found.figures()
     assert (rate.value, false.value) == (0.5, 1)
-    assert found.missed == ["320001, rate halved: unit"]
-    assert found.false == ["320001: rate: it is"]
+    second = spoilt.FIRST + 1
+    assert found.missed == [f"{second}, rate halved: unit"]
+    assert found.false == [f"{second}: rate: it is"]
 
 
 def test_the_headline_is_the_worst_rope_in_the_worse_world():

@@ -34,7 +34,7 @@ from palpate.runs.run import RESULT
 
 NAME = "own-model"
 EXAMPLE = Path(__file__).parents[3] / "examples" / "door.py"  # in a checkout
-FIRST = 265_000  # seed of the first door
+FIRST = 266_000  # seed of the first door
 # Seconds between two angles, and MuJoCo's steps in them: its own error, half a step of time, is to
 # stay below the noise.
 PERIOD, STEPS = 0.02, 200

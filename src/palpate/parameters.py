@@ -251,6 +251,11 @@ class FreeParameters(eqx.Module):
     @property
     def initial(self) -> dict[str, Array]:
         """Free values of the reference model (the mean over the elements of a shared one)."""
+        free = self._initial()
+        return {path: free[path] for path in self.declarations}  # compiled functions sort a dict
+
+    @eqx.filter_jit
+    def _initial(self) -> dict[str, Array]:
         free = {}
         for path, declaration in self.declarations.items():
             value = value_of(self.reference, path)
@@ -262,6 +267,7 @@ class FreeParameters(eqx.Module):
         """The legal model at these free values."""
         return self.unconstrained(free).constrain()
 
+    @eqx.filter_jit
     def project(self, free: dict[str, Array]) -> dict[str, Array]:
         """The free values of the legal model at these: a descent that leaves the legal set returns.
 
@@ -284,13 +290,18 @@ class FreeParameters(eqx.Module):
 
     def unconstrained(self, free: dict[str, Array]) -> Any:
         """As `build`, before what couples several parameters is applied."""
+        return with_values(self.reference, self._values(free))
+
+    @eqx.filter_jit
+    def _values(self, free: dict[str, Array]) -> dict[str, Array]:
         values = {}
         for path, declaration in self.declarations.items():
             reference = value_of(self.reference, path)
             value = declaration.prior.to_value(free[path], reference)
             values[path] = jnp.broadcast_to(value, reference.shape).astype(reference.dtype)
-        return with_values(self.reference, values)
+        return values
 
+    @eqx.filter_jit
     def penalty(self, free: dict[str, Array]) -> Float[Array, ""]:
         """Minus the logarithm of the prior density, up to a constant: half the squared norm."""
         return 0.5 * sum(

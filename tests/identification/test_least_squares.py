@@ -86,7 +86,7 @@ def test_curved_products_are_the_derivatives_of_the_loss_beyond_its_knee():
         return jnp.sum(pseudo_huber(relative, KNEE))
 
     curved, straight = (
-        objective.products(coordinates.initial, start, segments, False, curved).sum(axis=1)
+        objective.products(coordinates.initial, start, segments, curved).sum(axis=1)[:, 3:, 3:]
         for curved in (True, False)
     )
     slope, curvature = jax.grad(loss)(start.ravel()), jax.hessian(loss)(start.ravel())

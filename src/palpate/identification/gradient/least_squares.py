@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import observation_scale, predict, residuals
@@ -77,21 +77,23 @@ class Objective(eqx.Module):
         free: Free,
         offset: Array,
         segments: Segments,
-        parameters: bool = True,
         curved: bool = False,
     ) -> Float[np.ndarray, "segments blocks columns columns"]:
         """Products of the weighted columns of the Jacobian and the residual, by tenth of a segment.
 
-        Columns: the free values in the order of `ravel_pytree` (not without `parameters`), the
-        errors of a segment's own start, the residual. A few segments at a time. Those of the
-        Jacobian with itself have the weights whose slope is the loss's, or, `curved`, its curvature
-        (pseudo-Huber's is less, beyond the knee by far).
+        Columns: the free values in the order of `ravel_pytree`, the errors of a segment's own
+        start, the residual. A few segments at a time. Those of the Jacobian with itself have the
+        weights whose slope is the loss's, or, `curved`, its curvature (pseudo-Huber's is less,
+        beyond the knee by far).
         """
-        parts = []
-        for first in range(0, segments.count, GROUP):
-            own = jax.tree.map(lambda x, f=first: x[f : f + GROUP], (offset, segments))
-            parts.append(np.asarray(_products(self, free, own, parameters, curved)))
-        return np.concatenate(parts)
+        everything = jax.tree.map(np.asarray, (offset, segments))
+        size, parts = min(GROUP, segments.count), []
+        for first in range(0, segments.count, size):
+            # The last group repeats its last segment: all have one shape, which is compiled once.
+            chosen = np.minimum(np.arange(first, first + size), segments.count - 1)
+            own = jax.tree.map(lambda x, c=chosen: x[c], everything)
+            parts.append(np.asarray(_products(self, free, own, np.asarray(curved))))
+        return np.concatenate(parts)[: segments.count]
 
     def step(
         self, free: Free, offset: Array, damping: Array, segments: Segments
@@ -126,8 +128,7 @@ def _products(
     objective: Objective,
     free: Free,
     starting: tuple[Array, Segments],
-    parameters: bool,
-    curved: bool,
+    curved: Bool[np.ndarray | Array, ""],
 ) -> Array:
     offset, segments = starting
     flat, unravel = ravel_pytree(free)
@@ -143,11 +144,11 @@ def _products(
         return push(direction[:unknowns], moved.reshape(offset.shape))
 
     directions = jnp.eye(unknowns + starts, dtype=flat.dtype)
-    columns = jax.vmap(along)(directions[0 if parameters else unknowns :])
+    columns = jax.vmap(along)(directions)
     weight, bend = segments.seen.astype(flat.dtype), jnp.ones_like(residual)
     if objective.knee is not None:
         share = objective.knee / jnp.sqrt(jnp.square(residual) + objective.knee**2)
-        weight, bend = weight * share, share if curved else bend
+        weight, bend = weight * share, jnp.where(curved, share, bend)
     # The curvature is the weight times `bend` squared; with the residual it is the slope.
     columns = jnp.concatenate([columns * bend, residual[None] / bend]) * jnp.sqrt(weight)
     time = -residual.shape[1] % BLOCKS
@@ -237,7 +238,8 @@ def intervals(coordinates: FreeParameters, free: Free, aligned: Aligned) -> Inte
     objective = Objective(coordinates, observation_scale(aligned, coordinates.reference), KNEE)
     flat, unravel = ravel_pytree(free)
     # The best starts first: about others the parameters' slope is a small difference of large sums.
-    alone = objective.products(free, offset, segments, False).sum(axis=1, dtype=np.float64)
+    products = objective.products(free, offset, segments)
+    alone = products[:, :, flat.size :, flat.size :].sum(axis=1, dtype=np.float64)
     if (lost := ~np.isfinite(alone).all(axis=(1, 2))).any():
         raise PalpateError(
             f"trial {np.argmax(lost)} cannot be predicted from its start to its end: errors or "

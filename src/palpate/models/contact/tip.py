@@ -20,7 +20,6 @@ Walls = Float[Array, "*batch walls"]
 Point = Float[Array, "*batch 2"]
 
 SUBSTEP = 1.25e-3  # s, of the integration, at most: of twice that stiffnesses were .2 % further off
-UNROLLED = 4  # so many of them in a control period are written out
 OF_WALLS = "position", "tilt", "stiffness", "damping", "friction", "wall_mass"
 SLIP = 1e-5  # m/s, the sliding velocity at which three quarters of a wall's friction are there
 
@@ -195,8 +194,7 @@ class Tip(Model):
                 sensed = force + late * (state.force - force)
                 return TipState(position, velocity, sensed, plates), None
 
-            unroll = count <= UNROLLED
-            return jax.lax.scan(advanced, state, as_floating(moments), unroll=unroll)[0]
+            return jax.lax.scan(advanced, state, as_floating(moments))[0]
 
         return step
 

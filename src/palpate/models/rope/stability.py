@@ -44,6 +44,7 @@ SHARES = {
 }
 
 
+@eqx.filter_jit
 def load(rope: RopeParameters) -> Float[Array, "*batch nodes"]:
     """How much of the stability limit each node uses: stable below 4."""
     return sum(_loads(rope).values(), start=jnp.zeros(()))
@@ -62,6 +63,14 @@ def soften(rope: SomeRope) -> SomeRope:
     leave, if that is more; one that asks for more is scaled down alone, where it does. No value an
     optimiser can reach is unstable, and one parameter beyond its limit does not wear others down.
     """
+    softened = _softened(rope)
+    return eqx.tree_at(
+        lambda rope: [getattr(rope, name) for name in softened], rope, list(softened.values())
+    )
+
+
+@eqx.filter_jit
+def _softened(rope: RopeParameters) -> dict[str, Array]:
     loads = _loads(rope)
     left = jnp.asarray(LIMIT, rope.node_mass.dtype)
     softened = {}
@@ -75,11 +84,10 @@ def soften(rope: SomeRope) -> SomeRope:
         factor = jnp.where(excess > 1.0001, 1.0 / excess, 1.0)
         softened[name] = value * _weakest(factor, name, value)
         left = jnp.maximum(left - _load_of(rope, name, softened[name]), 1e-5)  # rounding
-    return eqx.tree_at(
-        lambda rope: [getattr(rope, name) for name in softened], rope, list(softened.values())
-    )
+    return softened
 
 
+@eqx.filter_jit
 def _loads(rope: RopeParameters) -> dict[str, Array]:
     return {name: _load_of(rope, name, getattr(rope, name)) for name in SHARES}
 

@@ -193,8 +193,14 @@ def _normals(
     A point without a plane floats in the air, as pixels on edges do.
     """
     distance, neighbours = tree.query(points, min(NEIGHBOURS, len(points)))
-    around = points[neighbours] - points[neighbours].mean(axis=1, keepdims=True)
-    spread = np.einsum("nki,nkj->nij", around, around) / neighbours.shape[1]
+    # Means over neighbours of the points and their products: a fifth of the time of gathering them.
+    count, each = neighbours.shape
+    start, share = each * np.arange(count + 1), np.full(neighbours.size, 1.0 / each)
+    average = csr_array((share, neighbours.ravel(), start), shape=(count, count))
+    local = points - points.mean(axis=0)
+    products = (local[:, :, None] * local[:, None]).reshape(count, 9)
+    mean = average @ local
+    spread = (average @ products).reshape(count, 3, 3) - mean[:, :, None] * mean[:, None]
     values, vectors = np.linalg.eigh(spread)
     normals = vectors[:, :, 0]
     toward = np.vecdot(normals, viewpoints - points)

@@ -292,8 +292,18 @@ def noise_scale(aligned: Aligned, model: Model, fast: bool = False) -> Float[np.
 
 
 def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """The model's difference of two arrays of observations, in float64."""
-    return np.asarray(model.difference(jnp.asarray(predicted), jnp.asarray(observed)), np.float64)
+    """The model's difference of two arrays of observations, in float64.
+
+    Of so many at a time as a power of two says: trials and pieces have many lengths, and XLA
+    would compile one subtraction for each.
+    """
+    pair = np.broadcast_arrays(predicted, observed)
+    shape, each = pair[0].shape, model.observation_shape
+    count = math.prod(shape[: len(shape) - len(each)])
+    padded = np.zeros((2, 1 << max(count - 1, 0).bit_length(), *each), pair[0].dtype)
+    padded[:, :count] = np.reshape(pair, (2, count, *each))
+    off = np.asarray(model.difference(*map(jnp.asarray, padded)), np.float64)
+    return off[:count].reshape(shape)
 
 
 def stands_still(model: Model, early: np.ndarray, late: np.ndarray, noise: np.ndarray) -> bool:

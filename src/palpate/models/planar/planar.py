@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,6 +84,7 @@ class Planar(PlanarParameters):
         off = predicted - observed
         return off.at[..., 2].set(wrap_angle(off[..., 2]))
 
+    @eqx.filter_jit
     def initial_state(self, observations: Float[Array, "*batch frames bodies 3"]) -> PlanarState:
         """The state at the last of a few frames: on the straight line that fits them best.
 

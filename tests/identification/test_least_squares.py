@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
 from palpate.identification.data.prediction import observation_scale
-from palpate.identification.data.segments import SegmentSource
+from palpate.identification.data.segments import SegmentSource, difference
 from palpate.identification.gradient.least_squares import (
     KNEE,
     Objective,
@@ -98,6 +98,22 @@ def test_curved_products_are_the_derivatives_of_the_loss_beyond_its_knee():
     np.testing.assert_allclose(curved[:, -1, -1], straight[:, -1, -1], rtol=1e-5)
 
 
+def test_products_of_many_segments_are_those_of_each():
+    """Six in groups of four: the second group is filled up to the first one's shape."""
+    cart, random = GearedCart(gear=1.0, mass=1.0, friction=1.0), np.random.default_rng(0)
+    moving = np.cumsum(random.normal(size=(6, 31, 1)), axis=1)
+    aligned = Aligned(0.05, moving, random.normal(size=(6, 30, 1)), np.full(6, 31))
+    segments, coordinates = SegmentSource.of(aligned, cart).whole(), FreeParameters(cart)
+    objective = Objective(coordinates, observation_scale(aligned, cart), KNEE)
+    start = jnp.asarray(random.normal(size=(6, 2, 1)), jnp.float32)
+    products = objective.products(coordinates.initial, start, segments)
+    each = [
+        objective.products(coordinates.initial, start[i : i + 1], segments.take([i]))
+        for i in range(6)
+    ]
+    np.testing.assert_allclose(products, np.concatenate(each), rtol=1e-4, atol=1e-6)
+
+
 def test_a_trial_that_jumps_out_of_all_bounds_is_named():
     cart = GearedCart(gear=1.0, mass=1e-3, friction=1e-3)
     moving = np.tile(np.linspace(0.0, 1.0, 61, dtype=np.float32)[:, None], (4, 1, 1))
@@ -173,3 +189,15 @@ def test_one_stiffness_is_named_beside_the_masses_of_many_nodes():
     assert warned({"mass": masses, "shape": shape, "stiffness": stiffness}) == [
         ("mass", "stiffness")
     ]
+
+
+@pytest.mark.parametrize(("shape", "other"), [((7, 5), (7, 5)), ((5, 7), ()), ((), ()), ((0,), ())])
+def test_differences_of_any_number_of_observations_are_each_its_own(shape, other):
+    """Their number is filled up to a power of two, and observations that all share are repeated."""
+    random = np.random.default_rng(0)
+    cart = GearedCart(gear=1.0, mass=1.0, friction=1.0)
+    predicted, observed = random.normal(size=(*shape, 1)), random.normal(size=(*other, 1))
+    off = difference(cart, predicted, observed)
+    assert off.dtype == np.float64
+    np.testing.assert_allclose(off, predicted - observed, atol=1e-6)
+    assert off.shape == (*shape, 1)

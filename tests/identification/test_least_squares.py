@@ -201,3 +201,5 @@ def test_differences_of_any_number_of_observations_are_each_its_own(shape, other
     assert off.dtype == np.float64
     np.testing.assert_allclose(off, predicted - observed, atol=1e-6)
     assert off.shape == (*shape, 1)
+    whole = np.zeros((*shape, 1), int)  # its type is not the other's
+    np.testing.assert_allclose(difference(cart, whole, observed), whole - observed, atol=1e-6)

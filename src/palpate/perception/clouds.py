@@ -193,7 +193,7 @@ def _normals(
     A point without a plane floats in the air, as pixels on edges do.
     """
     distance, neighbours = tree.query(points, min(NEIGHBOURS, len(points)))
-    # Means over neighbours of the points and their products: a fifth of the time of gathering them.
+    # Means over neighbours of the points and of their products: to gather them takes longer.
     count, each = neighbours.shape
     start, share = each * np.arange(count + 1), np.full(neighbours.size, 1.0 / each)
     average = csr_array((share, neighbours.ravel(), start), shape=(count, count))

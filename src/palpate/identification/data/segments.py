@@ -300,7 +300,7 @@ def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.
     pair = np.broadcast_arrays(predicted, observed)
     shape, each = pair[0].shape, model.observation_shape
     count = math.prod(shape[: len(shape) - len(each)])
-    padded = np.zeros((2, 1 << max(count - 1, 0).bit_length(), *each), pair[0].dtype)
+    padded = np.zeros((2, 1 << max(count - 1, 0).bit_length(), *each), np.result_type(*pair))
     padded[:, :count] = np.reshape(pair, (2, count, *each))
     off = np.asarray(model.difference(*map(jnp.asarray, padded)), np.float64)
     return off[:count].reshape(shape)

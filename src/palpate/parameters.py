@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from palpate.errors import PalpateError
+from palpate.numerics.arrays import as_array
 
 _METADATA = "palpate.parameter"
 
@@ -142,7 +143,7 @@ def as_floating(value: Any) -> Array:
     Never a weak dtype: an int here and a float there would be traced anew each time.
     """
     kept = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
-    return jnp.asarray(value, dtype=value.dtype if kept else jnp.asarray(0.0).dtype)
+    return as_array(value, value.dtype if kept else jnp.zeros(()).dtype)
 
 
 def axes_of(kind: type) -> dict[str, list[str]]:

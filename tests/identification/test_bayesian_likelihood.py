@@ -48,7 +48,7 @@ def test_the_likelihood_is_that_of_the_dense_normal_distribution():
     target = motion_posterior(sled, segments, inferred_scales(sled, NOISE))
     position = initial_position(target) + 0.1
     target = target.linearised(position)
-    found = np.asarray(target.by_segment(position))
+    found = np.asarray(eqx.filter_jit(target.by_segment)(position))
     kernel = discrepancy_covariance(0.02 * np.arange(1, 21))
     model = target.model(position)
     noise, growth = np.asarray(target.noise(position)), np.asarray(target.growth(position))
@@ -91,8 +91,8 @@ def test_curvature_is_that_of_the_expected_information():
     exact = known_start(pose, pose, actions, from_start(sled, blank))
     target = motion_posterior(sled, exact, known_scales(sled, NOISE))
     position = initial_position(target)
-    value, slope, curvature = target.curvature(position)
-    assert value == pytest.approx(float(target.density(position)))
+    value, slope, curvature = eqx.filter_jit(target.curvature)(position)
+    assert value == pytest.approx(float(eqx.filter_jit(target.density)(position)))
     gradient, hessian = jax.jit(jax.grad(target.density)), jax.jit(jax.hessian(target.density))
     np.testing.assert_allclose(slope, gradient(position), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(curvature, -hessian(position), rtol=1e-6)
@@ -104,8 +104,10 @@ def test_several_positions_side_by_side_are_each_by_itself():
     segments = cut(pushes(SLED, 1, trials=2, frames=31), sled, 0.2)
     target = motion_posterior(sled, segments, inferred_scales(sled, NOISE))
     positions = jnp.asarray(np.random.default_rng(0).normal(size=(3, target.dimension))) * 0.3
-    densities, curvatures = target.densities(positions), target.curvatures(positions)
-    slopes = jax.grad(lambda p: jnp.sum(target.densities(p)))(positions)
+    densities, curvatures = jax.jit(lambda p: (target.densities(p), target.curvatures(p)))(
+        positions
+    )
+    slopes = jax.jit(jax.grad(lambda p: jnp.sum(target.densities(p))))(positions)
 
     @jax.jit
     def alone(position):
@@ -184,9 +186,11 @@ def test_angles_are_wrapped():
     turned = recording.observation.copy()
     turned[..., 2] += np.float32(4.0 * np.pi)
     densities = [
-        motion_posterior(
-            SLED, cut(aligned, SLED, 1.0, at_rest=True), known_scales(SLED, NOISE)
-        ).by_segment(jnp.zeros(3))
+        eqx.filter_jit(
+            motion_posterior(
+                SLED, cut(aligned, SLED, 1.0, at_rest=True), known_scales(SLED, NOISE)
+            ).by_segment
+        )(jnp.zeros(3))
         for aligned in (recording, aligned_with(recording, turned))
     ]
     np.testing.assert_allclose(*densities, rtol=1e-3)
@@ -337,7 +341,9 @@ def test_the_most_probable_error_of_a_start_is_found_where_the_model_is_not_line
         found[name] = target.linearised(position, rounds)
     start = found["good"].error - off.reshape(2, 2)
     assert np.allclose(found["bad"].error, start, atol=0.01)
-    densities = {name: float(t.log_likelihood(position)) for name, t in found.items()}
+    densities = {
+        name: float(eqx.filter_jit(t.log_likelihood)(position)) for name, t in found.items()
+    }
     # The two differ by the prior of the starts' errors, half a square each.
     prior = 0.5 * float(jnp.sum(jnp.square(start)) - jnp.sum(jnp.square(found["good"].error)))
     assert densities["bad"] == pytest.approx(densities["good"] - prior, abs=0.5)
@@ -378,10 +384,10 @@ def test_starts_that_ring_on_are_not_taken_for_damping():
         return (float(densities[1]) - float(densities[0])) / 0.2
 
     sides = here.at[index].add(-0.1), here.at[index].add(0.1)
-    anew = slope([target.linearised(side).density(side) for side in sides])
-    assert slope([target.density(side) for side in sides]) == pytest.approx(anew, abs=0.05)
+    anew = slope([eqx.filter_jit(target.linearised(side).density)(side) for side in sides])
+    assert slope(list(map(eqx.filter_jit(target.density), sides))) == pytest.approx(anew, abs=0.05)
     fixed = eqx.tree_at(lambda t: t.volume_slope, target, jnp.zeros_like(target.volume_slope))
-    assert slope([fixed.density(side) for side in sides]) < anew - 0.2
+    assert slope(list(map(eqx.filter_jit(fixed.density), sides))) < anew - 0.2
 
 
 def test_a_trial_that_rests_to_its_end_is_not_lost():

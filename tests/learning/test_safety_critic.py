@@ -68,7 +68,7 @@ def test_nothing_counts_beyond_a_violation_or_an_end() -> None:
     lived = chain()
     state = CRITIC.init(jax.random.key(0), LENGTH + 1, 1)
     only = jax.tree.map(lambda leaf: jnp.asarray(leaf[LENGTH - 1 :]), lived)
-    _, figures = CRITIC.update(state, only, jnp.zeros((2, 1)))
+    _, figures = jax.jit(CRITIC.update)(state, only, jnp.zeros((2, 1)))
     assert figures["risk"] == 0.5  # 1 of the violation, 0 of the end: nothing of what follows
 
 

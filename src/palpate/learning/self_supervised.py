@@ -19,6 +19,7 @@ from palpate.errors import PalpateError
 from palpate.learning.closed_loop import simulate
 from palpate.models.model import Model
 from palpate.networks.policy import CommandPolicy
+from palpate.numerics.arrays import as_array
 from palpate.numerics.devices import data_parallel, everywhere
 from palpate.parameters import randomise
 from palpate.runs import Run
@@ -144,7 +145,7 @@ def train(
                     run.save(iteration, state)
             if stop:
                 break
-    return eqx.combine(jax.tree.map(jnp.asarray, jax.device_get(state.policy)), static)
+    return eqx.combine(jax.tree.map(as_array, jax.device_get(state.policy)), static)
 
 
 def _finite(value: Array) -> float | None:

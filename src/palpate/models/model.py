@@ -172,6 +172,7 @@ def batch_size(model: Model, actions: Array) -> int | None:
     return actions.shape[0] if axes else None
 
 
+@eqx.filter_jit
 def rollout(model: Model, state: State, actions: Array) -> State:
     """The states after each action, open loop.
 

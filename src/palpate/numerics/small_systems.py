@@ -4,11 +4,14 @@ JAX hands such batches to LAPACK on the threads that also run the rest of the pr
 wait for each other for ever (seen with JAX 0.10 on two cores). These are loops over columns.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+@jax.jit
 def cholesky(matrix: Float[Array, "*batch size size"]) -> Float[Array, "*batch size size"]:
     """Lower triangular L with L L' = `matrix`; not finite where that is not positive definite."""
     rows = jnp.arange(matrix.shape[-1])
@@ -44,6 +47,7 @@ def solve(
     return solve_upper(root, solve_lower(root, right[..., None]))[..., 0]
 
 
+@functools.partial(jax.jit, static_argnames="backwards")
 def _substitute(triangle: Array, right: Array, backwards: bool) -> Array:
     """Solve for one unknown after another, the last one first if `backwards`."""
 

@@ -14,6 +14,7 @@ from jaxtyping import Array
 
 from palpate.identification.data.segments import difference
 from palpate.models.model import Model
+from palpate.numerics.arrays import as_array
 
 PANELS = 6  # numbers of an observation that the page shows
 Against = Mapping[str, tuple[Model, np.ndarray | Array]]
@@ -27,7 +28,7 @@ def in_space(
     What the models believe of the object (`Model.drawing`) is drawn with what they predict, and
     not with the reference, which nobody believes.
     """
-    seen = model.drawing(jnp.asarray(reference)).get("")
+    seen = model.drawing(as_array(reference)).get("")
     chains = {} if seen is None else {called: np.asarray(seen)}
     for label, (of, predicted) in against.items():
         lines = _side_by_side(of, predicted) if _several(model, predicted) else of.drawing(

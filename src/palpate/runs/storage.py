@@ -246,6 +246,8 @@ def _as_like(path: str | Path, name: str, stored: Any, key: str | None, like: An
     import jax
     import numpy as np
 
+    from palpate.numerics.arrays import as_array
+
     found = stored if key is None else jax.random.wrap_key_data(stored, impl=key)
     expected = like if hasattr(like, "dtype") else np.asarray(like)
     fits = found.shape == expected.shape and found.dtype == expected.dtype
@@ -263,7 +265,7 @@ def _as_like(path: str | Path, name: str, stored: Any, key: str | None, like: An
         return type(like)(found.item())
     if isinstance(like, np.ndarray) or key is not None:
         return found
-    return jax.numpy.asarray(found)
+    return as_array(found)
 
 
 def _open(path: str | Path) -> Any:

@@ -27,6 +27,7 @@ from palpate.identification.posterior.comparison import explore, posterior_of, s
 from palpate.models.model import Model
 from palpate.models.planar import Planar
 from palpate.models.planar.planar import wrap_angle
+from palpate.numerics.arrays import as_array
 from palpate.parameters import declare, parameters_of, value_of, with_values
 from palpate.recordings import Recording
 from palpate.runs.progress import progress
@@ -227,7 +228,7 @@ def _with_pivots(model: Planar, held: Mapping[int, Held]) -> Planar:
         anchor[body, 0] = own / np.asarray(model.half_extent[body])
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         pose[body, 0] = (*(place - turn @ own), angle)
-    return dataclasses.replace(model, link_anchor=jnp.asarray(anchor), link_pose=jnp.asarray(pose))
+    return dataclasses.replace(model, link_anchor=as_array(anchor), link_pose=as_array(pose))
 
 
 def _begun(model: Planar, pieces: Sequence[Model]) -> Planar:

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 
 from palpate.errors import PalpateError
 from palpate.models.model import Model
+from palpate.numerics.arrays import as_array
 from palpate.recordings import Aligned
 
 REACH = 0.2  # s before and after a frame that its smoothed pose is taken from, at most
@@ -251,7 +252,7 @@ def cut(
 def _join(pieces: list[tuple[np.ndarray, ...]], relaxation: int = 0) -> Segments:
     columns = [np.stack(column) for column in zip(*pieces, strict=True)]
     return Segments(
-        *(jnp.asarray(c, bool if c.dtype == bool else jnp.zeros(()).dtype) for c in columns),
+        *(as_array(c, bool if c.dtype == bool else jnp.zeros(()).dtype) for c in columns),
         relaxation=relaxation,
     )
 
@@ -302,8 +303,13 @@ def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.
     count = math.prod(shape[: len(shape) - len(each)])
     padded = np.zeros((2, 1 << max(count - 1, 0).bit_length(), *each), np.result_type(*pair))
     padded[:, :count] = np.reshape(pair, (2, count, *each))
-    off = np.asarray(model.difference(*map(jnp.asarray, padded)), np.float64)
+    off = np.asarray(_difference(model, as_array(padded)), np.float64)
     return off[:count].reshape(shape)
+
+
+@eqx.filter_jit
+def _difference(model: Model, pair: Array) -> Array:
+    return model.difference(pair[0], pair[1])
 
 
 def stands_still(model: Model, early: np.ndarray, late: np.ndarray, noise: np.ndarray) -> bool:

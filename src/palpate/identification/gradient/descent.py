@@ -23,6 +23,7 @@ from palpate.identification.data.segments import Segments, SegmentSource
 from palpate.identification.gradient.least_squares import KNEE, Free, Objective
 from palpate.models.model import Model
 from palpate.numerics import devices
+from palpate.numerics.arrays import as_array
 from palpate.parameters import FreeParameters
 from palpate.recordings import Aligned
 from palpate.runs import Run
@@ -228,7 +229,7 @@ def identify(
                 run.log(step, loss=loss if np.isfinite(loss) else None, horizon=horizon)
                 if stop or descent.within == 0 or step % 50 == 0:
                     run.save(step, descent)
-    return coordinates.build(jax.tree.map(jnp.asarray, jax.device_get(descent.free)))
+    return coordinates.build(jax.tree.map(as_array, jax.device_get(descent.free)))
 
 
 def _horizon(source: SegmentSource, share: float) -> int:
@@ -255,7 +256,7 @@ def _iterate(
         segments = source.sample(rng, settings.windows, horizon)
         rows = np.full(segments.count, -1)
     remaining = 1.0 - descent.within / settings.iterations[descent.stage] if last else 1.0
-    free, offset, optimiser, loss = method.step(descent, segments, jnp.asarray(rows), remaining)
+    free, offset, optimiser, loss = method.step(descent, segments, as_array(rows), remaining)
     loss = float(loss)
     halvings, finite = descent.halvings, descent.finite + 1
     if not np.isfinite(loss):

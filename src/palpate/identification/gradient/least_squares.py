@@ -22,6 +22,7 @@ from palpate.errors import PalpateError
 from palpate.identification.data.prediction import observation_scale, predict, residuals
 from palpate.identification.data.segments import Segments, SegmentSource
 from palpate.identification.verdicts import undecided, verdict
+from palpate.numerics.arrays import as_array
 from palpate.parameters import FreeParameters, value_of
 from palpate.recordings import Aligned
 
@@ -114,9 +115,9 @@ class Objective(eqx.Module):
         gradient = reduced.gradient + weight * np.asarray(flat)
         diagonal = np.diag(np.diag(matrix) + 1e-12)
         change = np.linalg.solve(matrix + float(damping) * diagonal, -gradient)
-        proposal = self.coordinates.project(unravel(flat + jnp.asarray(change, flat.dtype)))
+        proposal = self.coordinates.project(unravel(flat + as_array(change, flat.dtype)))
         moved = own + reduced.start - reduced.slope @ change
-        starts = jnp.asarray(moved.reshape(offset.shape), offset.dtype)
+        starts = as_array(moved.reshape(offset.shape), offset.dtype)
         after, _ = _value(self, proposal, starts, segments)
         if np.isfinite(after) and after < before:
             return proposal, starts, jnp.maximum(damping / 3.0, 1e-7), mean

@@ -32,6 +32,7 @@ from palpate.identification.gradient.least_squares import KNEE, pseudo_huber
 from palpate.models.model import Model
 from palpate.models.residual import Residual, SiteNetwork, correctable
 from palpate.numerics import devices
+from palpate.numerics.arrays import as_array
 from palpate.recordings import Aligned
 from palpate.runs import Run
 from palpate.runs.progress import interruptible, progress
@@ -286,7 +287,7 @@ def _iteration(
 
 def _on_default_device(tree: SiteNetwork) -> SiteNetwork:
     """The arrays on the default device alone."""
-    return jax.tree.map(jnp.asarray, jax.device_get(tree))
+    return jax.tree.map(as_array, jax.device_get(tree))
 
 
 def _verdict(physics: PredictionError, corrected: PredictionError, size: float) -> tuple[bool, str]:

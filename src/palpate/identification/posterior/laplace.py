@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from palpate.errors import PalpateError
 from palpate.identification.posterior.likelihood import MotionPosterior, initial_position
 from palpate.identification.samplers.target import Target
+from palpate.numerics.arrays import as_array
 from palpate.numerics.devices import compile_at_once, over_devices
 from palpate.runs.progress import Watch, without_progress
 
@@ -53,12 +54,18 @@ class Modes(eqx.Module):
 
     def draw(self, key: PRNGKeyArray, count: int) -> Array:
         """Draws (count, free) from the mixture, modes weighted by their evidence."""
-        which, where = jax.random.split(key)
-        chosen = jax.random.categorical(which, self.evidence, shape=(count,))
-        noise = jax.random.normal(where, (count, self.position.shape[1]), self.position.dtype)
+        chosen, noise = _chance(key, self.evidence, (count, self.position.shape[1]))
         root = np.linalg.cholesky(np.asarray(self.covariance, np.float64))[np.asarray(chosen)]
         off = np.einsum("nij,nj->ni", root, np.asarray(noise, np.float64))
-        return jnp.asarray(np.asarray(self.position)[np.asarray(chosen)] + off, noise.dtype)
+        return as_array(np.asarray(self.position)[np.asarray(chosen)] + off, noise.dtype)
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _chance(key: PRNGKeyArray, evidence: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """The mode that each of many draws is of, and standard normal numbers, (count, free)."""
+    which, where = jax.random.split(key)
+    chosen = jax.random.categorical(which, evidence, shape=shape[:1])
+    return chosen, jax.random.normal(where, shape, evidence.dtype)
 
 
 def find_modes(target: Target, key: PRNGKeyArray, starts: int = 8, steps: int = 40) -> Modes:
@@ -123,7 +130,7 @@ def climb_each(
     dtype = jnp.zeros(()).dtype
 
     def rounded(part: np.ndarray) -> Array:
-        return jnp.asarray(part[order], dtype)
+        return as_array(part[order], dtype)
 
     return Modes(
         position=rounded(here),
@@ -154,7 +161,7 @@ def look(
 def _finite(
     curvature: Callable[[Array], tuple[ArrayLike, ...]], position: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    here = jnp.asarray(position, jnp.zeros(()).dtype)
+    here = as_array(position, jnp.zeros(()).dtype)
     value, slope, information = (np.array(x, np.float64) for x in curvature(here))
     finite = np.isfinite(value) & np.isfinite(slope).all(-1)
     finite &= np.isfinite(information).all((-2, -1))

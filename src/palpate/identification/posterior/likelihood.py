@@ -34,6 +34,7 @@ from palpate.identification.data.segments import Segments
 from palpate.identification.posterior.discrepancy import eigenvectors
 from palpate.identification.samplers.target import Target
 from palpate.models.model import FORCES, Model
+from palpate.numerics.arrays import as_array
 from palpate.numerics.devices import compile_at_once
 from palpate.numerics.small_systems import cholesky, solve, solve_lower
 from palpate.parameters import FreeParameters, parameters_of, value_of, with_values
@@ -355,9 +356,9 @@ def motion_posterior(
         FreeParameters(model),
         segments,
         scales,
-        jnp.asarray(rotation, dtype),
-        jnp.asarray(spectrum, dtype),
-        jnp.asarray(counted, dtype),
+        as_array(rotation, dtype),
+        as_array(spectrum, dtype),
+        as_array(counted, dtype),
         empty if uncertain else None,
         jnp.zeros((segments.count, starts, starts, horizon), dtype) if one_variance else None,
     )

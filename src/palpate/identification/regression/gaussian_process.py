@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from palpate.errors import PalpateError
 from palpate.identification.regression.locally_weighted import Regression, check_data, standard
+from palpate.numerics.arrays import as_array
 
 LARGEST = 2000  # data: time grows with the cube of their number
 _LENGTHS = 1.0, 8.0  # standard deviations, where the two descents begin
@@ -96,7 +97,7 @@ def gaussian_process(inputs: np.ndarray, targets: np.ndarray) -> GaussianProcess
     shared = x, centre, scale, target_centre, target_scale
     dtype = jnp.zeros(()).dtype
     fields = *shared, *(np.stack(values) for values in zip(*processes, strict=True))
-    return GaussianProcess(*(jnp.asarray(values, dtype) for values in fields))
+    return GaussianProcess(*(as_array(values, dtype) for values in fields))
 
 
 def _process(x: np.ndarray, y: np.ndarray) -> tuple[Any, ...]:

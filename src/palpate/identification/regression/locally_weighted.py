@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from palpate.errors import PalpateError
+from palpate.numerics.arrays import as_array
 from palpate.numerics.small_systems import cholesky, solve_lower, solve_upper
 
 BANDWIDTHS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 100.0)  # standard deviations; the last is linear
@@ -63,6 +64,7 @@ class LocallyWeighted(Regression):
     bandwidth: Float[Array, "*parts"]
     ridge: Float[Array, "*parts"]
 
+    @eqx.filter_jit
     def __call__(
         self, inputs: Float[Array, "*batch inputs"], condition: Bool[Array, "*batch bits"]
     ) -> Float[Array, "*batch outputs"]:
@@ -112,14 +114,14 @@ def locally_weighted(
         **{"target_centre": target_centre, "target_scale": target_scale},
     }
     regression = LocallyWeighted(
-        condition=jnp.asarray(_pad(condition, room)),
-        **{name: jnp.asarray(values, dtype) for name, values in arrays.items()},
+        condition=as_array(_pad(condition, room)),
+        **{name: as_array(values, dtype) for name, values in arrays.items()},
     )
     if count == 1:
         return regression  # which has nothing to be chosen by: it predicts the one datum
     # Evenly spread over the data; padded by repetition, so that their number compiles once.
     chosen = np.linspace(0, count - 1, LEFT_OUT).round().astype(int)
-    bandwidth, ridge = _chosen(regression, jnp.asarray(chosen))
+    bandwidth, ridge = _chosen(regression, as_array(chosen))
     return eqx.tree_at(lambda r: (r.bandwidth, r.ridge), regression, (bandwidth, ridge))
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import gammaln
 
 from palpate.identification.samplers.draws import pooled_covariance
+from palpate.numerics.arrays import as_array
 
 COMPONENTS = 8  # at most
 DEGREES = 10  # of freedom of Student's distributions
@@ -111,7 +112,7 @@ def fit_mixture(
     root = np.concatenate([root, np.tile(whole, (more, 1, 1))])
     volume = np.log(np.einsum("kii->ki", root)).sum(axis=1)
     parts = log_weight, mean, root, np.linalg.inv(root), volume
-    return Mixture(*(jnp.asarray(part, jnp.zeros(()).dtype) for part in parts))
+    return Mixture(*(as_array(part, jnp.zeros(()).dtype) for part in parts))
 
 
 def _outer_products(vectors: Float[np.ndarray, "components free"]) -> np.ndarray:

@@ -76,6 +76,7 @@ def follow(target: Any, values: Any, rate: float) -> Any:
     return jax.tree.map(lambda old, new: old + rate * (new - old), target, values)
 
 
+@jax.jit
 def copy_arrays(values: Any) -> Any:
     """The same arrays in memory of their own: compiled calls overwrite a state in place."""
-    return jax.tree.map(jnp.array, values)
+    return jax.tree.map(jnp.copy, values)

@@ -9,7 +9,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from palpate.numerics.arrays import as_array
 
 
 class Transition(eqx.Module):
@@ -82,15 +85,14 @@ class ReplayBuffer(eqx.Module):
         more = len(dataclasses.fields(kind)) - len(dataclasses.fields(Transition))
 
         def empty(count: int) -> Transition:
-            seen, done = jnp.zeros((count, observation)), jnp.zeros((count, action))
-            one = jnp.zeros(count)
+            seen, done = np.zeros((count, observation)), np.zeros((count, action))
+            one = np.zeros(count)
             # Buffers are donated to compiled calls: no array may stand in two places.
             return jax.tree.map(
-                jnp.array, kind(seen, done, done, one, one, seen, one, *more * [one])
+                as_array, kind(seen, done, done, one, one, seen, one, *more * [one])
             )
 
-        zero = jnp.zeros((), jnp.int32)
-        counts = (jnp.array(zero), jnp.array(zero), jnp.array(zero))
+        counts = (as_array(0, jnp.int32), as_array(0, jnp.int32), as_array(0, jnp.int32))
         return cls(empty(capacity), empty(min(violating, capacity)), *counts)
 
     @property

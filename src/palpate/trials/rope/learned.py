@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate.models.rope import Rope, RopeState
 from palpate.networks import CommandPolicy
+from palpate.numerics.arrays import as_array
 from palpate.perception.rope.marker_observer import MarkerObserver
 from palpate.perception.rope.nodes import at_nodes, smooth_lengths
 from palpate.perception.velocity import VelocityEstimator
@@ -40,7 +41,7 @@ class RopeObserver:
         positions = smooth_lengths(window[-1], self.positions(observation), self._period)
         window = np.concatenate([window[1:], positions[None]])
         weights = self.estimator.weights.astype(np.float32)
-        return window, RopeState(jnp.asarray(positions), jnp.tensordot(weights, window, axes=1))
+        return window, RopeState(as_array(positions), jnp.tensordot(weights, window, axes=1))
 
     def positions(self, observation: RopeObservation) -> np.ndarray:
         """Of the nodes as they are seen, (worlds, nodes, 3) in m; raises as `at_nodes`."""

@@ -44,7 +44,7 @@ def motion(model, batch=3, steps=20, seed=0):
         line = np.linspace(0.0, 1.0, model.nodes)[:, None] * np.array([0.25, 0.1, -0.05])
         frames = line + 0.01 * frames
     frames = np.concatenate([frames, frames + 1e-3 * rng.normal(size=frames.shape)], axis=1)
-    state = model.initial_state(jnp.asarray(frames, jnp.float32))
+    state = eqx.filter_jit(model.initial_state)(jnp.asarray(frames, jnp.float32))
     actions = 0.1 * rng.normal(size=(batch, steps, *model.action_shape))
     if isinstance(model, Rope):
         driven = frames[:, 1, list(model.driven)]
@@ -88,7 +88,7 @@ def model(request):
 def test_untrained_it_is_the_physics(model):
     state, actions = motion(model)
     corrected = Residual(model, network(model, trained=False))
-    assert not np.any(corrected.correction(state, actions[:, 0]))
+    assert not np.any(eqx.filter_jit(corrected.correction)(state, actions[:, 0]))
 
 
 @pytest.mark.parametrize("kind", ["cart", "pendulum", "rope held at both ends"])
@@ -107,16 +107,19 @@ def test_untrained_it_moves_as_the_physics_does(kind):
 def test_a_batch_is_its_members(model):
     state, actions = motion(model)
     corrected = Residual(model, network(model))
-    together = correctable(model).corrected(state, corrected.correction(state, actions[:, 0]))
+    moved = eqx.filter_jit(
+        lambda *now: correctable(model).corrected(now[0], corrected.correction(*now))
+    )
+    together = moved(state, actions[:, 0])
     member = jax.tree.map(lambda x: x[1], state)
-    alone = correctable(model).corrected(member, corrected.correction(member, actions[1, 0]))
+    alone = moved(member, actions[1, 0])
     for batch, single in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(batch[1], single, rtol=1e-4, atol=1e-6)
 
 
 def test_what_is_corrected_is_what_lies_between(model):
     state, actions = motion(model)
-    correction = Residual(model, network(model)).correction(state, actions[:, 0])
+    correction = eqx.filter_jit(Residual(model, network(model)).correction)(state, actions[:, 0])
     assert correction.shape == (3, *correctable(model).correction_shape)
     assert np.max(np.abs(correction)) > 0.1 * BOUND
     found = correctable(model).correction_between(
@@ -174,7 +177,7 @@ def test_a_rope_whose_ends_meet_has_finite_derivatives():
         )
         return jnp.sum(correctable(model).corrected(state, correction).velocity)
 
-    assert np.all(np.isfinite(jax.grad(moved)(closed)))
+    assert np.all(np.isfinite(jax.jit(jax.grad(moved))(closed)))
 
 
 def test_bodies_turned_and_moved_are_corrected_the_same_turned_and_moved():

@@ -1,5 +1,6 @@
 """Features of bodies in the plane: their symmetries, and contacts on the right side."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,12 +42,12 @@ def test_body_features_do_not_depend_on_the_place_and_raw_ones_do():
     model = furniture([BOX], floor_friction=0.1)
     state, wrench = draws(30, 1)
     there, pushed = moved(state, wrench, 3.0, -2.0, 0.7)
-    features = body_features()
+    features, step = body_features(), eqx.filter_jit(model.step)
     np.testing.assert_allclose(
         features.inputs(state, wrench), features.inputs(there, pushed), atol=1e-4
     )
-    here = features.change(state, model.step(state, wrench))
-    same = features.change(there, model.step(there, pushed))
+    here = features.change(state, step(state, wrench))
+    same = features.change(there, step(there, pushed))
     np.testing.assert_allclose(here, same, atol=1e-4)
     raw = raw_features()
     assert raw.inputs(state, wrench).shape == (30, 1, 9)
@@ -57,10 +58,10 @@ def test_a_regression_of_body_features_predicts_another_place():
     model = furniture([BOX], control_period=0.2, wheel_along=0.5, wheel_across=0.5)
     data = draws(200, 1)
     asked = moved(*draws(50, 1, seed=5), 4.0, 4.0, 2.0)
-    error = {}
+    error, step = {}, eqx.filter_jit(model.step)
     for name, features in (("raw", raw_features()), ("body", body_features())):
-        fitted = fit_regression(model, features, "lwr", *data, model.step(*data))
-        off = fitted.step(*asked).pose - model.step(*asked).pose
+        fitted = fit_regression(model, features, "lwr", *data, step(*data))
+        off = eqx.filter_jit(fitted.step)(*asked).pose - step(*asked).pose
         error[name] = float(jnp.abs(off).mean())
     assert error["body"] < 0.02
     assert error["raw"] > 2 * error["body"]

@@ -202,10 +202,19 @@ def everywhere(tree: Any) -> Any:
     Else a loop's first turn is compiled by itself, and rounds differently from the others.
     """
     import jax
+    import numpy as np
     from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
     placed = NamedSharding(Mesh(jax.devices(), ("batch",)), PartitionSpec())
-    return jax.device_put(tree, placed)
+
+    def on_host(leaf: Any) -> Any:
+        """What is on one device: JAX compiles a slice for each shape that goes on to others."""
+        if not isinstance(leaf, jax.Array):
+            return leaf
+        is_key = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return leaf if is_key or leaf.sharding == placed else np.asarray(leaf)
+
+    return jax.device_put(jax.tree.map(on_host, tree), placed)
 
 
 def compile_alone(function: Callable[..., Any]) -> Callable[..., Any]:

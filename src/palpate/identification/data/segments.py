@@ -295,13 +295,14 @@ def noise_scale(aligned: Aligned, model: Model, fast: bool = False) -> Float[np.
 def difference(model: Model, predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
     """The model's difference of two arrays of observations, in float64.
 
-    Of so many at a time as a power of two says: trials and pieces have many lengths, and XLA
-    would compile one subtraction for each.
+    Of so many at a time as a power of two says, a thousand or more: trials and pieces have many
+    lengths, and XLA would compile one subtraction for each.
     """
     pair = np.broadcast_arrays(predicted, observed)
     shape, each = pair[0].shape, model.observation_shape
     count = math.prod(shape[: len(shape) - len(each)])
-    padded = np.zeros((2, 1 << max(count - 1, 0).bit_length(), *each), np.result_type(*pair))
+    room = 1 << max(count - 1, 1023).bit_length()
+    padded = np.zeros((2, room, *each), np.result_type(*pair))
     padded[:, :count] = np.reshape(pair, (2, count, *each))
     off = np.asarray(_difference(model, as_array(padded)), np.float64)
     return off[:count].reshape(shape)

@@ -208,7 +208,7 @@ def everywhere(tree: Any) -> Any:
     placed = NamedSharding(Mesh(jax.devices(), ("batch",)), PartitionSpec())
 
     def on_host(leaf: Any) -> Any:
-        """What is on one device: JAX compiles a slice for each shape that goes on to others."""
+        """From one device on to the others JAX compiles a slice for each shape; from here none."""
         if not isinstance(leaf, jax.Array):
             return leaf
         is_key = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)

@@ -239,7 +239,6 @@ class Rope(RopeParameters):
         """The rope softened where the integration would be unstable: see `stability`."""
         return stability.soften(self)
 
-    @eqx.filter_jit
     def energy(self, state: RopeState) -> Float[Array, "*batch"]:
         """Mechanical energy (J) above hanging at rest under the first driven node's position.
 

@@ -206,16 +206,15 @@ def _descend(
         _, descent = run.restore(descent) or (0, descent)
     stages = np.repeat(settings.horizons, settings.iterations)
     remaining = 0 if descent.stale >= settings.patience else len(stages) - descent.iteration
+    fixed = devices.everywhere((model, scale))
     with interruptible() as stop:
         bar = progress(remaining, "fitting the correction", done=descent.iteration)
         for _ in bar:
             horizon = max(1, round(stages[descent.iteration] * source.longest))
             rng = np.random.default_rng((settings.seed, descent.iteration))
             segments = source.sample(rng, settings.windows, horizon)
-            state = (descent.network, descent.optimiser, descent.average, model, scale)
-            network, moments, average, loss = _iteration(
-                devices.everywhere(state), segments, settings
-            )
+            state = devices.everywhere((descent.network, descent.optimiser, descent.average))
+            network, moments, average, loss = _iteration((*state, *fixed), segments, settings)
             step, found = descent.iteration + 1, None
             best, least, stale = descent.best, descent.least, descent.stale
             if looked := step % CHECK == 0 or step == len(stages):

@@ -1,5 +1,7 @@
 """Two joints of MuJoCo, one on the other, before two cameras and with a hand, for the tests."""
 
+import copy
+import functools
 import math
 
 import mujoco
@@ -86,6 +88,33 @@ class Room:
         """Degrees, and cm, from a part's joint to the true one."""
         found = twin.screw(part, len(twin.looks) - 1)
         return difference(found, self.data.xaxis[joint], self.data.xanchor[joint])
+
+
+Place = tuple[float, float]
+
+
+def pulled(
+    start: Place, *pulls: tuple[int, Place], kind: type[Room] = Room
+) -> tuple[Room, Twin]:
+    """A room and a twin that has looked at it, and seen one body after another pulled to its place.
+
+    What many tests begin with is computed once; each gets copies that go on as if they were alone.
+    """
+    room, twin = _pulled(kind, start, pulls)
+    return copy.deepcopy(room), twin.copy()
+
+
+@functools.lru_cache(maxsize=8)
+def _pulled(kind: type[Room], start: Place, pulls: tuple) -> tuple[Room, Twin]:
+    if not pulls:
+        room, twin = kind(), Twin()
+        room.at(*start)
+        twin.look(room.look())
+        return room, twin
+    *before, (body, end) = pulls
+    room, twin = pulled(start, *before, kind=kind)
+    room.pull(twin, body, before[-1][1] if before else start, end)
+    return room, twin
 
 
 class Notes(Twin):

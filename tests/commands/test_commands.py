@@ -453,7 +453,7 @@ def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys, sho
     def blind(world, width, height):
         raise PalpateError("no OpenGL here; install libegl1")
 
-    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.7)
+    monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.3)
     monkeypatch.setattr(RopeWorld, "render", blind)
     tiny = Size(
         trials=2, duration=0.6, identification=(1, 1, 1), training=2, batch=2, starts=32, ropes=1

@@ -19,7 +19,7 @@ from palpate.identification.interactive.tree import PartTree
 from palpate.identification.interactive.twin import Twin
 from palpate.numerics.pinhole import Pinhole
 from palpate.perception.clouds import cloud_of
-from rooms import DOOR, FLAP, Room
+from rooms import DOOR, FLAP, Room, pulled
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
@@ -109,12 +109,8 @@ def test_a_door_stays_where_it_is_while_another_is_found_that_looks_like_it() ->
         ((FLAP, DOOR), [1, 0], [(0.0, 0.0), (-0.5, 0.7), (-0.1, 0.7)], [0.4, 0.0]),
     ],
 )
-def test_a_flap_is_found_on_a_door_that_moves_with_it(room, bodies, held, places, gone) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    for body, start, end in zip(bodies, places, places[1:], strict=False):
-        room.pull(twin, body, start, end)
+def test_a_flap_is_found_on_a_door_that_moves_with_it(bodies, held, places, gone) -> None:
+    room, twin = pulled(places[0], *zip(bodies, places[1:], strict=True))
     assert [part.parent for part in twin.parts] == [-1, 0]
     assert [part for part, _ in twin.held] == held
     for part in (0, 1):
@@ -125,11 +121,8 @@ def test_a_flap_is_found_on_a_door_that_moves_with_it(room, bodies, held, places
     assert np.abs(positions[:, -1] - positions[:, 1]) == pytest.approx(gone, abs=0.1)
 
 
-def test_a_flap_that_swings_along_is_found_though_the_hand_is_on_the_door(room) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+def test_a_flap_that_swings_along_is_found_though_the_hand_is_on_the_door() -> None:
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
     room.pull(twin, DOOR, (-0.6, 0.0), (-0.25, 0.6))
     assert [part.parent for part in twin.parts] == [-1, 0]
     assert [len(part.ways) for part in twin.parts] == [2, 0]
@@ -179,22 +172,16 @@ def test_a_flap_turns_about_its_own_hinge_though_its_door_went_too(room, places)
         assert abs(last) == pytest.approx(abs(gone), abs=0.06)
 
 
-def test_a_door_that_is_elsewhere_than_was_believed_is_no_flap(room) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+def test_a_door_that_is_elsewhere_than_was_believed_is_no_flap() -> None:
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
     twin.parts[0].positions[1] += 0.4
     twin.parts[0].positions[2] += 0.4
     assert not split(twin, [1, 2])
     assert len(twin.parts) == 1
 
 
-def test_a_joint_that_is_hardly_known_tells_of_no_flap(room) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+def test_a_joint_that_is_hardly_known_tells_of_no_flap() -> None:
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
     room.at(-0.25, 0.6)
     known = twin.parts[0].estimate
     for covariance, found in ((1e-3 * np.eye(4), False), (1e-6 * np.eye(4), True)):
@@ -205,10 +192,7 @@ def test_a_joint_that_is_hardly_known_tells_of_no_flap(room) -> None:
 
 @pytest.mark.parametrize(("left", "right"), [(0.3, 1.0), (0.3, 1.3)])
 def test_a_door_beside_one_that_is_known_is_no_part_on_it(left, right) -> None:
-    room, twin = Post(), Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, LEFT, (0.0, 0.0), (0.9, 0.0))
+    room, twin = pulled((0.0, 0.0), (LEFT, (0.9, 0.0)), kind=Post)
     known = twin.parts[0].estimate
     twin.parts[0].estimate = dataclasses.replace(known, covariance=1e-6 * np.eye(4))
     room.at(left, right)
@@ -220,11 +204,8 @@ def test_a_door_beside_one_that_is_known_is_no_part_on_it(left, right) -> None:
 @pytest.mark.parametrize(
     ("limit", "value"), [("LARGEST", 0.05), ("GROWN", 0.5), ("MOST", 0.02), ("UNSURE", 0.01)]
 )
-def test_a_flap_too_large_or_hardly_known_is_none(room, monkeypatch, limit, value) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+def test_a_flap_too_large_or_hardly_known_is_none(monkeypatch, limit, value) -> None:
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
     known = twin.parts[0].estimate
     twin.parts[0].estimate = dataclasses.replace(known, covariance=1e-6 * np.eye(4))
     room.at(-0.25, 0.6)
@@ -263,12 +244,8 @@ def test_a_part_that_has_not_gone_along_is_taken_off_what_it_hung_on() -> None:
     assert twin.parts[0].positions[-1] == pytest.approx(twin.parts[0].positions[1], abs=0.05)
 
 
-def test_a_flap_that_was_guessed_from_two_ends_is_dropped_once_more_is_known(room) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
-    room.pull(twin, FLAP, (-0.6, 0.0), (-0.2, 0.7))
+def test_a_flap_that_was_guessed_from_two_ends_is_dropped_once_more_is_known() -> None:
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)), (FLAP, (-0.2, 0.7)))
     guess = twin.parts[1]
     assert guess.provisional
     twin.parts.append(dataclasses.replace(guess, provisional=False))
@@ -293,11 +270,8 @@ def test_a_joint_that_a_short_way_left_open_is_mended_and_not_found_again(room) 
     assert room.error(twin, 0, 0)[0] < 2.0
 
 
-def test_a_little_way_at_what_stands_is_none_of_a_door_that_stands_as_well(room) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+def test_a_little_way_at_what_stands_is_none_of_a_door_that_stands_as_well() -> None:
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
     wall, out = np.array([0.13, 0.74, 1.1]), np.array([-1.0, 0.0, 0.0])
     way = wall + np.linspace(0.0, 0.012, 40)[:, None] * out
     twin.observe(
@@ -417,12 +391,8 @@ def test_a_part_that_was_found_twice_becomes_one(room) -> None:
     assert len(twin.parts[0].ways) == 3
 
 
-def test_a_way_on_a_part_whose_carrier_has_moved_counts_by_its_ends(room) -> None:
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
-    room.pull(twin, FLAP, (-0.6, 0.0), (-0.2, 0.7))
+def test_a_way_on_a_part_whose_carrier_has_moved_counts_by_its_ends() -> None:
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)), (FLAP, (-0.2, 0.7)))
     look, way = twin.parts[1].ways[0]
     local = twin.way_from(0, look, way)
     assert local.shape == (6, 3)

@@ -1,6 +1,5 @@
 """What was done to a door with a flap, explained once more from the last pull to the first."""
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -17,33 +16,27 @@ from palpate.identification.interactive.hindsight import (
 )
 from palpate.identification.interactive.insertion import hang
 from palpate.identification.interactive.twin import Twin
-from rooms import DOOR, FLAP, Room
+from rooms import DOOR, FLAP, Room, pulled
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
 PLACES = (0.0, 0.0), (-0.6, 0.0), (-0.2, 0.7)
 
 
-@pytest.fixture(scope="module")
-def room() -> Room:
-    return Room()
-
-
-@pytest.fixture(scope="module")
-def pulled(room) -> Twin:
-    """Of a door that was pulled open, and of its flap."""
-    twin = Twin()
-    room.at(*PLACES[0])
-    twin.look(room.look())
-    for body, start, end in zip((DOOR, FLAP), PLACES, PLACES[1:], strict=False):
-        room.pull(twin, body, start, end)
-    return twin
+@pytest.fixture
+def known() -> tuple[Room, Twin]:
+    """A door that was pulled open, and its flap."""
+    return pulled(PLACES[0], (DOOR, PLACES[1]), (FLAP, PLACES[2]))
 
 
 @pytest.fixture
-def twin(pulled) -> Twin:
-    """The same, for each test."""
-    return copy.deepcopy(pulled)
+def room(known) -> Room:
+    return known[0]
+
+
+@pytest.fixture
+def twin(known) -> Twin:
+    return known[1]
 
 
 def test_an_account_backwards_is_of_the_same_looks_and_pulls(room, twin) -> None:

@@ -9,7 +9,7 @@ from palpate.identification.interactive.edges import folding
 from palpate.identification.interactive.explanation import find_moved_part
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.twin import Twin
-from rooms import DOOR, Notes, Room
+from rooms import DOOR, Notes, Room, pulled
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
@@ -42,20 +42,17 @@ class Drawers(Room):
         return np.array([-0.1, 0.2, 0.0])
 
 
-def known_door(room: Room) -> Twin:
+def known_door() -> tuple[Room, Twin]:
     """A twin that has seen a hand open the door, to -0.5 rad."""
-    twin = Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.5, 0.0))
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.5, 0.0)))
     assert len(twin.parts) == 1
-    return twin
+    return room, twin
 
 
-def swung_on(room: Room) -> tuple[Twin, Handling]:
+def swung_on() -> tuple[Twin, Handling]:
     """The same, once the door has swung on to -0.75 rad since it was let go, and a hand has taken
     it from there to -0.3, which the twin has seen and not yet explained."""
-    twin, notes = known_door(room), Notes()
+    (room, twin), notes = known_door(), Notes()
     room.at(-0.75, 0.0)
     twin.look(room.look())
     notes.look(twin.looks[-1])
@@ -70,8 +67,8 @@ def room() -> Room:
     return Room()
 
 
-def test_where_a_known_door_has_gone_no_other_part_is_seen(room) -> None:
-    twin = known_door(room)
+def test_where_a_known_door_has_gone_no_other_part_is_seen() -> None:
+    room, twin = known_door()
     sign = np.sign(twin.parts[0].positions[-1])
     room.at(-0.9, 0.0)
     look = twin.add_look(room.look())
@@ -114,8 +111,8 @@ def test_a_new_part_that_explains_nothing_leaves_all_as_it_was(room, monkeypatch
     assert all((labels == -1).all() for labels in twin.labels)
 
 
-def test_a_joint_that_is_refused_leaves_labels_as_they_were(room, monkeypatch) -> None:
-    twin, notes = known_door(room), Notes()
+def test_a_joint_that_is_refused_leaves_labels_as_they_were(monkeypatch) -> None:
+    (room, twin), notes = known_door(), Notes()
     notes.look(twin.looks[-1])
     room.pull(notes, DOOR, (-0.5, 0.0), (-0.1, 0.0))
     (handling,) = notes.handled
@@ -131,8 +128,8 @@ def test_a_joint_that_is_refused_leaves_labels_as_they_were(room, monkeypatch) -
     assert twin.parts[0].positions == positions
 
 
-def test_of_places_that_explain_a_part_as_well_the_one_that_meets_it_is_taken(room) -> None:
-    twin = known_door(room)
+def test_of_places_that_explain_a_part_as_well_the_one_that_meets_it_is_taken() -> None:
+    room, twin = known_door()
     sign = np.sign(twin.parts[0].positions[-1])
     for begun in (0.47, 0.54):
         room.at(-0.5, 0.0)
@@ -142,8 +139,8 @@ def test_of_places_that_explain_a_part_as_well_the_one_that_meets_it_is_taken(ro
         assert sign * twin.parts[0].positions[look] == pytest.approx(0.5, abs=0.012)
 
 
-def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(room, monkeypatch) -> None:
-    twin = known_door(room)
+def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(monkeypatch) -> None:
+    room, twin = known_door()
     part = twin.parts[0]
     sign = np.sign(part.positions[-1])
     room.at(-0.5, 0.0)
@@ -167,9 +164,9 @@ def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(room, monkeypatch
 
 @pytest.mark.parametrize(("there", "place"), [(-0.3, 0.9), (-0.4, 0.5)])
 def test_where_a_part_never_was_it_is_if_a_little_is_seen_there_and_it_is_nowhere_else(
-    room, monkeypatch, there, place
+    monkeypatch, there, place
 ) -> None:
-    twin = known_door(room)
+    room, twin = known_door()
     part = twin.parts[0]
     sign = np.sign(part.positions[-1])
     look = len(twin.looks) - 1
@@ -184,8 +181,8 @@ def test_where_a_part_never_was_it_is_if_a_little_is_seen_there_and_it_is_nowher
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.1])
-def test_where_looks_hardly_tell_a_part_is_where_the_hand_took_it(room, monkeypatch, slope) -> None:
-    twin = known_door(room)
+def test_where_looks_hardly_tell_a_part_is_where_the_hand_took_it(monkeypatch, slope) -> None:
+    _, twin = known_door()
     look = len(twin.looks) - 1
 
     def seen_at(part, look, positions, others=None, fewest=None):
@@ -197,8 +194,8 @@ def test_where_looks_hardly_tell_a_part_is_where_the_hand_took_it(room, monkeypa
     assert twin.parts[0].positions[look] == pytest.approx(0.2)
 
 
-def test_where_a_part_began_is_told_by_both_looks_and_the_hand_together(room, monkeypatch) -> None:
-    twin, handling = swung_on(room)
+def test_where_a_part_began_is_told_by_both_looks_and_the_hand_together(monkeypatch) -> None:
+    twin, handling = swung_on()
     part, before, after = twin.parts[0], len(twin.looks) - 2, len(twin.looks) - 1
     sign = np.sign(part.positions[1])
     part.positions[before] = part.positions[after] = sign * 0.6
@@ -215,8 +212,8 @@ def test_where_a_part_began_is_told_by_both_looks_and_the_hand_together(room, mo
     assert places == pytest.approx([0.75, 0.3], abs=0.05)
 
 
-def test_where_a_hand_takes_a_part_from_corrects_where_it_was_believed_to_be(room) -> None:
-    twin, handling = swung_on(room)
+def test_where_a_hand_takes_a_part_from_corrects_where_it_was_believed_to_be() -> None:
+    twin, handling = swung_on()
     part, before, after = twin.parts[0], len(twin.looks) - 2, len(twin.looks) - 1
     sign = np.sign(part.positions[1])
     part.positions[before] = sign * 0.5  # and the look before did not show it
@@ -239,8 +236,8 @@ def test_a_short_way_along_a_wall_is_not_the_slide_of_the_wall(room) -> None:
     assert (twin.labels[0][wall] == 0).mean() < 0.05
 
 
-def test_a_part_is_described_where_its_joint_says_that_it_was(room) -> None:
-    twin = known_door(room)
+def test_a_part_is_described_where_its_joint_says_that_it_was() -> None:
+    _, twin = known_door()
     part, shown = twin.parts[0], [0, len(twin.looks) - 1]
     points, normals = part.support
     part.support = points + 0.05 * normals, normals
@@ -255,8 +252,8 @@ def test_a_part_is_described_where_its_joint_says_that_it_was(room) -> None:
     assert min(seen()) > 0.7
 
 
-def test_a_part_that_no_look_shows_keeps_its_description(room) -> None:
-    twin = known_door(room)
+def test_a_part_that_no_look_shows_keeps_its_description() -> None:
+    _, twin = known_door()
     part = twin.parts[0]
     kept = part.support
     part.seen = {look: chosen[:5] for look, chosen in part.seen.items()}

@@ -1,6 +1,5 @@
 """A hand on a flap that moves its door as well: what is said of both, of one pull."""
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -20,7 +19,7 @@ from palpate.identification.interactive.labels import distinguishing_looks, weig
 from palpate.identification.interactive.screws import screws_of_way
 from palpate.identification.interactive.twin import Twin
 from palpate.identification.interactive.ways import misfit
-from rooms import DOOR, FLAP, Room
+from rooms import DOOR, FLAP, Room, pulled
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
@@ -41,14 +40,11 @@ class Unsteady(Room):
         return np.array(found) + 5e-4 * self.random.standard_normal((60, 3))
 
 
-@pytest.fixture(scope="module")
-def once() -> tuple[Unsteady, Twin, Handling]:
-    room, twin = Unsteady(), Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
-    room.pull(twin, FLAP, (-0.6, 0.0), (-0.6, 0.9))
-    room.pull(twin, FLAP, (-0.6, 0.9), BEGAN)
+@pytest.fixture
+def known() -> tuple[Unsteady, Twin, Handling]:
+    """A twin that knows the door and the flap, and a pull that moves both."""
+    pulls = (DOOR, (-0.6, 0.0)), (FLAP, (-0.6, 0.9)), (FLAP, BEGAN)
+    room, twin = pulled((0.0, 0.0), *pulls, kind=Unsteady)
     assert [part.parent for part in twin.parts] == [-1, 0]
     way = room.way(BEGAN, ENDED)
     room.at(*ENDED)
@@ -57,13 +53,6 @@ def once() -> tuple[Unsteady, Twin, Handling]:
         Push(way[0], along), twin.looks[-1], room.look(), np.linspace(0, 2, 60), way, 0.0 * way
     )
     return room, twin, handling
-
-
-@pytest.fixture
-def known(once) -> tuple[Unsteady, Twin, Handling]:
-    """A twin that knows the door and the flap, and a pull that moves both."""
-    room, twin, handling = once
-    return room, copy.deepcopy(twin), handling
 
 
 def test_where_both_joints_are_is_told_by_the_hand_alone(known) -> None:
@@ -108,10 +97,7 @@ def test_ways_of_two_joints_are_of_no_one_joint(known) -> None:
 
 
 def test_seen_from_a_door_that_went_along_the_hand_goes_round_the_flap_s_hinge() -> None:
-    room, twin = Room(), Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
     room.at(-0.4, 0.9)
     before, after = len(twin.looks) - 1, twin.add_look(room.look())
     assert twin.parts[0].positions[after] - twin.parts[0].positions[before] != 0.0
@@ -135,11 +121,7 @@ def test_seen_from_a_door_that_went_along_the_hand_goes_round_the_flap_s_hinge()
 
 
 def test_a_door_is_not_found_again_because_its_flap_moved_a_little() -> None:
-    room, twin = Room(), Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.6, 0.0))
-    room.pull(twin, DOOR, (-0.6, 0.0), (-0.1, 0.0))
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)), (DOOR, (-0.1, 0.0)))
     way = []
     for share in np.linspace(0.0, 1.0, 60):
         room.at(-0.1 - 0.6 * share, 0.0)
@@ -174,13 +156,10 @@ def test_a_look_is_held_against_more_than_one_in_which_a_part_has_gone_as_far() 
 
 
 def test_what_no_hand_has_moved_may_creep_but_does_not_jump() -> None:
-    room, twin = Room(), Twin()
-    room.at(0.0, 0.0)
-    twin.look(room.look())
-    room.pull(twin, DOOR, (0.0, 0.0), (-0.9, 0.0))
+    room, twin = pulled((0.0, 0.0), (DOOR, (-0.9, 0.0)))
     sign = np.sign(twin.parts[0].positions[-1])
     for door, still, expected in ((1.0, True, 1.0), (0.05, False, 0.05), (0.05, True, None)):
-        seen = copy.deepcopy(twin)
+        seen = twin.copy()
         room.at(-door, 0.0)
         found = sign * seen.parts[0].positions[seen.add_look(room.look(), still=still)]
         if expected is None:  # so far it does not go by itself
@@ -209,7 +188,7 @@ def test_a_flap_that_was_found_twice_is_one_and_a_door_with_a_flap_is_two(known)
 def test_a_joint_of_which_nothing_is_known_goes_when_a_hand_goes_otherwise(known) -> None:
     _, twin, handling = known
     for spread, kept in ((1e-6, True), (4.0, False)):
-        seen = copy.deepcopy(twin)
+        seen = twin.copy()
         flap = seen.parts[1]
         flap.estimate = dataclasses.replace(flap.estimate, covariance=spread * np.eye(4))
         assert seen._drop_refuted(len(seen.looks) - 1, handling) == (not kept)

@@ -93,9 +93,7 @@ class Room:
 Place = tuple[float, float]
 
 
-def pulled(
-    start: Place, *pulls: tuple[int, Place], kind: type[Room] = Room
-) -> tuple[Room, Twin]:
+def pulled(start: Place, *pulls: tuple[int, Place], kind: type[Room] = Room) -> tuple[Room, Twin]:
     """A room and a twin that has looked at it, and seen one body after another pulled to its place.
 
     What many tests begin with is computed once; each gets copies that go on as if they were alone.

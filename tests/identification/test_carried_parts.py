@@ -173,7 +173,7 @@ def test_a_flap_turns_about_its_own_hinge_though_its_door_went_too(room, places)
 
 
 def test_a_door_that_is_elsewhere_than_was_believed_is_no_flap() -> None:
-    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
+    _, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
     twin.parts[0].positions[1] += 0.4
     twin.parts[0].positions[2] += 0.4
     assert not split(twin, [1, 2])
@@ -245,7 +245,7 @@ def test_a_part_that_has_not_gone_along_is_taken_off_what_it_hung_on() -> None:
 
 
 def test_a_flap_that_was_guessed_from_two_ends_is_dropped_once_more_is_known() -> None:
-    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)), (FLAP, (-0.2, 0.7)))
+    _, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)), (FLAP, (-0.2, 0.7)))
     guess = twin.parts[1]
     assert guess.provisional
     twin.parts.append(dataclasses.replace(guess, provisional=False))
@@ -392,7 +392,7 @@ def test_a_part_that_was_found_twice_becomes_one(room) -> None:
 
 
 def test_a_way_on_a_part_whose_carrier_has_moved_counts_by_its_ends() -> None:
-    room, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)), (FLAP, (-0.2, 0.7)))
+    _, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)), (FLAP, (-0.2, 0.7)))
     look, way = twin.parts[1].ways[0]
     local = twin.way_from(0, look, way)
     assert local.shape == (6, 3)

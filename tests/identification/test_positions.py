@@ -166,7 +166,7 @@ def test_where_a_part_never_was_it_is_only_if_it_is_seen_there(monkeypatch) -> N
 def test_where_a_part_never_was_it_is_if_a_little_is_seen_there_and_it_is_nowhere_else(
     monkeypatch, there, place
 ) -> None:
-    room, twin = known_door()
+    _, twin = known_door()
     part = twin.parts[0]
     sign = np.sign(part.positions[-1])
     look = len(twin.looks) - 1

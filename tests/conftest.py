@@ -14,6 +14,8 @@ import jaxtyping
 import pytest
 
 from palpate import family
+from palpate.commands import identify
+from palpate.identification.gradient.descent import Settings
 from palpate.numerics.devices import cores
 from palpate.trials.rope import baselines
 
@@ -90,6 +92,16 @@ def short_tuning(monkeypatch):
     few = functools.partial(baselines.tune, ropes=1, candidates=4)
     monkeypatch.setattr(baselines, "tune", lambda base, start, **_: few(base, start))
     monkeypatch.setattr(baselines, "tune_gains", baselines.tune_gains.__wrapped__)
+
+
+@pytest.fixture
+def one_horizon(monkeypatch):
+    """Fits of `identify` look ahead as far as they can at once: one compilation in place of three.
+
+    `--iterations` is one number then. That horizons grow is tested where a fit is.
+    """
+    settings = functools.partial(Settings, horizons=(1.0,), iterations=(1,))
+    monkeypatch.setattr(identify, "Settings", settings)
 
 
 @pytest.fixture

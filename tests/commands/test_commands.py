@@ -449,14 +449,16 @@ def test_a_stopped_identification_goes_on_to_the_same_result(tmp_path, monkeypat
 # --- the rope, once, through everything --------------------------------------------------------
 
 
-def test_a_rope_goes_from_recording_to_report(tmp_path, monkeypatch, capsys, short_tuning):
+def test_a_rope_goes_from_recording_to_report(
+    tmp_path, monkeypatch, capsys, short_tuning, one_horizon
+):
     def blind(world, width, height):
         raise PalpateError("no OpenGL here; install libegl1")
 
     monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.3)
     monkeypatch.setattr(RopeWorld, "render", blind)
     tiny = Size(
-        trials=2, duration=0.6, identification=(1, 1, 1), training=2, batch=2, starts=32, ropes=1
+        trials=2, duration=0.6, identification=(1,), training=2, batch=2, starts=32, ropes=1
     )
     tiny = dataclasses.replace(tiny, nodes=6)
     monkeypatch.setattr(DemoRope, "size", tiny)

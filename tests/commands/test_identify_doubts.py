@@ -24,13 +24,13 @@ def markers():
 
 
 @pytest.fixture
-def identify(tmp_path, monkeypatch):
+def identify(tmp_path, monkeypatch, one_horizon):
     monkeypatch.chdir(tmp_path)
 
     def identify(markers, *more):
         np.savez("mine.npz", positions=markers.astype(np.float32))
         given = ["mine.npz", "--rate", str(1 / PERIOD), "--substeps", "5", "--out", "run"]
-        return main(["identify", "rope", *given, "--iterations", "1", "1", "1", *more])
+        return main(["identify", "rope", *given, "--iterations", "1", *more])
 
     return identify
 
@@ -47,7 +47,7 @@ def test_markers_out_of_order_are_said_at_once_and_at_the_end(identify, markers,
         recordings=(Path("mine.npz"),),
         rate=1 / PERIOD,
         substeps=5,
-        iterations=(1, 1, 1),
+        iterations=(1,),
         out=Path("run"),
     )
     with pytest.raises(DoubtfulResultError, match="order of the markers"):

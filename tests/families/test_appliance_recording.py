@@ -115,10 +115,10 @@ def test_options_refuse_what_cannot_be():
         RecordAppliance(duration=0.1)
 
 
-def test_the_command_leaves_a_model_and_a_twin(recording, tmp_path, capsys):
+def test_the_command_leaves_a_model_and_a_twin(recording, tmp_path, capsys, one_horizon):
     write_recording(tmp_path / "R.npz", recording)
     options = IdentifyAppliance(
-        recordings=(tmp_path / "R.npz",), out=tmp_path / "out", iterations=(1, 1, 2)
+        recordings=(tmp_path / "R.npz",), out=tmp_path / "out", iterations=(2,)
     )
     folder = identify.run(options)
     model, _ = load_model(folder / "model.json")

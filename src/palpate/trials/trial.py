@@ -143,11 +143,11 @@ def run_trials(
         check_period(controller, period)
     if steps is None:
         steps = max(trial.steps or 0 for trial in trials)
-    loop = _Loop(trials, steps, drawn)
     carry = controller.initial_carry(np.stack([trial.command for trial in trials]))
     goals = type(trials[0]).goals(trials)
     shares = np.array_split(np.arange(len(trials)), devices.cores())
     with ThreadPoolExecutor(devices.cores()) as threads:
+        loop = _Loop(trials, steps, drawn, threads)
         for step in range(steps + 1):
             if step:
                 carry, actions = controller(carry, stack_observations(loop.latest), goals, None)
@@ -161,12 +161,18 @@ def run_trials(
 class _Loop(Generic[RecordType]):
     """Worlds, the last observation of each, and what is kept of them."""
 
-    def __init__(self, trials: Sequence[Trial[RecordType]], steps: int, drawn: Sequence[int]):
+    def __init__(
+        self,
+        trials: Sequence[Trial[RecordType]],
+        steps: int,
+        drawn: Sequence[int],
+        threads: ThreadPoolExecutor,
+    ):
         self._trials = trials
         self.worlds = [trial.world() for trial in trials]
         self._drawn = {trial: place for place, trial in enumerate(drawn)}
         self.record = type(trials[0]).record(trials, steps, len(drawn))
-        self.latest = [self._reset(index, trial) for index, trial in enumerate(trials)]
+        self.latest = list(threads.map(self._reset, range(len(trials)), trials))
         for index in range(len(trials)):
             if index not in self.record.failures:
                 self._keep(index, 0)

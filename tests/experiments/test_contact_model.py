@@ -13,25 +13,31 @@ from palpate.worlds.contact.touching import record_touches
 SEED = 7  # of no plates that are reproduced
 
 
-def off(rival) -> dict:
-    recording = record_touches(PlatesWorld(), SEED, 8, 1.25)
+@pytest.fixture(scope="module")
+def touches():
+    return record_touches(PlatesWorld(), SEED, 8, 1.25)
+
+
+def off(rival, recording) -> dict:
     truth = contact_model.truth_of(plates_of(SEED), np.zeros(2))
     return contact_model.errors(rival(recording), truth)
 
 
-def test_a_straight_line_finds_plates_that_face_as_they_were_meant_to_a_rough_size(monkeypatch):
+def test_a_straight_line_finds_plates_that_face_as_they_were_meant_to_a_rough_size(
+    touches, monkeypatch
+):
     """No straw man: what it lacks is only how the plates are turned, which makes it worse."""
-    turned = off(contact_model.straight_line)
+    turned = off(contact_model.straight_line, touches)
     monkeypatch.setattr(plates, "TURNED", 0.0)
-    straight = off(contact_model.straight_line)
+    straight = off(contact_model.straight_line, record_touches(PlatesWorld(), SEED, 8, 1.25))
     assert np.all(straight["position"] < 5.0)
     assert np.all(straight["stiffness"] < 0.6)
     assert np.all(straight["friction"] < 0.6)
     assert straight["position"].max() < turned["position"].max()
 
 
-def test_a_plane_finds_turned_plates_to_a_rough_size():
-    found = off(contact_model.plane)
+def test_a_plane_finds_turned_plates_to_a_rough_size(touches):
+    found = off(contact_model.plane, touches)
     assert np.all(found["position"] < 5.0)
     assert np.all(found["stiffness"] < 0.4)
     assert np.all(found["friction"] < 0.4)

@@ -21,7 +21,7 @@ def both(tmp_path_factory):
     """A recording of a microwave by two cameras, and the same as clouds of points."""
     world = ApplianceWorld("microwave", 3, views=2)
     world.reset(3)
-    *_, step = interact(world, CHOICES["information"], 5, 3)
+    *_, step = interact(world, CHOICES["information"], 3, 3)
     recording = recording_of(step.twin.handled, step.twin.looks[-1], {"world": "appliance"})
     folder = tmp_path_factory.mktemp("actions")
     kept = [one for one in step.twin.handled if one.held]

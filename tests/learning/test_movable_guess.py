@@ -24,7 +24,9 @@ def ring():
 @pytest.fixture(scope="module")
 def guess(ring):
     features, moves = ring
-    return fit_guess(features[:7000], moves[:7000], seed=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("palpate.learning.movable_guess.STEPS", 3000)
+        return fit_guess(features[:7000], moves[:7000], seed=0)
 
 
 def test_it_learns_what_no_line_tells(ring, guess):

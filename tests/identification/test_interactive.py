@@ -8,10 +8,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from palpate.errors import PalpateError
+from palpate.identification.interactive import labels
 from palpate.identification.interactive import twin as twin_module
 from palpate.identification.interactive.description import describe
 from palpate.identification.interactive.handling import Handling, Push
-from palpate.identification.interactive.labels import evidence, smooth_labels
+from palpate.identification.interactive.labels import SMOOTH, evidence, smooth_labels
 from palpate.identification.interactive.refinement import refine, sighting
 from palpate.identification.interactive.screws import NOWHERE, Screw
 from palpate.identification.interactive.twin import Twin
@@ -185,13 +186,20 @@ def test_evidence_tells_where_points_have_gone(handled):
     assert after.position[0] > 0.2
 
 
-def test_neighbours_on_a_surface_are_likely_of_one_part(handled):
+def test_neighbours_on_a_surface_are_likely_of_one_part(handled, monkeypatch):
     cloud = handled[2].before
     given = np.zeros((2, len(cloud.points)))
     given[1, ::5] = 2.0
     chance = smooth_labels(cloud, given)
     assert np.allclose(chance.sum(axis=0), 1.0)
     assert chance[1].mean() > 0.6
+    # three labels come to where the equation of the mean field holds
+    monkeypatch.setattr(labels, "ROUNDS", 1000)
+    monkeypatch.setattr(labels, "SETTLED", 1e-7)
+    given = np.random.default_rng(0).normal(size=(3, len(cloud.points)))
+    chance = smooth_labels(cloud, given)
+    again = np.exp(given + SMOOTH * (cloud.surface_graph @ chance.T).T)
+    np.testing.assert_allclose(chance, again / again.sum(axis=0), atol=1e-6)
 
 
 def test_a_refined_joint_is_nearer_than_its_first_guess(handled):

@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from palpate.identification.interactive.explanation import positions_along
 from palpate.identification.interactive.screws import (
     Pose,
     Screw,
+    cross,
     rotation_about,
     screws_of_way,
 )
@@ -83,3 +85,22 @@ def test_axes_are_as_far_apart_as_their_lines_whichever_way_they_point() -> None
     )
     assert upright.distance_to(other) == pytest.approx((30.0, 0.5))
     assert upright.distance_to(upright) == (0.0, 0.0)
+
+
+@given(st.tuples(*6 * [numbers]))
+def test_cross_products_are_numpy_s(values):
+    one, other = np.array(values).reshape(2, 3)
+    assert np.allclose(cross(one, other), np.cross(one, other), atol=1e-15)
+
+
+@pytest.mark.parametrize("inner", [HINGE, SLIDE], ids=["hinge", "slide"])
+def test_a_way_tells_how_far_both_of_two_joints_have_gone(inner):
+    base = Pose(rotation_about(np.array([0.6, 0.8, 0.0]), 0.7), np.array([0.1, 0.2, 0.3]))
+    outer = Screw("revolute", np.array([0.0, 0.6, 0.8]), np.array([-0.5, 0.0, 0.2]))
+    start, shares = np.array([[0.9, 0.4, -0.1]]), np.linspace(0.1, 1.0, 60)
+    way = np.concatenate(
+        [(base @ outer.pose(0.8 * s) @ inner.pose(-0.5 * s**2)).at(start) for s in shares]
+    )
+    ends = positions_along(base, (outer, inner), (0.08, -0.005), start, way, 0.01)
+    assert ends == pytest.approx((0.8, -0.5), abs=1e-6)
+    assert positions_along(base, (outer, inner), (0.08, -0.005), start, way[:, ::-1], 0.01) is None

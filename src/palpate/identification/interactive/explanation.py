@@ -23,7 +23,7 @@ TOGETHER = 0.02  # of the travel: how far two joints may miss the hand, beside t
 OPEN = -1.0  # of evidence, for each point: what has less is not where it is believed to be
 IN_THE_WAY = 0.05  # share of a part's points that cameras look through: hardly any where it is
 STEPS = 5  # of Gauss-Newton at each moment of a hand's way
-SMALL, DAMPED, MOST_STEP = 1e-5, 1e-5, 0.2  # rad or m, m^2, rad or m
+DAMPED, MOST_STEP = 1e-5, 0.2  # m^2, rad or m
 ELSEWHERE = 0.15  # rad or m that a carrier is at least from where it was believed to be
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 
@@ -228,19 +228,22 @@ def positions_along(
     """
     places = np.array(began)
 
-    def there(at: np.ndarray) -> np.ndarray:
-        pose = base @ joints[0].pose(float(at[0])) @ joints[1].pose(float(at[1]))
-        return pose.at(start)[0]
+    def there(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The place of the hand (m), and its derivatives by both positions."""
+        first, second = joints[0].pose(float(at[0])), joints[1].pose(float(at[1]))
+        on_first = second.at(start)
+        on_base = first.at(on_first)
+        inner = joints[1].velocity(on_first) @ first.rotation.T
+        slopes = np.concatenate([joints[0].velocity(on_base), inner]) @ base.rotation.T
+        return base.at(on_base)[0], slopes.T
 
     for point in way[np.linspace(0, len(way) - 1, MOMENTS).astype(int)]:
         for _ in range(STEPS):
-            here = there(places)
-            slopes = np.stack([there(places + one) - here for one in SMALL * np.eye(2)], axis=1)
-            slopes /= SMALL
+            here, slopes = there(places)
             square = slopes.T @ slopes + DAMPED * np.eye(2)
             step = np.linalg.solve(square, slopes.T @ (point - here))
             places = places + np.clip(step, -MOST_STEP, MOST_STEP)
-        if np.linalg.norm(there(places) - point) > most:
+        if np.linalg.norm(there(places)[0] - point) > most:
             return None
     return float(places[0]), float(places[1])
 

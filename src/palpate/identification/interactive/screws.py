@@ -110,8 +110,9 @@ class Screw:
     def distance_to(self, other: "Screw") -> tuple[float, float]:
         """Degrees between its axis and another one, whichever way they point, and how far (m) from
         its axis the other's point is."""
-        sine = float(np.linalg.norm(np.cross(self.axis, other.axis)))
-        aside = float(np.linalg.norm(np.cross(other.point - self.point, self.axis)))
+        across = _cross_matrix(self.axis)
+        sine = math.hypot(*(across @ other.axis))
+        aside = math.hypot(*(across @ (other.point - self.point)))
         return math.degrees(math.asin(min(sine, 1.0))), aside
 
     def is_beyond(
@@ -137,6 +138,11 @@ def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarr
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
 
 
+def cross(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The cross product of two vectors, for which NumPy's takes five times as long."""
+    return _cross_matrix(one) @ other
+
+
 def _frame(axis: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors across an axis, right-handed with it."""
     cross = _cross_matrix(axis)
@@ -146,7 +152,7 @@ def _frame(axis: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cross_matrix(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Its product with a vector is the cross product, for which NumPy's takes ten times as long."""
+    """Its product with a vector is the cross product."""
     x, y, z = axis
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from palpate.identification.interactive.edges.pieces import Piece, edges_of, pieces_of
 from palpate.identification.interactive.explanation import positions_along
-from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, rotation_about
+from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, cross, rotation_about
 from palpate.perception.clouds import Cloud
 
 AT_HAND = 0.05  # m from a hand: pieces that it may hold
@@ -138,7 +138,7 @@ def hinge_pairs(
 ) -> Iterator[HingePair]:
     """Pairs with one of some hinges of a carrier, by all angles, if the other hinge is at points of
     the carrier. Both are as they were in the look before or `after`."""
-    across = np.cross(*grip.normals)
+    across = cross(*grip.normals)
     sine = float(np.linalg.norm(across))
     for edge in hinges:
         parallel = sine > LEAST_TURN and abs(edge.axis @ across) > PARALLEL * sine
@@ -148,7 +148,7 @@ def hinge_pairs(
             if (carried := _hinge_on_carrier(back, grip)) is None:
                 continue
             own = back.at(points) if after else points
-            away = np.linalg.norm(np.cross(own - carried[0].point, carried[0].axis), axis=1)
+            away = np.linalg.norm(carried[0].velocity(own), axis=1)
             if away.min() < TOUCHES:
                 yield HingePair(hinge, turn, *carried, grip)
 
@@ -168,7 +168,7 @@ def _hinge_on_carrier(back: Pose, grip: Grip) -> tuple[Screw, float] | None:
     """The hinge of what is held, on a carrier that comes `back` so from the look after, and how far
     it has turned (rad); None if none takes the hand where it went."""
     normal, there = back.rotation @ grip.normals[1], back.at(grip.places[1][None])[0]
-    across = np.cross(grip.normals[0], normal)
+    across = cross(grip.normals[0], normal)
     sine = float(np.linalg.norm(across))
     angle = math.atan2(sine, float(grip.normals[0] @ normal))
     if not LEAST_TURN < angle < MOST_TURN:
@@ -186,7 +186,7 @@ def _centre(axis: Vector, angle: float, start: Vector, end: Vector) -> Vector | 
     if abs(along) > ASIDE:
         return None
     chord = chord - along * axis
-    return start + 0.5 * chord + 0.5 / math.tan(0.5 * angle) * np.cross(axis, chord)
+    return start + 0.5 * chord + 0.5 / math.tan(0.5 * angle) * cross(axis, chord)
 
 
 def _distance_to_end(hinge: Screw, edges: list[Screw], hand: Vector) -> float:
@@ -195,5 +195,5 @@ def _distance_to_end(hinge: Screw, edges: list[Screw], hand: Vector) -> float:
     along = [one for one in edges if one.distance_to(hinge)[0] < ALONG]
     if not along:
         return MOST_UNENDED
-    end = max(along, key=lambda one: float(np.linalg.norm(np.cross(hand - one.point, one.axis))))
+    end = max(along, key=lambda one: math.hypot(*one.velocity(hand)))
     return end.distance_to(hinge)[1]

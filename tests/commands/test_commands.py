@@ -458,7 +458,7 @@ def test_a_rope_goes_from_recording_to_report(
     monkeypatch.setattr(stabilization, "TRIAL_PERIODS", 0.3)
     monkeypatch.setattr(RopeWorld, "render", blind)
     tiny = Size(
-        trials=2, duration=0.6, identification=(1,), training=2, batch=2, starts=32, ropes=1
+        trials=2, duration=0.6, identification=(1,), training=1, batch=2, starts=32, ropes=1
     )
     tiny = dataclasses.replace(tiny, nodes=6)
     monkeypatch.setattr(DemoRope, "size", tiny)

@@ -235,6 +235,14 @@ def test_the_initial_free_values_build_the_reference(model):
         assert np.allclose(ours, theirs, rtol=1e-6)
 
 
+def test_a_weakly_typed_model_has_no_weakly_typed_free_values():
+    """A user's own number in a model is one, and a fit would compile all that it does twice."""
+    model = eqx.tree_at(lambda one: one.length, Pendulum(1.0, 0.2), jnp.asarray(2.0))
+    assert model.length.weak_type
+    free = FreeParameters(model).initial
+    assert not any(value.weak_type for value in free.values())
+
+
 def test_the_penalty_is_half_the_squared_norm():
     free = FreeParameters(Cart(1.0, 0.5))
     assert float(free.penalty(free.initial)) == 0.0

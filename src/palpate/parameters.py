@@ -261,7 +261,10 @@ class FreeParameters(eqx.Module):
         for path, declaration in self.declarations.items():
             value = value_of(self.reference, path)
             coordinate = declaration.prior.to_free(value, value)
-            free[path] = jnp.mean(coordinate) if declaration.shared else coordinate
+            coordinate = jnp.mean(coordinate) if declaration.shared else coordinate
+            # not weakly typed, as of a model that was given Python's numbers: what is computed
+            # of it is not, and would be compiled once more
+            free[path] = coordinate.astype(coordinate.dtype)
         return free
 
     def build(self, free: dict[str, Array]) -> Any:

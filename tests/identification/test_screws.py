@@ -93,6 +93,11 @@ def test_cross_products_are_numpy_s(values):
     assert np.allclose(cross(one, other), np.cross(one, other), atol=1e-15)
 
 
+def test_a_radius_is_the_distance_from_the_axis_wherever_along_it():
+    points = np.array([[1.3, -0.2, 0.5], [0.3, 0.4, -7.0], [0.3, -0.2, 2.0]])
+    assert HINGE.radii(points) == pytest.approx([1.0, 0.6, 0.0])
+
+
 @pytest.mark.parametrize("inner", [HINGE, SLIDE], ids=["hinge", "slide"])
 def test_a_way_tells_how_far_both_of_two_joints_have_gone(inner):
     base = Pose(rotation_about(np.array([0.6, 0.8, 0.0]), 0.7), np.array([0.1, 0.2, 0.3]))

@@ -277,7 +277,7 @@ def _is_hinged_on(tree: PartTree, part: int, before: int, after: int, new: Disco
     rest = np.setdiff1d(own, new.masks[0])
     if screw.joint != "revolute" or len(rest) < FEWEST:
         return False
-    away = np.linalg.norm(np.cross(cloud.points[own] - screw.point, screw.axis), axis=1)
+    away = screw.radii(cloud.points[own])
     if away.min() > TOUCHES:
         return False
     stayed = evidence(tree.looks[after], cloud.points[rest], cloud.normals[rest])

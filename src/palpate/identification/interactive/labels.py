@@ -267,13 +267,13 @@ def smooth_labels(cloud: Cloud, given: Scores) -> Float[np.ndarray, "labels poin
 
     Mean field of a Potts model on the graph of nearest neighbours (Krahenbuhl and Koltun 2011).
     """
-    chance, all_labels = _softmax(given), cloud.surface_graph.sum(axis=1)
+    chance, total = _softmax(given), cloud.surface_graph.sum(axis=1)
     for _ in range(ROUNDS):
         # label by label: the product of all at once lies the other way in memory, slow to reduce
         last, around = chance, np.empty_like(chance)
         for label, one in enumerate(chance[1:], 1):
             around[label] = cloud.surface_graph @ one
-        around[0] = all_labels - around[1:].sum(axis=0)  # as probabilities sum to one
+        around[0] = total - around[1:].sum(axis=0)  # as probabilities sum to one
         chance = _softmax(given + SMOOTH * around)
         if np.abs(chance - last).max() < SETTLED:
             break

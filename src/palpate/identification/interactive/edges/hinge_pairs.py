@@ -148,7 +148,7 @@ def hinge_pairs(
             if (carried := _hinge_on_carrier(back, grip)) is None:
                 continue
             own = back.at(points) if after else points
-            away = np.linalg.norm(carried[0].velocity(own), axis=1)
+            away = carried[0].radii(own)
             if away.min() < TOUCHES:
                 yield HingePair(hinge, turn, *carried, grip)
 
@@ -195,5 +195,5 @@ def _distance_to_end(hinge: Screw, edges: list[Screw], hand: Vector) -> float:
     along = [one for one in edges if one.distance_to(hinge)[0] < ALONG]
     if not along:
         return MOST_UNENDED
-    end = max(along, key=lambda one: math.hypot(*one.velocity(hand)))
+    end = max(along, key=lambda one: math.hypot(*cross(one.axis, hand - one.point)))
     return end.distance_to(hinge)[1]

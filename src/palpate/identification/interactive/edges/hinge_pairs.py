@@ -29,7 +29,6 @@ PARALLEL = 0.97  # cosine between an edge and the axis that a hand's piece turns
 ASIDE = 0.03  # m that a hand may seem to go along a hinge
 TOUCHES = 0.06  # m from a carrier to the hinge on it
 OFF, ENDS = 0.03, 0.15  # m that a pair may miss a hand on its way, rad that it may end elsewhere
-BEGUN = 0.05  # share of its turns from which a pair is followed
 # Shares of what a pair explains that are taken off for each rad that both hinges turn, and for each
 # m from its hinge to the end of what is held, up to some m: truer ones were behind by up to .15.
 COST, UNENDED, MOST_UNENDED = 0.08, 0.5, 0.15
@@ -76,12 +75,18 @@ class HingePair(NamedTuple):
         """Whether it lets a hand go its way and ends as it has to: two positions of two hinges take
         a hand to most places."""
         start, hinges = way[:3].mean(axis=0)[None], (self.carrier, self.carried)
-        # a lid that lies flat may fold either way
-        began = BEGUN * self.turn, BEGUN * self.carried_turn
-        ends = positions_along(NOWHERE, hinges, began, start, way, OFF)
-        if ends is None:
-            return False
-        return max(abs(ends[0] - self.turn), abs(ends[1] - self.carried_turn)) < ENDS
+        ends = np.zeros(2), np.array([self.turn, self.carried_turn])
+        # of a lid that lies flat it is open which way it folds: begin where hinges are told apart
+        if self._area(way[-1:], self.motions[0]) > self._area(start, NOWHERE):
+            way, ends = way[::-1], ends[::-1]
+        reached = positions_along(NOWHERE, hinges, tuple(ends[0].tolist()), start, way, OFF)
+        return reached is not None and float(np.abs(reached - ends[1]).max()) < ENDS
+
+    def _area(self, place: Float[np.ndarray, "1 3"], carrier: Pose) -> float:
+        """How well a place of the hand tells both positions, its carrier being there: the area that
+        the hand's velocities span as either hinge turns (m^2)."""
+        hinges = self.carrier, self.carried.moved(carrier)
+        return math.hypot(*cross(*(one.velocity(place)[0] for one in hinges)))
 
     def with_carrier(self, carrier: Screw, turn: float) -> "HingePair | None":
         """The pair in which the carrier turned otherwise and what is held went as it does; None if

@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.identification.interactive.explanation import positions_along
 from palpate.identification.interactive.screws import (
+    NOWHERE,
     Pose,
     Screw,
     cross,
     rotation_about,
     screws_of_way,
 )
+from palpate.identification.interactive.two_joints import Linkage
 
 HINGE = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.3, -0.2, 0.0]))
 SLIDE = Screw("prismatic", np.array([1.0, 0.0, 0.0]), np.zeros(3))
@@ -106,6 +107,24 @@ def test_a_way_tells_how_far_both_of_two_joints_have_gone(inner):
     way = np.concatenate(
         [(base @ outer.pose(0.8 * s) @ inner.pose(-0.5 * s**2)).at(start) for s in shares]
     )
-    ends = positions_along(base, (outer, inner), (0.08, -0.005), start, way, 0.01)
-    assert ends == pytest.approx((0.8, -0.5), abs=1e-6)
-    assert positions_along(base, (outer, inner), (0.08, -0.005), start, way[:, ::-1], 0.01) is None
+    linkage = Linkage(base, (outer, inner), start)
+    assert linkage.follow((0.08, -0.005), way, 0.01) == pytest.approx((0.8, -0.5), abs=1e-6)
+    assert linkage.follow((0.08, -0.005), way[:, ::-1], 0.01) is None
+
+
+def test_from_a_flat_place_an_elbow_bends_up_or_down_and_otherwise_as_it_began():
+    upper = Screw("revolute", np.array([0.0, 1.0, 0.0]), np.zeros(3))
+    lower = Screw("revolute", np.array([0.0, 1.0, 0.0]), np.array([0.4, 0.0, 0.0]))
+    linkage = Linkage(NOWHERE, (upper, lower), np.array([[0.7, 0.0, 0.0]]))
+    turned = np.linspace(0.0, 1.0, 40)[:, None] * np.array([0.5, -0.9])
+    way = np.array([linkage.there(one)[0] for one in turned])
+    for ends in (linkage.ends((0.0, 0.0), way, 0.01), linkage.ends((0.1, -0.05), way, 0.01)):
+        assert sorted(ends)[1] == pytest.approx((0.5, -0.9), abs=1e-3)
+        assert len(ends) == 2
+        for one in ends:
+            np.testing.assert_allclose(linkage.there(np.array(one))[0], way[-1], atol=1e-3)
+    bent = turned[::-1] * [1.0, 1.0]
+    back = np.array([linkage.there(one)[0] for one in bent])
+    assert linkage.ends((0.5, -0.9), back[:30], 0.01) == [pytest.approx(bent[29], abs=1e-3)]
+    assert linkage.leads((0.0, 0.0), (0.5, -0.9), way, 0.01)
+    assert not linkage.leads((0.0, 0.0), (-0.5, 0.9), way, 0.01)

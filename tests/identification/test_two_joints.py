@@ -11,7 +11,7 @@ from palpate.identification.interactive.duplicates import drop_explained
 from palpate.identification.interactive.explanation import (
     find_moved_part,
     joint_of_ways,
-    two_positions,
+    possible_ends,
 )
 from palpate.identification.interactive.handling import Handling, Push
 from palpate.identification.interactive.insertion import Discovery
@@ -58,8 +58,7 @@ def known() -> tuple[Unsteady, Twin, Handling]:
 def test_where_both_joints_are_is_told_by_the_hand_alone(known) -> None:
     _, twin, handling = known
     look = len(twin.looks) - 1
-    ends = two_positions(twin, 1, look, handling)
-    assert ends is not None
+    (ends,) = possible_ends(twin, 1, look, handling)
     gone = np.subtract(ends, [part.positions[look] for part in twin.parts])
     signs = np.sign([part.positions[-1] for part in twin.parts])
     assert np.abs(gone) == pytest.approx([0.45, 0.7], abs=0.04)
@@ -70,7 +69,7 @@ def test_where_both_joints_are_is_told_by_the_hand_alone(known) -> None:
         handling.push, handling.before, handling.after, handling.times,
         handling.points + aside, handling.forces,
     )  # fmt: skip
-    assert two_positions(twin, 1, look, lifted) is None
+    assert not possible_ends(twin, 1, look, lifted)
 
 
 def test_a_pull_that_moves_a_known_flap_and_its_door_is_of_the_flap(known) -> None:

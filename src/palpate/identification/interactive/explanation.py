@@ -10,9 +10,10 @@ from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.labels import FREE, LEAST_MOTION, evidence
 from palpate.identification.interactive.part import Candidate, Part
 from palpate.identification.interactive.refinement import SURPRISE, Estimate, refine, surprise
-from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, screws_of_way
+from palpate.identification.interactive.screws import NOWHERE, screws_of_way
 from palpate.identification.interactive.tree import NOT_MOVED, PartTree
-from palpate.identification.interactive.ways import MOMENTS, Way, misfit
+from palpate.identification.interactive.two_joints import Linkage
+from palpate.identification.interactive.ways import Way, misfit
 
 BESIDE = 0.06  # m from where a hand takes hold: what it may have hold of
 FURTHER = 1.5  # rad or m that a part may have been beyond where it was seen
@@ -22,8 +23,6 @@ SHORT = 0.05  # m that a hand went: a way so short fits many joints
 TOGETHER = 0.02  # of the travel: how far two joints may miss the hand, beside the metres below
 OPEN = -1.0  # of evidence, for each point: what has less is not where it is believed to be
 IN_THE_WAY = 0.05  # share of a part's points that cameras look through: hardly any where it is
-STEPS = 5  # of Gauss-Newton at each moment of a hand's way
-DAMPED, MOST_STEP = 1e-5, 0.2  # m^2, rad or m
 ELSEWHERE = 0.15  # rad or m that a carrier is at least from where it was believed to be
 EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss the hand
 
@@ -149,18 +148,19 @@ def _by_two_joints(tree: PartTree, before: int, after: int, handling: Handling) 
     for part in labels_near(tree, before, handling.push.point):
         if part < 0 or (carrier := tree.parts[part].parent) < 0:
             continue
-        ends = two_positions(tree, part, before, handling)
-        if ends is None:
-            continue
         both = tree.parts[carrier], tree.parts[part]
         kept = [one.positions[after] for one in both]
-        own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
-        _place(both, ends, after)
-        seen = _are_seen_near(tree, (carrier, part), before, after, handling)
-        if not seen:
+        best, found = -np.inf, None
+        for ends in possible_ends(tree, part, before, handling):
             _place(both, ends, after)
-            seen = _are_seen(tree, (carrier, part), after)
-        if seen and not any(tree.much_is_left(candidate, look, own) for look in (before, after)):
+            if not _are_seen_near(tree, (carrier, part), before, after, handling):
+                _place(both, ends, after)
+            seen = _seen(tree, (carrier, part), after)
+            if min(seen) > OPEN and sum(seen) > best:
+                best, found = sum(seen), [one.positions[after] for one in both]
+        _place(both, kept if found is None else found, after)
+        own, candidate = int(np.sum(tree.labels[before] == part)), Candidate(NOWHERE, before, after)
+        if found and not any(tree.much_is_left(candidate, look, own) for look in (before, after)):
             both[1].ways.append((before, handling.points))
             return part
         _place(both, kept, after)
@@ -173,79 +173,38 @@ def _place(parts: Sequence[Part], positions: Sequence[float], look: int) -> None
         part.positions[look] = position
 
 
-def _are_seen(tree: PartTree, parts: tuple[int, int], look: int) -> bool:
-    """Whether no camera looks through parts where they are believed to be."""
-    return all(
-        tree.seen_at(part, look, np.array([tree.parts[part].positions[look]]))[0] > OPEN
+def _seen(tree: PartTree, parts: tuple[int, int], look: int) -> list[float]:
+    """The evidence, for each point, of parts where they are believed to be in a look."""
+    return [
+        float(tree.seen_at(part, look, np.array([tree.parts[part].positions[look]]))[0])
         for part in parts
-    )
+    ]
 
 
 def _are_seen_near(
     tree: PartTree, parts: tuple[int, int], before: int, after: int, handling: Handling
 ) -> bool:
-    """The same of a carrier and a part on it, which are taken to where they are seen, as joints are
-    a little off; if the hand is then about where the part has gone."""
+    """Whether a carrier and a part on it are where no camera looks through them, taken to where
+    they are seen, as joints are a little off; and the hand about where the part has gone."""
     for part in parts:
         tree.find(part, after, around=tree.parts[part].positions[after])
     start, end = handling.points[:3].mean(axis=0), handling.points[-3:].mean(axis=0)
     missed = np.linalg.norm(tree.motion(parts[1], before, after).at(start[None])[0] - end)
     near = missed < EXPLAINED[0] + EXPLAINED[1] * handling.travel
-    return bool(near) and _are_seen(tree, parts, after)
+    return bool(near) and min(_seen(tree, parts, after)) > OPEN
 
 
-def two_positions(
+def possible_ends(
     tree: PartTree, part: int, before: int, handling: Handling
-) -> tuple[float, float] | None:
-    """Where the hand has taken a part's carrier and the part on it (rad or m); None if their joints
-    do not let it go there."""
+) -> list[tuple[float, float]]:
+    """Where the hand may have taken a part's carrier and the part on it (rad or m): nowhere if
+    their joints do not let it go its way."""
     carrier, one = tree.parts[tree.parts[part].parent], tree.parts[part]
     start = tree.pose(part, before).inverse.at(handling.points[:3].mean(axis=0)[None])
-    most = EXPLAINED[0] + TOGETHER * handling.travel
-    return positions_along(
-        tree.pose(carrier.parent, before),
-        (carrier.screw, one.screw),
-        (carrier.positions[before], one.positions[before]),
-        start,
-        handling.points,
-        most * (0.5 if one.provisional else 1.0),
-    )
-
-
-def positions_along(
-    base: Pose,
-    joints: tuple[Screw, Screw],
-    began: tuple[float, float],
-    start: Float[np.ndarray, "1 3"],
-    way: Float[np.ndarray, "times 3"],
-    most: float,
-) -> tuple[float, float] | None:
-    """Where a hand has taken two joints, one on what the other carries (rad or m), that a hand held
-    at a point of what both carry; None if they miss its way by more than the `most` (m).
-
-    Three coordinates of each point of the way are to be explained by two positions (Gauss-Newton,
-    from those of the point before).
-    """
-    places = np.array(began)
-
-    def there(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The place of the hand (m), and its derivatives by both positions."""
-        first, second = joints[0].pose(float(at[0])), joints[1].pose(float(at[1]))
-        on_first = second.at(start)
-        on_base = first.at(on_first)
-        inner = joints[1].velocity(on_first) @ first.rotation.T
-        slopes = np.concatenate([joints[0].velocity(on_base), inner]) @ base.rotation.T
-        return base.at(on_base)[0], slopes.T
-
-    for point in way[np.linspace(0, len(way) - 1, MOMENTS).astype(int)]:
-        for _ in range(STEPS):
-            here, slopes = there(places)
-            square = slopes.T @ slopes + DAMPED * np.eye(2)
-            step = np.linalg.solve(square, slopes.T @ (point - here))
-            places = places + np.clip(step, -MOST_STEP, MOST_STEP)
-        if np.linalg.norm(there(places)[0] - point) > most:
-            return None
-    return float(places[0]), float(places[1])
+    most = (EXPLAINED[0] + TOGETHER * handling.travel) * (0.5 if one.provisional else 1.0)
+    linkage = Linkage(tree.pose(carrier.parent, before), (carrier.screw, one.screw), start)
+    began = carrier.positions[before], one.positions[before]
+    return linkage.ends(began, handling.points, most)
 
 
 def _by_all_ways(tree: PartTree, before: int, after: int, handling: Handling) -> int:
@@ -303,7 +262,7 @@ def _by_way_elsewhere(tree: PartTree, before: int, after: int, handling: Handlin
                 continue
             for look in (before, after):
                 tree.find(part, look, beyond=FURTHER)
-            if _are_seen(tree, (one.parent, part), before) and _follows_hand(
+            if min(_seen(tree, (one.parent, part), before)) > OPEN and _follows_hand(
                 tree, part, before, after, handling
             ):
                 one.ways.append((before, handling.points))

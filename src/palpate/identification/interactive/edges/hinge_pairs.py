@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from palpate.identification.interactive.edges.pieces import Piece, edges_of, pieces_of
-from palpate.identification.interactive.explanation import positions_along
 from palpate.identification.interactive.screws import NOWHERE, Pose, Screw, cross, rotation_about
+from palpate.identification.interactive.two_joints import Linkage
 from palpate.perception.clouds import Cloud
 
 AT_HAND = 0.05  # m from a hand: pieces that it may hold
@@ -28,7 +28,7 @@ LEAST_TURN, MOST_TURN = 0.1, 2.4  # rad, of a carrier, and of what it carries
 PARALLEL = 0.97  # cosine between an edge and the axis that a hand's piece turns about, known better
 ASIDE = 0.03  # m that a hand may seem to go along a hinge
 TOUCHES = 0.06  # m from a carrier to the hinge on it
-OFF, ENDS = 0.03, 0.15  # m that a pair may miss a hand on its way, rad that it may end elsewhere
+OFF = 0.03  # m that a pair may miss a hand on its way
 # Shares of what a pair explains that are taken off for each rad that both hinges turn, and for each
 # m from its hinge to the end of what is held, up to some m: truer ones were behind by up to .15.
 COST, UNENDED, MOST_UNENDED = 0.08, 0.5, 0.15
@@ -72,21 +72,10 @@ class HingePair(NamedTuple):
         return 1.0 - COST * turned - UNENDED * min(away, MOST_UNENDED)
 
     def follows(self, way: Float[np.ndarray, "times 3"]) -> bool:
-        """Whether it lets a hand go its way and ends as it has to: two positions of two hinges take
-        a hand to most places."""
-        start, hinges = way[:3].mean(axis=0)[None], (self.carrier, self.carried)
-        ends = np.zeros(2), np.array([self.turn, self.carried_turn])
-        # of a lid that lies flat it is open which way it folds: begin where hinges are told apart
-        if self._area(way[-1:], self.motions[0]) > self._area(start, NOWHERE):
-            way, ends = way[::-1], ends[::-1]
-        reached = positions_along(NOWHERE, hinges, tuple(ends[0].tolist()), start, way, OFF)
-        return reached is not None and float(np.abs(reached - ends[1]).max()) < ENDS
-
-    def _area(self, place: Float[np.ndarray, "1 3"], carrier: Pose) -> float:
-        """How well a place of the hand tells both positions, its carrier being there: the area that
-        the hand's velocities span as either hinge turns (m^2)."""
-        hinges = self.carrier, self.carried.moved(carrier)
-        return math.hypot(*cross(*(one.velocity(place)[0] for one in hinges)))
+        """Whether it lets a hand go its way and turns as far as it has to: two positions of two
+        hinges take a hand to most places."""
+        linkage = Linkage(NOWHERE, (self.carrier, self.carried), way[:3].mean(axis=0)[None])
+        return linkage.leads((0.0, 0.0), (self.turn, self.carried_turn), way, OFF)
 
     def with_carrier(self, carrier: Screw, turn: float) -> "HingePair | None":
         """The pair in which the carrier turned otherwise and what is held went as it does; None if

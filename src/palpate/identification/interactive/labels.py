@@ -5,7 +5,7 @@ was seen there, or hidden. What a camera would have to look through is no part o
 what would have faced a camera that saw nothing there: depth has holes, but small ones.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,6 +18,10 @@ from palpate.perception.clouds import NEAREST, Cloud
 
 # logarithms of how much likelier each is of a point that moves so than of another
 ON, FREE, HIDDEN, MISSING = 0.9, -2.9, -0.4, -1.5
+POINTS = 100  # of each look by which it is told how much is explained, about
+# what is hidden where it has gone is nearly as likely then as what is seen there, as a part that
+# opens hides much and bares more
+CONCEALED = 0.6
 TOLERANCE = 3.0  # standard deviations of depth
 AGREES = 0.7  # cosine of the angle between the normals of what is the same surface
 SMOOTH = 0.45  # how much likelier neighbours on one surface are of one part (logarithm)
@@ -111,6 +115,25 @@ def scores(
         poses = [motion[number] for motion in motions]
         found += weights[number] * _known_evidence(cloud, other, poses, step, hidden)
     return np.maximum(found, found.max(axis=0) - MOST_EVIDENCE)
+
+
+def evidence_of_looks(
+    looks: Sequence[Cloud], labels: Sequence[int], motion: Callable[[int, int, int], Pose]
+) -> float:
+    """How much likelier the likeliest label of a point makes another look (logarithm), the mean of
+    some points and all pairs of looks.
+
+    `motion` of a label and two numbers of looks is how what has it has moved from one to the other.
+    """
+    found = []
+    for look, cloud in enumerate(looks):
+        others = [other for other in range(len(looks)) if other != look]
+        motions = [[motion(label, look, other) for other in others] for label in labels]
+        step = max(1, len(cloud.points) // POINTS)
+        seen = [looks[other] for other in others]
+        best = scores(cloud, seen, motions, step, hidden=CONCEALED).max(axis=0)
+        found.append(float(best.mean()) / max(len(others), 1))
+    return float(np.mean(found))
 
 
 def _known_evidence(

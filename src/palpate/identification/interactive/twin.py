@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.identification.interactive.discovery import TELLS, discover
 from palpate.identification.interactive.duplicates import drop_explained, merge_same
-from palpate.identification.interactive.edges.folding import discover_pair
+from palpate.identification.interactive.edges.folding import discover_pair, leaves_much
 from palpate.identification.interactive.edges.splitting import split, split_off_base
 from palpate.identification.interactive.explanation import (
     BESIDE,
@@ -26,18 +26,15 @@ from palpate.identification.interactive.explanation import (
 )
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, find_beside, reparent
-from palpate.identification.interactive.labels import scores
+from palpate.identification.interactive.labels import evidence_of_looks
 from palpate.identification.interactive.part import KNOWN, UNSURE, Part
 from palpate.identification.interactive.screws import Screw, screws_of_way
 from palpate.identification.interactive.tree import FEWEST, PartTree
 from palpate.identification.interactive.ways import is_of_two_ends, misfit
 from palpate.perception.clouds import Cloud
 
-POINTS = 100  # of each look by which it is told how much is explained, about
-# of evidence, for each point: what is hidden where it has gone is nearly as likely as what is seen
-# there, as a part that opens hides much and bares more
-CONCEALED = 0.6
-AS_GOOD = 0.03  # the same: what it may cost to have a part less
+# of evidence, for each point: what it may cost to have a part less, and what one more has to gain
+AS_GOOD = 0.03
 OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
 ELSEWHERE = 5.0, 0.05  # deg and m between two joints that nobody would take for one
 ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known
@@ -83,20 +80,8 @@ class Twin(PartTree):
         return self.evidence_of_looks() - cost
 
     def evidence_of_looks(self) -> float:
-        """How much likelier the likeliest label of a point makes another look (logarithm), the mean
-        of points and pairs of looks."""
-        found = []
-        for look, cloud in enumerate(self.looks):
-            others = [other for other in range(len(self.looks)) if other != look]
-            motions = [
-                [self.motion(part, look, other) for other in others]
-                for part in range(-1, len(self.parts))
-            ]
-            step = max(1, len(cloud.points) // POINTS)
-            seen = [self.looks[other] for other in others]
-            best = scores(cloud, seen, motions, step, hidden=CONCEALED).max(axis=0)
-            found.append(float(best.mean()) / max(len(others), 1))
-        return float(np.mean(found))
+        """See `palpate.identification.interactive.labels.evidence_of_looks`."""
+        return evidence_of_looks(self.looks, range(-1, len(self.parts)), self.motion)
 
     def observe(self, handling: Handling) -> None:
         """Explain what was seen and felt."""
@@ -119,6 +104,7 @@ class Twin(PartTree):
 
     def _learn(self, handling: Handling) -> None:
         """Explain a handling by a joint that is known, or a part that is new."""
+        known = self.copy()
         before = self.add_look(handling.before)
         after = self.add_look(handling.after, still=not handling.moved)
         self.handled.append(handling)
@@ -150,6 +136,8 @@ class Twin(PartTree):
         merge_same(self)
         drop_explained(self)
         self._drop_unknown()
+        if handling.moved and self.held[-1][0] >= 0 and leaves_much(self, before, after):
+            self._explain_by_two(known, handling)
 
     def look(self, cloud: Cloud) -> None:
         """Take in what is seen while nobody handles it: what was let go may have moved."""
@@ -258,6 +246,21 @@ class Twin(PartTree):
         self.refit(-1)
         if self.held[-1][0] >= 0:
             self._drop_replaced()
+
+    def _explain_by_two(self, known: "Twin", handling: Handling) -> None:
+        """Explain a pull by two hinges, from what was `known` before it, if that explains more: the
+        hand may go as one hinge would let it."""
+        before, after = known.add_look(handling.before), known.add_look(handling.after)
+        for look in (before, after):
+            known.relabel(look)
+        known.handled.append(handling)
+        known.held.append((-1, before))
+        known._explain_by_edges(before, after, handling)
+        merge_same(known)
+        drop_explained(known)
+        known._drop_unknown()
+        if known.held[-1][0] >= 0 and known.explained() > self.explained() + AS_GOOD:
+            self.parts, self.labels, self.held = known.parts, known.labels, known.held
 
     def _drop_replaced(self) -> None:
         """Take out parts that a hand took where it has now held two joints, if these explain all

@@ -26,6 +26,7 @@ from palpate.perception.clouds import Cloud
 POINTS = 250  # of each look, by which pairs are held against each other
 FOLLOWED, FINER = 60, 5  # of the pairs, the best: those that a hand may have followed, and finer
 STEPS = (0.03, 0.012), (0.015, 0.006)  # rad, and m aside, by which a pair is made finer
+MUCH = 0.05  # share of what has moved: less may be what was hidden, or noise
 LEAST_EVIDENCE = 500.0  # of evidence, of all points of both looks
 MOST_UNSURE = 5.0, 0.03  # deg and m by which it may count that a known hinge is not quite known
 
@@ -86,6 +87,16 @@ def discover_pair(tree: PartTree, before: int, after: int, handling: Handling) -
     looks = tree.looks[before], tree.looks[after]
     pair = _best_pair(looks, known, handling.points, carriers)
     return -1 if pair is None else _insert(tree, before, after, handling.points, pair, known)
+
+
+def leaves_much(tree: PartTree, before: int, after: int) -> bool:
+    """Whether much of what went elsewhere from one look to the next went as no part has."""
+    parts = list(range(-1, len(tree.parts)))
+    left, moved = 0, 0
+    for looks in ((before, after), (after, before)):
+        left += int(np.sum(_evidence(tree, *looks, parts) < UNEXPLAINED))
+        moved += int(np.sum(_evidence(tree, *looks, [-1]) < UNEXPLAINED))
+    return left > max(MUCH * moved, 2 * FEWEST)
 
 
 def _evidence(

@@ -57,7 +57,7 @@ STAGES = {
         *("identification.interactive.averaging", "identification.interactive.duplicates"),
         *("identification.interactive.insertion", "identification.interactive.hindsight"),
         *("identification.interactive.screws", "identification.interactive.ways"),
-        "identification.interactive.labels",
+        *("identification.interactive.two_joints", "identification.interactive.labels"),
         *("identification.interactive.refinement", "identification.interactive.description"),
         "identification.interactive.forces.resistance",
         "identification.interactive.forces.action",

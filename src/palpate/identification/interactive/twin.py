@@ -127,7 +127,7 @@ class Twin(PartTree):
             self._explain_earlier()
             self.refit(-1)
         self._merge()
-        if handling.moved and self.held[-1][0] < 0:
+        if by_edges := handling.moved and self.held[-1][0] < 0:
             self._explain_by_edges(before, after, handling)
         # where nothing has moved, another look only has other noise
         if any(one.moved for one in self.handled[-2:]) and split(self, [before, after]):
@@ -136,7 +136,7 @@ class Twin(PartTree):
         merge_same(self)
         drop_explained(self)
         self._drop_unknown()
-        if handling.moved and self.held[-1][0] >= 0 and leaves_much(self, before, after):
+        if handling.moved and not by_edges and leaves_much(self, before, after):
             self._explain_by_two(known, handling)
 
     def look(self, cloud: Cloud) -> None:

@@ -191,8 +191,9 @@ def test_a_door_and_a_flap_across_it_are_found_from_one_pull_that_moved_both() -
         errors = [room.error(twin, number, number) for number in (0, 1)]
         assert max(degrees for degrees, _ in errors) < 3.0
         aside.append([centimetres for _, centimetres in errors])
-        for part, gone in zip(twin.parts, end, strict=True):
+        for part, gone, off in zip(twin.parts, end, aside[-1], strict=True):
             assert np.ptp(part.positions) == pytest.approx(abs(gone), abs=0.06)
+            assert off < 100.0 * part.estimate.intervals[1]
     # one place alone is off by up to 1.5 cm, as the noise falls
     assert np.all(np.mean(aside, axis=0) < 1.0)
 

@@ -123,8 +123,8 @@ def test_from_a_flat_place_an_elbow_bends_up_or_down_and_otherwise_as_it_began()
         assert len(ends) == 2
         for one in ends:
             np.testing.assert_allclose(linkage.there(np.array(one))[0], way[-1], atol=1e-3)
-    bent = turned[::-1] * [1.0, 1.0]
-    back = np.array([linkage.there(one)[0] for one in bent])
-    assert linkage.ends((0.5, -0.9), back[:30], 0.01) == [pytest.approx(bent[29], abs=1e-3)]
+    back = turned[::-1][:30]
+    ends = linkage.ends((0.5, -0.9), np.array([linkage.there(one)[0] for one in back]), 0.01)
+    assert ends == [pytest.approx(back[-1], abs=1e-3)]
     assert linkage.leads((0.0, 0.0), (0.5, -0.9), way, 0.01)
     assert not linkage.leads((0.0, 0.0), (-0.5, 0.9), way, 0.01)

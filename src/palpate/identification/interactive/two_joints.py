@@ -49,7 +49,8 @@ class Linkage(NamedTuple):
         return self.base.at(on_base)[0], (slopes @ self.base.rotation.T).T
 
     def area(self, positions: Positions) -> float:
-        """How well the hand tells both positions: the area that its derivatives span (m^2)."""
+        """How well the hand tells both positions: the area that its derivatives span, m^2 of two
+        hinges (the manipulability of Yoshikawa 1985)."""
         return math.hypot(*cross(*self.there(np.array(positions))[1].T))
 
     def follow(self, began: Positions, way: Points, most: float) -> Positions | None:

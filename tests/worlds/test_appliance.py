@@ -1,5 +1,6 @@
 """Appliances of the generator: that they are what they say, and what a hand can do with them."""
 
+import itertools
 import math
 
 import mujoco
@@ -29,6 +30,22 @@ def test_every_category_has_one_to_six_parts_of_both_kinds_nested_and_tilted_one
     assert all(
         part.parent < number for design in designs for number, part in enumerate(design.parts)
     )
+
+
+def test_what_hangs_on_a_part_touches_it():
+    gaps = []
+    for category, seed in itertools.product(CATEGORIES, range(100)):
+        design = draw_design(category, seed)
+        for part in design.parts:
+            if part.parent >= 0:
+                own, its = (
+                    np.concatenate([corners_of(shape) for shape in one.shapes])
+                    for one in (part, design.parts[part.parent])
+                )
+                apart = np.maximum(own.min(0) - its.max(0), its.min(0) - own.max(0))
+                gaps.append(np.linalg.norm(np.maximum(apart, 0.0)))
+    assert len(gaps) > 50
+    assert max(gaps) < 0.01  # m
 
 
 def test_the_same_seed_gives_the_same_appliance_and_another_another():

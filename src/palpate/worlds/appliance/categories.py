@@ -178,6 +178,7 @@ def refrigerator(random: Random) -> Design:
     kind = random.choice(["one", "above", "beside", "drawers"], p=[0.25, 0.3, 0.25, 0.2])
     side: Side = "left" if chance(random, 0.5) else "right"
     parts: list[Part] = []
+    front = whole  # of the last door
 
     def leaf(name: str, front: Front, hinge: Side) -> None:
         parts.append(door(random, front, name, hinge, "sheet", thickness=thickness))
@@ -187,7 +188,8 @@ def refrigerator(random: Random) -> Design:
     elif kind == "above":
         split = uniform(random, 0.55, 0.75) * height
         leaf("door", whole.part(0.0, 0.0, width, split), side)
-        leaf("freezer", whole.part(0.0, split, width, height - split), side)
+        front = whole.part(0.0, split, width, height - split)
+        leaf("freezer", front, side)
     elif kind == "beside":
         split = uniform(random, 0.4, 0.6) * width
         leaf("right door", whole.part(0.0, 0.0, split, height), "right")
@@ -199,7 +201,6 @@ def refrigerator(random: Random) -> Design:
         for index in range(count):
             front = whole.part(0.0, index * tall, width, tall)
             parts.append(drawer(random, front, f"drawer {index + 1}", depth - 0.08, "sheet"))
-    front = whole if kind == "one" else whole.part(0.0, 0.0, width, 0.6 * height)
     if kind in ("one", "above"):
         parts += _nested_flaps(random, front, 0.003 + thickness, parts, "plastic")
     return Design("refrigerator", tuple(body), tuple(parts), 0.0)

@@ -350,3 +350,16 @@ def test_a_carrier_that_was_put_on_what_it_carries_stands_on_what_is_still(monke
         monkeypatch.setattr(folding, name, other)
     assert discover_pair(twin, before, after, pulled) == 0
     assert [part.parent for part in twin.parts] == [1, -1]
+
+
+def test_of_two_doors_on_one_line_the_carrier_is_the_one_at_the_hand() -> None:
+    _, twin = pulled((0.0, 0.0), (DOOR, (-0.6, 0.0)))
+    (door,) = twin.parts
+    for height in (2.0, -2.0):  # m, along its hinge
+        points, normals = door.support
+        other = dataclasses.replace(door, support=(points + height * door.screw.axis, normals))
+        for parts, expected in ([door, other], 0), ([other, door], 1):
+            twin.parts = parts
+            hand = twin.pose(expected, 0).at(points)[0]
+            assert folding._part_with(twin, 0, door.screw, hand) == expected
+            assert folding._part_with(twin, 0, door.screw, hand, but=expected) == 1 - expected

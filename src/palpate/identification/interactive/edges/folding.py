@@ -163,8 +163,8 @@ def _insert(
     """Put what is not known of a pair into the tree, if it explains points of its own; the number
     of what the hand held, or -1."""
     masks = _own_points(tree, before, after, pair, known)
-    carrier = _part_with(tree, before, pair.carrier)
-    carried = _part_with(tree, before, pair.carried, but=carrier)
+    carrier = _part_with(tree, before, pair.carrier, way[0])
+    carried = _part_with(tree, before, pair.carried, way[0], but=carrier)
     shown = [max(map(len, each)) >= FEWEST for each in masks]
     if (carrier is None and not shown[0]) or (carried is None and not shown[1]):
         return -1
@@ -202,13 +202,22 @@ def _insert(
     return len(tree.parts) - 1
 
 
-def _part_with(tree: PartTree, look: int, hinge: Screw, but: int | None = None) -> int | None:
-    """The part that turns about a hinge, as well as both are known; None if none does."""
+def _part_with(
+    tree: PartTree,
+    look: int,
+    hinge: Screw,
+    hand: Float[np.ndarray, "3"],
+    but: int | None = None,
+) -> int | None:
+    """The part that turns about a hinge, as well as both are known, and the nearest to a hand of
+    those: doors above each other have one line; None if none does."""
+    found: dict[int, float] = {}
     for number, part in enumerate(tree.parts):
         unsure = np.minimum(part.estimate.intervals, MOST_UNSURE).tolist()
         if number != but and is_same_hinge(hinge, tree.screw(number, look), *unsure):
-            return number
-    return None
+            points = tree.pose(number, look).at(part.support[0])
+            found[number] = float(np.linalg.norm(points - hand, axis=1).min())
+    return min(found, key=found.__getitem__, default=None)
 
 
 def _signed(screw: Screw, other: Screw, turn: float) -> float:

@@ -196,3 +196,28 @@ def test_the_pulls_of_a_part_that_is_dropped_are_of_what_moved(twin, monkeypatch
     twin.parts.append(dataclasses.replace(twin.parts[1], ways=[]))
     twin.held[1] = 2, twin.held[1][1]
     assert [part for part, _ in drop_needless(twin).held] == [0, 1]
+
+
+def test_a_carrier_that_no_hand_has_felt_is_dropped_where_what_it_carries_goes_as_far(room) -> None:
+    _, twin = pulled(PLACES[0], (DOOR, PLACES[1]))
+    (door,) = twin.parts
+    gone = door.positions
+    beside = dataclasses.replace(door.screw, point=door.screw.point + 0.05)
+    carrier = dataclasses.replace(
+        door,
+        estimate=dataclasses.replace(door.estimate, screw=beside),
+        positions=[0.4 * place for place in gone],
+        ways=[],
+    )
+    twin.parts = [carrier, hang(twin, door, -1, 0)]
+    twin.parts[1] = hang(twin, twin.parts[1], 0, 0)
+    twin.held = [(1, look) for _, look in twin.held]
+    for look in range(len(twin.looks)):
+        twin.find(1, look, beyond=1.0)
+        twin.relabel(look)
+    twin.parts[1].settle(twin.estimate(twin.parts[1]))
+    (left,) = drop_needless(twin).parts
+    assert left.parent == -1
+    np.testing.assert_allclose(
+        np.subtract(left.positions, left.positions[0]), np.subtract(gone, gone[0]), atol=0.05
+    )

@@ -93,6 +93,11 @@ def drop_needless(twin: Twin) -> Twin:
         other.remove(number, other.parts[number].parent)
         for look in range(len(other.looks)):
             other.relabel(look)
+        if any(part.parent == number for part in twin.parts):
+            # what it carried was only seen as if on it: a lid, taken for two hinges at once
+            other.refit(-1)
+            for look in range(len(other.looks)):
+                other.relabel(look)
         other.held = [
             (_part_that_went(other, before, handling), before) if lost else (part, before)
             for (part, before), lost, handling in zip(other.held, held, other.handled, strict=True)

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from chests import CHEST_LID, DEEP, LEAF, LID, Chest, opened
+from palpate.identification.interactive import explanation
 from palpate.identification.interactive import twin as twin_module
-from palpate.identification.interactive.duplicates import drop_explained
+from palpate.identification.interactive.duplicates import ANYWHERE, drop_explained, drop_unknown
 from palpate.identification.interactive.edges.splitting import split_off_base
 from palpate.identification.interactive.explanation import find_moved_part
 from palpate.identification.interactive.part import support_of
 from palpate.identification.interactive.tree import PartTree
-from palpate.identification.interactive.twin import ANYWHERE, Twin
+from palpate.identification.interactive.twin import Twin
 from rooms import Notes
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
@@ -128,7 +129,7 @@ def test_a_joint_of_which_nothing_is_known_is_not_kept_unless_a_hand_has_held_it
             for ways in ([], part.ways):  # a hand that held it tells that it is there
                 changed = dataclasses.replace(part, estimate=estimate, ways=ways)
                 twin.parts = [changed]
-                twin._drop_unknown()
+                drop_unknown(twin)
                 assert bool(twin.parts) == (kept or bool(ways))
 
 
@@ -164,3 +165,19 @@ def test_parts_are_split_off_only_after_something_has_moved(chest, monkeypatch) 
     for _ in range(3):
         twin.observe(still)
     assert len(calls) == 1  # what the pull before had moved may show only now
+
+
+def test_a_pull_that_folds_a_lid_of_which_little_is_known_is_of_both_joints(chest) -> None:
+    twin, notes = opened(chest), Notes()
+    chest.pull(twin, LEAF, (0.05, 0.0), (0.05, 0.6))
+    chest.pull(twin, LEAF, (0.05, 0.6), (0.0, 0.0))
+    notes.look(twin.looks[-1])
+    chest.pull(notes, LEAF, (0.0, 0.0), (0.46, 0.89))
+    (pull,) = notes.handled
+    looks = twin.add_look(pull.before), twin.add_look(pull.after)
+    lid, leaf = twin.parts
+    lid.ways = []  # as if a hand had never held it: its circle may be the hand's then
+    assert explanation._by_way(twin.copy(), *looks, pull) == 0
+    assert find_moved_part(twin, *looks, pull) == 1
+    gone = [part.positions[looks[1]] - part.positions[looks[0]] for part in (lid, leaf)]
+    np.testing.assert_allclose(np.abs(gone), [0.46, 0.89], atol=0.08)

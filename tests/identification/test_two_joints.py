@@ -210,3 +210,46 @@ def test_nothing_is_hinged_on_a_part_of_which_a_look_shows_nothing(known) -> Non
     twin.labels[look][:] = -1
     new = Discovery(-1, twin.parts[1].estimate, [np.zeros(0, int), np.zeros(0, int)])
     assert not discovery._is_hinged_on(twin, 0, look, look, new)
+
+
+class NarrowFlap(Room):
+    """A door with a flap in it whose hinge is beside the door's, and a hand on either."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            """
+            <mujoco>
+              <worldbody>
+                <geom type="box" size=".02 .9 1.1" pos=".15 0 1.1"/>
+                <geom type="box" size=".05 .05 1.1" pos="0 .5 1.1"/>
+                <geom type="box" size=".05 .05 1.1" pos="0 -.5 1.1"/>
+                <body name="door" pos="0 .44 1.1">
+                  <joint axis="0 0 1"/>
+                  <geom type="box" size=".02 .08 1" pos="0 -.08 0"/>
+                  <geom type="box" size=".02 .35 1" pos="0 -.43 0"/>
+                  <body name="flap" pos="-.03 -.12 -.1">
+                    <joint axis="0 0 1"/>
+                    <geom type="box" size=".01 .13 .28" pos="0 -.14 0"/>
+                  </body>
+                </body>
+              </worldbody>
+            </mujoco>
+            """
+        )
+
+    def place(self, body: int) -> np.ndarray:
+        return np.array([-0.02, -0.78, 0.0] if body == DOOR else [-0.01, -0.26, 0.0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_door_that_goes_nearly_as_its_flap_would_is_no_piece_of_that(seed) -> None:
+    room, twin = NarrowFlap(), Twin()
+    room.random = np.random.default_rng(seed)
+    room.at(-1.2, 0.0)
+    twin.look(room.look())
+    room.pull(twin, FLAP, (-1.2, 0.0), (-1.2, -1.6))
+    room.pull(twin, DOOR, (-1.2, -1.6), (-0.9, -1.6))
+    flap, door = twin.parts
+    assert [flap.parent, door.parent] == [1, -1]
+    assert [part for part, _ in twin.held] == [0, 1]
+    assert np.ptp(door.positions) == pytest.approx(0.3, abs=0.05)

@@ -1,14 +1,20 @@
-"""Parts found twice: on one hinge, or where another one explains what was seen as well."""
+"""Parts that are none: found twice, on one hinge or where another one explains what was seen as
+well, or by so little that their joint may be anywhere."""
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from palpate.identification.interactive.explanation import FURTHER, may_have_moved
+from palpate.identification.interactive.explanation import (
+    FURTHER,
+    joint_of_ways,
+    may_have_moved,
+)
 from palpate.identification.interactive.part import Part, is_same_hinge
 from palpate.identification.interactive.tree import FEWEST, PartTree
 
 NEAR, SHARED = 0.05, 0.3  # m between places of two parts, and share of one's where the other was
 LOOKS = 6  # that tell whether another part explains what was seen
+ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known
 LOSS = 0.5  # of evidence, for each point of a part: less is lost where another one explains it
 
 
@@ -33,6 +39,35 @@ def merge_same(tree: PartTree) -> None:
                     tree.relabel(look)
                 known.settle(tree.estimate(known))
                 break
+
+
+def merge_by_ways(tree: PartTree) -> None:
+    """Parts whose ways were all those of another one, which was there, are that one."""
+    order = sorted(tree.parts, key=lambda one: one.longest_way)
+    for least, part in enumerate(order):
+        for known in reversed(order[least + 1 :]):
+            old, number = tree.parts.index(part), tree.parts.index(known)
+            if (
+                part.ways
+                and old not in tree.carriers(number)
+                and all(may_have_moved(tree, number, look, way) for look, way in part.ways)
+                and joint_of_ways(tree, known, [*known.ways, *part.ways]) is not None
+            ):
+                known.ways += part.ways
+                for look in range(len(tree.looks)):
+                    tree.find(number, look, beyond=FURTHER)
+                tree.remove(old, number)
+                break
+
+
+def drop_unknown(tree: PartTree) -> None:
+    """Take out parts that no hand has held and whose joint may be anywhere by what was seen."""
+    for number in reversed(range(len(tree.parts))):
+        part = tree.parts[number]
+        turned, aside = part.estimate.intervals
+        anywhere = turned > ANYWHERE[0] or (aside > ANYWHERE[1] and part.screw.joint == "revolute")
+        if anywhere and not part.ways:
+            tree.remove(number, part.parent)
 
 
 def _are_same(tree: PartTree, number: int, other: int) -> bool:

@@ -7,7 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from palpate.identification.interactive.handling import Handling
-from palpate.identification.interactive.labels import FREE, LEAST_MOTION, evidence
+from palpate.identification.interactive.labels import (
+    FREE,
+    LEAST_MOTION,
+    evidence,
+    evidence_of_looks,
+)
 from palpate.identification.interactive.part import Candidate, Part
 from palpate.identification.interactive.refinement import SURPRISE, Estimate, refine, surprise
 from palpate.identification.interactive.screws import NOWHERE, screws_of_way
@@ -21,6 +26,7 @@ NEAR = 0.5  # the same, of one that a hand takes
 MISFIT = 1.1  # of each of a hand's ways, for the joint that they say is theirs: at most .91 of 85
 SHORT = 0.05  # m that a hand went: a way so short fits many joints
 TOGETHER = 0.02  # of the travel: how far two joints may miss the hand, beside the metres below
+CLEARLY = 0.005  # of evidence, for each point: how much likelier two joints have to be than one
 OPEN = -1.0  # of evidence, for each point: what has less is not where it is believed to be
 IN_THE_WAY = 0.05  # share of a part's points that cameras look through: hardly any where it is
 ELSEWHERE = 0.15  # rad or m that a carrier is at least from where it was believed to be
@@ -29,7 +35,7 @@ EXPLAINED = 0.015, 0.1  # m, and of the travel: how far a known joint may miss t
 
 def find_moved_part(tree: PartTree, before: int, after: int, handling: Handling) -> int:
     """The part that moved with the hand, which has one way more; -1 if none that is known has."""
-    for explain in (_by_way, _by_two_joints, _by_clouds, _by_all_ways, _by_way_elsewhere):
+    for explain in (_by_known_joints, _by_clouds, _by_all_ways, _by_way_elsewhere):
         if (part := explain(tree, before, after, handling)) >= 0:
             return part
     return -1
@@ -72,6 +78,57 @@ def labels_near(tree: PartTree, look: int, point: np.ndarray, reach: float = BES
         if np.linalg.norm(pose.at(part.support[0]) - point, axis=1).min() < reach:
             found.append(number)
     return list(dict.fromkeys(found))
+
+
+def _by_known_joints(tree: PartTree, before: int, after: int, handling: Handling) -> int:
+    """The part that the hand moved, by its own joint or together with what carries it: as both
+    looks are likelier, where its way fits either, as that of a folded lid may."""
+    began = _Belief.of(tree)
+    alone = _by_way(tree, before, after, handling)
+    by_way, value = _Belief.of(tree), _evidence_of_both(tree, before, after)
+    began.restore(tree)
+    both = _by_two_joints(tree, before, after, handling)
+    if alone >= 0 and (both < 0 or _evidence_of_both(tree, before, after) < value + CLEARLY):
+        by_way.restore(tree)
+        return alone
+    return both
+
+
+@dataclasses.dataclass(frozen=True)
+class _Belief:
+    """What an explanation of a pull may change."""
+
+    positions: list[list[float]]
+    ways: list[list[Way]]
+    labels: list[np.ndarray]
+
+    @classmethod
+    def of(cls, tree: PartTree) -> "_Belief":
+        """What is believed now."""
+        parts = tree.parts
+        return cls(
+            [list(one.positions) for one in parts],
+            [list(one.ways) for one in parts],
+            [*tree.labels],
+        )
+
+    def restore(self, tree: PartTree) -> None:
+        """Believe it again."""
+        for part, positions, ways in zip(tree.parts, self.positions, self.ways, strict=True):
+            part.positions, part.ways = list(positions), list(ways)
+        for look, labels in enumerate(self.labels):
+            if tree.labels[look] is not labels:
+                tree.put_labels(look, labels)
+
+
+def _evidence_of_both(tree: PartTree, before: int, after: int) -> float:
+    """How likely (logarithm, for each point) what is believed of the parts makes two looks."""
+    looks = before, after
+    return evidence_of_looks(
+        [tree.looks[look] for look in looks],
+        range(-1, len(tree.parts)),
+        lambda part, one, other: tree.motion(part, looks[one], looks[other]),
+    )
 
 
 def _by_way(tree: PartTree, before: int, after: int, handling: Handling) -> int:

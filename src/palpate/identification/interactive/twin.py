@@ -12,17 +12,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from palpate.identification.interactive.discovery import TELLS, discover
-from palpate.identification.interactive.duplicates import drop_explained, merge_same
+from palpate.identification.interactive.duplicates import (
+    drop_explained,
+    drop_unknown,
+    merge_by_ways,
+    merge_same,
+)
 from palpate.identification.interactive.edges.folding import discover_pair, leaves_much
 from palpate.identification.interactive.edges.splitting import split, split_off_base
 from palpate.identification.interactive.explanation import (
     BESIDE,
-    FURTHER,
     MISFIT,
     find_moved_part,
-    joint_of_ways,
     labels_near,
-    may_have_moved,
 )
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, find_beside, reparent
@@ -37,7 +39,6 @@ from palpate.perception.clouds import Cloud
 AS_GOOD = 0.03
 OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
 ELSEWHERE = 5.0, 0.05  # deg and m between two joints that nobody would take for one
-ANYWHERE = 45.0, 1.0  # deg and m: 90 % intervals of a joint of which nothing is known
 
 
 class Twin(PartTree):
@@ -102,15 +103,18 @@ class Twin(PartTree):
             for one, old in zip(self.parts, known.parts, strict=False)
         )
 
-    def _learn(self, handling: Handling) -> None:
-        """Explain a handling by a joint that is known, or a part that is new."""
+    def _learn(self, handling: Handling, *, only_new: bool = False) -> None:
+        """Explain a handling by a joint that is known, or a part that is new, or `only_new`."""
         known = self.copy()
         before = self.add_look(handling.before)
         after = self.add_look(handling.after, still=not handling.moved)
         self.handled.append(handling)
-        part, new = self._explain(before, after, handling)
+        put_to = self._part_at(before, handling)
+        part, new = self._explain(before, after, handling, only_new=only_new)
+        above = self.carriers(put_to) if put_to >= 0 else []
+        doubtful = handling.moved and part >= 0 and not new and part not in (put_to, *above)
         if part < 0 and handling.moved and self._drop_refuted(before, handling):
-            part, new = self._explain(before, after, handling)
+            part, new = self._explain(before, after, handling, only_new=only_new)
         self.held.append((part, before))
         new = self._keep(new, before, after)
         if new:
@@ -126,7 +130,7 @@ class Twin(PartTree):
         if handling.moved and not new and self._is_first_way():
             self._explain_earlier()
             self.refit(-1)
-        self._merge()
+        merge_by_ways(self)
         if by_edges := handling.moved and self.held[-1][0] < 0:
             self._explain_by_edges(before, after, handling)
         # where nothing has moved, another look only has other noise
@@ -135,7 +139,9 @@ class Twin(PartTree):
             self.refit(-1)
         merge_same(self)
         drop_explained(self)
-        self._drop_unknown()
+        drop_unknown(self)
+        if doubtful:
+            self._explain_by_new(known.copy(), handling)
         if handling.moved and not by_edges and leaves_much(self, before, after):
             self._explain_by_two(known, handling)
 
@@ -258,9 +264,20 @@ class Twin(PartTree):
         known._explain_by_edges(before, after, handling)
         merge_same(known)
         drop_explained(known)
-        known._drop_unknown()
-        if known.held[-1][0] >= 0 and known.explained() > self.explained() + AS_GOOD:
-            self.parts, self.labels, self.held = known.parts, known.labels, known.held
+        drop_unknown(known)
+        self._adopt_if_likelier(known)
+
+    def _explain_by_new(self, known: "Twin", handling: Handling) -> None:
+        """Explain a pull by a part that is new, from what was `known` before it, if that explains
+        more: a hand that was put to something else may go as a known joint would let it."""
+        known._learn(handling, only_new=True)
+        self._adopt_if_likelier(known)
+
+    def _adopt_if_likelier(self, other: "Twin") -> None:
+        """Believe what another twin of the same looks does, if it explains the last pull, and all
+        that was seen clearly better."""
+        if other.held[-1][0] >= 0 and other.explained() > self.explained() + AS_GOOD:
+            self.parts, self.labels, self.held = other.parts, other.labels, other.held
 
     def _drop_replaced(self) -> None:
         """Take out parts that a hand took where it has now held two joints, if these explain all
@@ -301,17 +318,6 @@ class Twin(PartTree):
             self.remove(number, self.parts[number].parent)
         return bool(doubtful)
 
-    def _drop_unknown(self) -> None:
-        """Take out parts that no hand has held and whose joint may be anywhere by what was seen."""
-        for number in reversed(range(len(self.parts))):
-            part = self.parts[number]
-            turned, aside = part.estimate.intervals
-            anywhere = turned > ANYWHERE[0] or (
-                aside > ANYWHERE[1] and part.screw.joint == "revolute"
-            )
-            if anywhere and not part.ways:
-                self.remove(number, part.parent)
-
     def _keep(self, new: bool, before: int, after: int) -> bool:
         """Say anew what two looks show; a new part that explains and carries nothing vanishes
         (III-B d).
@@ -329,24 +335,6 @@ class Twin(PartTree):
             self.held = [(-1 if look == before else held, look) for held, look in self.held]
             return False
         return new
-
-    def _merge(self) -> None:
-        """Parts whose ways were all those of another one, which was there, are that one."""
-        order = sorted(self.parts, key=lambda one: one.longest_way)
-        for least, part in enumerate(order):
-            for known in reversed(order[least + 1 :]):
-                old, number = self.parts.index(part), self.parts.index(known)
-                if (
-                    part.ways
-                    and old not in self.carriers(number)
-                    and all(may_have_moved(self, number, look, way) for look, way in part.ways)
-                    and joint_of_ways(self, known, [*known.ways, *part.ways]) is not None
-                ):
-                    known.ways += part.ways
-                    for look in range(len(self.looks)):
-                        self.find(number, look, beyond=FURTHER)
-                    self.remove(old, number)
-                    break
 
     def _explain_earlier(self) -> None:
         """Explain what moved and was of no part, now that one more is known that may carry it."""
@@ -370,14 +358,23 @@ class Twin(PartTree):
         self.held[number] = part, before
         self._keep(new, before, after)
 
+    def _part_at(self, look: int, handling: Handling) -> int:
+        """The part that a hand was put to."""
+        return int(self.labels[look][self.looks[look].tree.query(handling.push.point)[1]])
+
     def _explain(
-        self, before: int, after: int, handling: Handling, *, carried: bool = False
+        self,
+        before: int,
+        after: int,
+        handling: Handling,
+        *,
+        carried: bool = False,
+        only_new: bool = False,
     ) -> tuple[int, bool]:
         """The part that the hand held, -1: none that is known; and whether it is new."""
         if not handling.moved:
-            nearest = self.looks[before].tree.query(handling.push.point)[1]
-            return int(self.labels[before][nearest]), False
-        if (part := find_moved_part(self, before, after, handling)) >= 0:
+            return self._part_at(before, handling), False
+        if not only_new and (part := find_moved_part(self, before, after, handling)) >= 0:
             return part, False
         if handling.travel > TELLS and discover(self, before, after, handling, carried=carried):
             return len(self.parts) - 1, True

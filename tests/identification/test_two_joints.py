@@ -19,7 +19,7 @@ from palpate.identification.interactive.labels import distinguishing_looks, weig
 from palpate.identification.interactive.screws import screws_of_way
 from palpate.identification.interactive.twin import Twin
 from palpate.identification.interactive.ways import misfit
-from rooms import DOOR, FLAP, Room, pulled
+from rooms import DOOR, FLAP, SCENE, Room, pulled
 
 pytestmark = pytest.mark.unchecked  # what test_interactive.py checks, on more scenes
 
@@ -212,30 +212,27 @@ def test_nothing_is_hinged_on_a_part_of_which_a_look_shows_nothing(known) -> Non
     assert not discovery._is_hinged_on(twin, 0, look, look, new)
 
 
+# The door of the room, whole, with a flap before it whose hinge is beside its own.
+NARROW = (
+    SCENE[: SCENE.index('<geom type="box" size=".02 .08 1" pos="0 -.78 0"/>')]
+    + """
+      <geom type="box" size=".02 .35 1" pos="0 -.43 0"/>
+      <body name="flap" pos="-.03 -.12 -.1">
+        <joint axis="0 0 1"/>
+        <geom type="box" size=".01 .13 .28" pos="0 -.14 0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+)
+
+
 class NarrowFlap(Room):
     """A door with a flap in it whose hinge is beside the door's, and a hand on either."""
 
     def __init__(self) -> None:
-        super().__init__(
-            """
-            <mujoco>
-              <worldbody>
-                <geom type="box" size=".02 .9 1.1" pos=".15 0 1.1"/>
-                <geom type="box" size=".05 .05 1.1" pos="0 .5 1.1"/>
-                <geom type="box" size=".05 .05 1.1" pos="0 -.5 1.1"/>
-                <body name="door" pos="0 .44 1.1">
-                  <joint axis="0 0 1"/>
-                  <geom type="box" size=".02 .08 1" pos="0 -.08 0"/>
-                  <geom type="box" size=".02 .35 1" pos="0 -.43 0"/>
-                  <body name="flap" pos="-.03 -.12 -.1">
-                    <joint axis="0 0 1"/>
-                    <geom type="box" size=".01 .13 .28" pos="0 -.14 0"/>
-                  </body>
-                </body>
-              </worldbody>
-            </mujoco>
-            """
-        )
+        super().__init__(NARROW)
 
     def place(self, body: int) -> np.ndarray:
         return np.array([-0.02, -0.78, 0.0] if body == DOOR else [-0.01, -0.26, 0.0])

@@ -111,8 +111,7 @@ def _part_that_went(twin: Twin, before: int, handling: Handling) -> int:
     """The part that has gone from one look to the next as the hand has, -1: none; of one that has
     not moved what it was put to."""
     if not handling.moved:
-        nearest = twin.looks[before].tree.query(handling.push.point)[1]
-        return int(twin.labels[before][nearest])
+        return twin.part_at(before, handling)
     missed = missed_by(twin, before, before + 1, handling)
     if not missed or min(missed.values()) > EXPLAINED[0] + EXPLAINED[1] * handling.travel:
         return -1

@@ -109,7 +109,7 @@ class Twin(PartTree):
         before = self.add_look(handling.before)
         after = self.add_look(handling.after, still=not handling.moved)
         self.handled.append(handling)
-        put_to = self._part_at(before, handling)
+        put_to = self.part_at(before, handling)
         part, new = self._explain(before, after, handling, only_new=only_new)
         above = self.carriers(put_to) if put_to >= 0 else []
         doubtful = handling.moved and part >= 0 and not new and part not in (put_to, *above)
@@ -358,8 +358,8 @@ class Twin(PartTree):
         self.held[number] = part, before
         self._keep(new, before, after)
 
-    def _part_at(self, look: int, handling: Handling) -> int:
-        """The part that a hand was put to."""
+    def part_at(self, look: int, handling: Handling) -> int:
+        """The part that a hand was put to, as a look shows it; -1: none that is known."""
         return int(self.labels[look][self.looks[look].tree.query(handling.push.point)[1]])
 
     def _explain(
@@ -373,7 +373,7 @@ class Twin(PartTree):
     ) -> tuple[int, bool]:
         """The part that the hand held, -1: none that is known; and whether it is new."""
         if not handling.moved:
-            return self._part_at(before, handling), False
+            return self.part_at(before, handling), False
         if not only_new and (part := find_moved_part(self, before, after, handling)) >= 0:
             return part, False
         if handling.travel > TELLS and discover(self, before, after, handling, carried=carried):

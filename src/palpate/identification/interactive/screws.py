@@ -1,6 +1,7 @@
 """Motion of one joint, about a line or along one, and its fit to the way of a hand."""
 
 import dataclasses
+import functools
 import math
 from typing import Literal, NamedTuple
 
@@ -40,10 +41,11 @@ class Pose(NamedTuple):
     @property
     def chord(self) -> float:
         """How far (m) what is 1 m from the axis goes, straight: twice the sine of half its turn."""
-        return float(np.linalg.norm(self.rotation - np.eye(3))) / math.sqrt(2.0)
+        return float(np.linalg.norm(self.rotation - UNTURNED)) / math.sqrt(2.0)
 
 
-NOWHERE = Pose(np.eye(3), np.zeros(3))
+UNTURNED = np.eye(3)
+NOWHERE = Pose(UNTURNED, np.zeros(3))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,10 +58,20 @@ class Screw:
 
     def pose(self, position: float) -> Pose:
         """Of what it carries, at a position (rad or m) from where it was described (Rodrigues)."""
+        if (known := self._poses.get(position)) is not None:
+            return known
         if self.joint == "prismatic":
-            return Pose(np.eye(3), position * self.axis)
-        rotation = rotation_about(self.axis, position)
-        return Pose(rotation, self.point - rotation @ self.point)
+            found = Pose(UNTURNED, position * self.axis)
+        else:
+            rotation = rotation_about(self.axis, position)
+            found = Pose(rotation, self.point - rotation @ self.point)
+        self._poses[position] = found
+        return found
+
+    @functools.cached_property
+    def _poses(self) -> dict[float, Pose]:
+        """By position: where its parts are in each look is asked for again and again."""
+        return {}
 
     @property
     def across(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
@@ -138,7 +150,7 @@ class Screw:
 def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
     """The rotation by an angle (rad) about a unit vector."""
     cross = _cross_matrix(axis)
-    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    return UNTURNED + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
 
 
 def cross(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -156,7 +168,7 @@ def _frame(axis: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
 
 def _cross_matrix(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Its product with a vector is the cross product."""
-    x, y, z = axis
+    x, y, z = axis.tolist()  # numbers of Python, from which NumPy makes an array sooner
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 

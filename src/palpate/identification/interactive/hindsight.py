@@ -20,7 +20,7 @@ from palpate.identification.interactive.insertion import CARRIED, STILLER, hang
 from palpate.identification.interactive.refinement import SURPRISE, surprise
 from palpate.identification.interactive.twin import Twin
 
-ENOUGH = 0.82  # of evidence, for each point, whatever parts cost: less than nearly all is explained
+ENOUGH = 0.78  # of evidence, for each point, whatever parts cost: less than most is explained
 AS_GOOD, HANGS = 0.003, 0.008  # the same: what hanging a part lower may cost, and on another gain
 NEARLY = 0.02  # of evidence, for each of a part's points: to be seen less is not to be seen as well
 # the same: how much more what was known earlier, or the account backwards, has to explain

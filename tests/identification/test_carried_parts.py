@@ -56,8 +56,30 @@ POST = """
   </worldbody>
 </mujoco>
 """
+# A cabinet with a door above a drawer.
+CABINET = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size=".02 .5 1" pos=".5 0 1"/>
+    <geom type="box" size=".25 .02 .4" pos=".25 .32 .9"/>
+    <geom type="box" size=".25 .02 .4" pos=".25 -.32 .9"/>
+    <geom type="box" size=".25 .32 .02" pos=".25 0 1.3"/>
+    <body name="door" pos="0 .3 1.1">
+      <joint axis="0 0 1"/>
+      <geom type="box" size=".01 .3 .18" pos="0 -.3 0"/>
+    </body>
+    <body name="drawer" pos="0 0 .7">
+      <joint type="slide" axis="-1 0 0"/>
+      <geom type="box" size=".01 .29 .19"/>
+      <geom type="box" size=".2 .01 .15" pos=".2 .27 0"/>
+      <geom type="box" size=".2 .01 .15" pos=".2 -.27 0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
 ON_DOOR, ON_FLAP = np.array([-0.02, -0.4, 0.5]), np.array([-0.02, 0.0, 0.72])
 LEFT, RIGHT = 1, 2
+DRAWER = 2
 
 
 class Post(Room):
@@ -68,6 +90,16 @@ class Post(Room):
 
     def place(self, body: int) -> np.ndarray:
         return np.array([-0.015, 0.4 if body == LEFT else -0.4, 0.0])
+
+
+class Cabinet(Room):
+    """A door and a drawer below it, and a hand at the edge of the one or in front of the other."""
+
+    def __init__(self) -> None:
+        super().__init__(CABINET)
+
+    def place(self, body: int) -> np.ndarray:
+        return np.array([-0.01, -0.5, 0.0] if body == DOOR else [-0.01, 0.0, 0.05])
 
 
 @pytest.fixture
@@ -199,6 +231,19 @@ def test_a_door_beside_one_that_is_known_is_no_part_on_it(left, right) -> None:
     twin.look(room.look())
     assert not split(twin, [len(twin.looks) - 1])
     assert len(twin.parts) == 1
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_drawer_slides_though_a_door_swings_meanwhile(seed) -> None:
+    room, twin = Cabinet(), Twin()
+    room.random = np.random.default_rng(seed)
+    room.at(0.0, 0.0)
+    twin.look(room.look())
+    room.pull(twin, DOOR, (0.0, 0.0), (-0.9, 0.0))
+    # some hinge on the door joins the ends of the hand's way as well, but a line would be chance
+    room.pull(twin, DRAWER, (-0.9, 0.0), (-0.4, 0.2))
+    assert [part.screw.joint for part in twin.parts] == ["revolute", "prismatic"]
+    assert [part.parent for part in twin.parts] == [-1, -1]
 
 
 @pytest.mark.parametrize(

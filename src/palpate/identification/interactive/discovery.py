@@ -51,6 +51,9 @@ TURNS, ARMS = 12, (0.0, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7)  # directio
 TRIED = 3  # of those joints, the best, which are refined
 ROUNDS = 4  # of a joint and of what has moved with it, each from the other
 SETTLED = 2  # ways of a hand that agree: the joint of a part is what they say
+# How much likelier a joint on what moved as well has to be than one that the whole way follows
+# (logarithm): by chance a way of two joints may be an arc, and hardly ever a line.
+BY_CHANCE = {"revolute": 8.0, "prismatic": 16.0}
 
 
 def discover(
@@ -81,8 +84,11 @@ def discover(
             near = [one for one in near if _moves_beside(tree, before, after, one, found)]
         options = (_on_carrier(tree, before, after, one, way) for one in near)
         other = next((one for one in options if one is not None), None)
-        if found is None or (other is not None and other.gain > found.gain):
+        if found is None:
             found = other
+        elif other is not None:
+            chance = BY_CHANCE[found.estimate.screw.joint]
+            found = other if other.gain > found.gain + chance else found
     if found is not None:
         insert(tree, before, after, found, way)
     return found is not None

@@ -108,6 +108,6 @@ def test_too_few_trials_are_refused_before_anything_is_fitted(recording, tmp_pat
     options = IdentifyCart(recordings=(recording,), residual=True, out=tmp_path / "run")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(IdentifyCart, "held_out", 0.9)
-        with pytest.raises(PalpateError, match=r"needs at least 5 trials.* the recording has 2$"):
+        with pytest.raises(PalpateError, match=r"needs at least 8 trials.* the recording has 2$"):
             identify.run(options)
     assert not (tmp_path / "run").exists()

@@ -41,7 +41,9 @@ CHECK = 20  # iterations between looks at the held-out trials
 CONFIDENCE = 0.95  # that the gain on held-out trials is not chance, one-sided
 # Held-out trials at least: two or three agree by chance too often, as they also stop the descent.
 JUDGES = 4
-FEWEST_TRIALS = JUDGES + 1  # that say whether a correction helps
+# Trials at least, half of them to learn from: what was learnt from two gained on four like them,
+# and made the motion of a box twice as wrong under other forces.
+FEWEST_TRIALS = 2 * JUDGES
 MIN_GAIN = 0.02  # of the physics' error, below which a correction is not worth carrying
 AVERAGED = 30  # iterations whose networks are averaged (Polyak): one alone is noisy
 # Share of what the physics changes below which a correction mends no physics: it makes up for how
@@ -146,15 +148,15 @@ def check_correctable(model: Model, aligned: Aligned) -> None:
     count = len(aligned.length)
     if count < FEWEST_TRIALS:
         raise PalpateError(
-            f"a correction needs at least {FEWEST_TRIALS} trials, one to learn from and {JUDGES} "
-            f"to judge by; the recording has {count}"
+            f"a correction needs at least {FEWEST_TRIALS} trials, {JUDGES} to learn from and "
+            f"{JUDGES} to judge by; the recording has {count}"
         )
 
 
 def _split_trials(aligned: Aligned, settings: ResidualSettings) -> tuple[np.ndarray, np.ndarray]:
     count = len(aligned.length)
     order = np.random.default_rng(settings.seed).permutation(count)
-    judges = min(max(JUDGES, round(settings.held_out * count)), count - 1)
+    judges = min(max(JUDGES, round(settings.held_out * count)), count - JUDGES)
     return np.sort(order[judges:]), np.sort(order[:judges])
 
 

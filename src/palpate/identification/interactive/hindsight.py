@@ -33,7 +33,7 @@ def reconsider(twin: Twin) -> Twin:
 
     That may be what was believed before some push, or what is believed of the same looks and
     handlings when they are taken from the last to the first; the latter is not tried where all
-    pulls are explained, and nearly all that was seen.
+    pulls are explained, and most of what was seen.
     """
     twin = drop_needless(_with_what_was_known(correct_parents(twin)))
     if twin.evidence_of_looks() > ENOUGH and not twin.share_unexplained:

@@ -20,7 +20,7 @@ from palpate.identification.interactive.insertion import CARRIED, STILLER, hang
 from palpate.identification.interactive.refinement import SURPRISE, surprise
 from palpate.identification.interactive.twin import Twin
 
-ENOUGH = 0.78  # of evidence, for each point, whatever parts cost: less than most is explained
+ENOUGH = 0.82  # of evidence, for each point, whatever parts cost: less than nearly all is explained
 AS_GOOD, HANGS = 0.003, 0.008  # the same: what hanging a part lower may cost, and on another gain
 NEARLY = 0.02  # of evidence, for each of a part's points: to be seen less is not to be seen as well
 # the same: how much more what was known earlier, or the account backwards, has to explain
@@ -33,7 +33,7 @@ def reconsider(twin: Twin) -> Twin:
 
     That may be what was believed before some push, or what is believed of the same looks and
     handlings when they are taken from the last to the first; the latter is not tried where all
-    pulls are explained, and most of what was seen.
+    pulls are explained, and nearly all that was seen.
     """
     twin = drop_needless(_with_what_was_known(correct_parents(twin)))
     if twin.evidence_of_looks() > ENOUGH and not twin.share_unexplained:

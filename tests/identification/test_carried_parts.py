@@ -77,6 +77,7 @@ CABINET = """
   </worldbody>
 </mujoco>
 """
+CAMERA = Pinhole.looking_at((0.0, 0.0, 0.6), (-2.4, 0.0, 0.7), 320, 240, math.radians(58.0))
 ON_DOOR, ON_FLAP = np.array([-0.02, -0.4, 0.5]), np.array([-0.02, 0.0, 0.72])
 LEFT, RIGHT = 1, 2
 DRAWER = 2
@@ -401,10 +402,9 @@ def test_a_floor_that_goes_on_from_an_open_door_is_not_of_it() -> None:
 
 def test_what_is_known_to_be_another_part_does_not_show_where_a_part_is() -> None:
     # two equal panels; the first, half hidden behind a post, would be seen better at the other
-    camera = Pinhole.looking_at((0.0, 0.0, 0.6), (-2.4, 0.0, 0.7), 320, 240, math.radians(58.0))
     tree = PartTree()
     for seed in (0, 1):
-        tree.looks.append(cloud_of([depth_of(PANELS, 0.0, camera, seed)]))
+        tree.looks.append(cloud_of([depth_of(PANELS, 0.0, CAMERA, seed)]))
         points = tree.looks[-1].points
         tree.labels.append(np.where((points[:, 1] > 0.28) & (points[:, 0] > -0.1), 0, -1))
     y, z = np.meshgrid(np.arange(0.32, 0.7, 0.03), np.arange(0.15, 1.1, 0.03))
@@ -445,3 +445,21 @@ def test_a_way_on_a_part_whose_carrier_has_moved_counts_by_its_ends() -> None:
     turned = still.position_of(local[0], local[-1:])[0]
     assert abs(turned) == pytest.approx(0.7, abs=0.1)
     assert twin.way_from(-1, look, way) is way
+
+
+@pytest.mark.parametrize(("radius", "joint"), [(1.0, "revolute"), (4.0, "prismatic")])
+def test_a_slide_is_no_hinge_that_is_fitted_metres_away(radius, joint) -> None:
+    # a drawer whose points were mistaken, so that a bent way fits it better
+    tree, turned = PartTree(), np.linspace(0.0, 0.8 / radius, 40)
+    arc = np.stack([np.sin(turned), 1.0 - np.cos(turned), np.zeros(40)], axis=1)
+    way = radius * arc
+    for _ in range(3):
+        tree.looks.append(cloud_of([depth_of(PANELS, 0.0, CAMERA, 0)]))
+        tree.labels.append(np.full(len(tree.looks[0].points), -1))
+    hinge = Screw("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.0, radius, 0.0]))
+    ways, support = [(0, way), (1, way[::-1])], (way, np.tile([-1.0, 0.0, 0.0], (40, 1)))
+    known = refine(hinge, np.zeros(3), [None] * 3, ways)
+    assert known.screw.radii(way).mean() == pytest.approx(radius, rel=0.05)
+    tree.parts.append(Part(-1, known, [0.0, 0.8 / radius, 0.0], {}, ways, support))
+    tree.refit(0)
+    assert tree.parts[0].screw.joint == joint

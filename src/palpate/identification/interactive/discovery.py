@@ -198,6 +198,8 @@ def _best(
             estimate = refine(estimate.screw, estimate.positions, seen, [(0, way)])
         if max(map(len, masks)) < FEWEST or surprise(estimate, way) > STRANGE:
             continue
+        if estimate.screw.is_far_from(way):
+            continue  # what goes so slides, and its line is tried, too
         candidate = candidate_of(estimate, back, before, after)
         if not any(
             tree.much_is_left(candidate, look, len(mask))

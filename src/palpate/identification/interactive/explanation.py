@@ -337,7 +337,12 @@ def joint_of_ways(tree: PartTree, part: Part, ways: list[Way]) -> Estimate | Non
     found = [
         refine(screw, np.zeros(looks), [None] * looks, ways) for screw in screws_of_way(longest)
     ]
-    found = [one for one in found if all(misfit(one.screw, way) < MISFIT for _, way in ways)]
+    found = [
+        one
+        for one in found
+        if not one.screw.is_far_from(longest)
+        and all(misfit(one.screw, way) < MISFIT for _, way in ways)
+    ]
     return min(found, key=lambda one: one.criterion, default=None)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 Points = Float[np.ndarray, "n 3"]
-FARTHEST = 6.0  # m from a hand's way to an axis: what turns about one further away slides
+FARTHEST = 3.0  # m from a hand's way to an axis: what turns about one further away slides
 AXES, STEP = 4, 1e-5  # numbers of a screw, and of their differences that give slopes (rad, m)
 TOUCH = 1e-3  # m, how well the way of a hand is known, offsets that stay apart
 
@@ -141,6 +141,10 @@ class Screw:
             ways.append(away / max(float(np.linalg.norm(away)), 1e-6))
         return (points - self.point) @ (ways[0] - ways[1]) > 0.0
 
+    def is_far_from(self, points: Points) -> bool:
+        """Whether it is a hinge so far from a way that what goes along that slides."""
+        return self.joint == "revolute" and float(self.radii(points).mean()) > FARTHEST
+
     def near(self, place: Float[np.ndarray, "3"]) -> "Screw":
         """The same, with the point of its axis that is nearest to a place."""
         along = float((place - self.point) @ self.axis)
@@ -213,7 +217,7 @@ def _circle(points: Points, middle: np.ndarray, directions: np.ndarray) -> Screw
             1.0, float(np.abs(change[:2]).max() / 0.3), float(np.abs(change[2:]).max() / 0.3)
         )
         screw = screw.varied(change / size)
-    if np.linalg.norm(screw.point - middle) > FARTHEST:
+    if screw.is_far_from(points):
         return None
     end = screw.position_of(points[0], points[-1:])[0]
     return dataclasses.replace(screw, axis=screw.axis * np.sign(end)) if end else screw

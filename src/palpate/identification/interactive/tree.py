@@ -342,6 +342,7 @@ class PartTree(Kinematics):
                     for screw in screws_of_way(longest)
                     if screw.joint != part.screw.joint
                 ]
+                found = [one for one in found if not one.screw.is_far_from(longest)] or found
             part.settle(min(found, key=lambda one: one.criterion))
             self.describe(number)
 

@@ -187,6 +187,34 @@ def test_a_pull_that_tells_little_of_a_door_costs_the_wall_little_trust():
     assert values[0] > 1.05 * values[1]
 
 
+def test_a_pull_in_vain_tells_of_other_pieces_of_what_is_flat(monkeypatch):
+    twin, point = unknown_door(), DOOR.point + np.array([0.0, 0.3, 0.3])
+    whole = max(
+        (one for one in surfaces(twin.looks[1], twin.labels[1], np.random.default_rng(0))
+         if one.centre[0] > -0.15),
+        key=lambda one: one.area,
+    )  # fmt: skip
+    own = twin.looks[1].points[whole.members]
+    piece = dataclasses.replace(whole, members=whole.members[own[:, 2] < point[2] - 0.15])
+    monkeypatch.setattr(active, "surfaces", lambda *_: [piece])
+    values, ways = [], []
+    for way in (-OUT, OUT):
+        vain = dataclasses.replace(pulled(twin, point, moved=False), push=Push(point, way))
+        twin.handled, twin.held = [vain], [(-1, 0)]
+        ((value, push),) = tried(twin)
+        values.append(value)
+        ways.append(float(push.direction @ OUT))
+    assert ways[0] > active.SAME_WAY
+    assert values[1] < 0.9 * values[0]
+    assert ways[1] <= active.SAME_WAY or values[1] == pytest.approx(active.TRIED_BEFORE * values[0])
+    twin.held = [(5, 0)]  # of another part a pull tells nothing
+    assert not active._vain_pulls_beside(twin, piece, twin.looks[1], 1)
+    twin.held = [(-1, 0)]
+    assert len(active._vain_pulls_beside(twin, piece, twin.looks[1], 1)) == 1
+    # at the piece itself it is weighed by what is believed of its joints
+    assert not active._vain_pulls_beside(twin, whole, twin.looks[1], 1)
+
+
 @pytest.mark.parametrize("sideways", [False, True])
 def test_what_a_hand_took_away_and_is_back_may_go_the_same_way_again(sideways):
     twin = unknown_door()

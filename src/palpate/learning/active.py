@@ -42,6 +42,7 @@ JOINT = 25.0
 MISSED = 0.7  # of what is expected is left after each time that a hand got no hold there
 # What is left where a hand took something that no joint explained, within as many m.
 TRIED_BEFORE, NEAR_IT = 0.4, 0.15
+SAME_WAY = 0.8  # cosine between two ways of pulling: a slide that one moves the other may not
 BEHIND = 0.03  # m
 GRIPS = 0.12, 0.38, 0.5, 0.62, 0.88  # shares of a surface's sides at which a hand takes hold
 ENDED = 0.8  # of the travel that was wanted: a hand that got less far was at an end
@@ -132,6 +133,8 @@ def _tries(
             if pull.moved:  # and nothing was found: it would be the same again
                 away = np.linalg.norm(points - pull.point, axis=1)
                 value = value * TRIED_BEFORE ** (away < NEAR_IT)
+        for way in _vain_pulls_beside(twin, surface, cloud, look):
+            value = value * TRIED_BEFORE ** (directions @ way > SAME_WAY)
         if surface.part >= 0:
             for sign in (-1.0, 1.0):
                 along = sign * np.sum(
@@ -276,6 +279,28 @@ def _pulls_at(
             pull = pull._replace(moved=False, travel=0.0, ended=True, force=float(force[0]))
         pulls.append(pull)
     return pulls, missed
+
+
+def _vain_pulls_beside(twin: Twin, surface: Surface, cloud: Cloud, look: int) -> list[np.ndarray]:
+    """Which ways hands have pulled in vain within the rectangle of a surface, or nearly, but not at
+    it: what is flat and noisy may be other surfaces in each look."""
+    found: list[np.ndarray] = []
+    for one, (held, before) in zip(twin.handled, twin.held, strict=True):
+        motion = twin.motion(surface.part, before, look)
+        point = motion.at(one.push.point[None])[0]
+        flat = surface.sides @ (point - surface.centre)
+        height = float((point - surface.centre) @ surface.normal)
+        beyond = np.maximum(np.maximum(surface.low - flat, flat - surface.high), 0.0)
+        if (
+            one.held
+            and not one.moved
+            and held == surface.part
+            and abs(height) < BEHIND
+            and (beyond < NEAR_IT).all()
+            and not _at(point, surface, cloud)
+        ):
+            found.append(motion.turned(one.push.direction[None])[0])
+    return found
 
 
 def _has_left(way: Float[np.ndarray, "times 3"], surface: Surface) -> bool:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import types
 
 import numpy as np
 import pytest
@@ -463,3 +464,20 @@ def test_a_slide_is_no_hinge_that_is_fitted_metres_away(radius, joint) -> None:
     tree.parts.append(Part(-1, known, [0.0, 0.8 / radius, 0.0], {}, ways, support))
     tree.refit(0)
     assert tree.parts[0].screw.joint == joint
+
+
+@pytest.mark.parametrize(
+    ("count", "gain", "believed"),
+    [(1, 0.021, False), (1, 0.024, True), (5, 0.006, False), (5, 0.009, True)],
+)
+def test_of_many_parts_a_new_one_that_a_hand_felt_has_few_points(
+    monkeypatch, count, gain, believed
+) -> None:
+    twin, other = Twin(), Twin()
+    for one, parts in ((twin, count), (other, count + 1)):
+        one.parts = [None] * parts
+        one.handled, one.held = [types.SimpleNamespace(moved=True)], [(0, 0)]
+    monkeypatch.setattr(Twin, "_learn", lambda *_, only_new: None)
+    monkeypatch.setattr(Twin, "evidence_of_looks", lambda one: gain if one is other else 0.0)
+    twin._explain_by_new(other, other.handled[0])
+    assert len(twin.parts) == count + believed

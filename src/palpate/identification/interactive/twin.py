@@ -38,6 +38,7 @@ from palpate.perception.clouds import Cloud
 # of evidence, for each point: what it may cost to have a part less, and what one more has to gain
 AS_GOOD = 0.03
 OF_PART, OF_PULLS = 0.02, 0.1  # the same: what a part costs, and pulls if none is of a part
+OF_NEW = 0.045  # the same, for each part that there then is: what a new one gains that a hand felt
 ELSEWHERE = 5.0, 0.05  # deg and m between two joints that nobody would take for one
 
 
@@ -271,12 +272,15 @@ class Twin(PartTree):
         """Explain a pull by a part that is new, from what was `known` before it, if that explains
         more: a hand that was put to something else may go as a known joint would let it."""
         known._learn(handling, only_new=True)
-        self._adopt_if_likelier(known)
+        gain = AS_GOOD
+        if len(known.parts) > len(self.parts):  # of many parts each has few of the points
+            gain = OF_NEW / len(known.parts) - OF_PART
+        self._adopt_if_likelier(known, gain)
 
-    def _adopt_if_likelier(self, other: "Twin") -> None:
-        """Believe what another twin of the same looks does, if it explains the last pull, and all
-        that was seen clearly better."""
-        if other.held[-1][0] >= 0 and other.explained() > self.explained() + AS_GOOD:
+    def _adopt_if_likelier(self, other: "Twin", gain: float = AS_GOOD) -> None:
+        """Believe what another twin of the same looks does, if it explains the last pull, and more
+        of all that was seen by a `gain`."""
+        if other.held[-1][0] >= 0 and other.explained() > self.explained() + gain:
             self.parts, self.labels, self.held = other.parts, other.labels, other.held
 
     def _drop_replaced(self) -> None:

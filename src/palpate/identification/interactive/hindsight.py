@@ -11,20 +11,31 @@ looks and ways, so that how well they explain those compares them.
 """
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
-from palpate.identification.interactive.explanation import EXPLAINED, FURTHER, missed_by
+from palpate.identification.interactive.explanation import (
+    EXPLAINED,
+    FURTHER,
+    joint_of_ways,
+    missed_by,
+)
 from palpate.identification.interactive.handling import Handling
 from palpate.identification.interactive.insertion import CARRIED, STILLER, hang
+from palpate.identification.interactive.part import support_of
 from palpate.identification.interactive.refinement import SURPRISE, surprise
-from palpate.identification.interactive.twin import Twin
+from palpate.identification.interactive.tree import FEWEST, ROUGHLY
+from palpate.identification.interactive.twin import OF_PART, Twin
 
 ENOUGH = 0.82  # of evidence, for each point, whatever parts cost: less than nearly all is explained
 AS_GOOD, HANGS = 0.003, 0.008  # the same: what hanging a part lower may cost, and on another gain
+# the same: of a part that no hand took, and of one that a hand took along, less may as well be none
+LITTLE, NOTHING = 0.008, 3e-4
+SOUGHT = {"revolute": (3.0, 0.05), "prismatic": (1.5, 0.03)}  # rad and m: how far, in which steps
 NEARLY = 0.02  # of evidence, for each of a part's points: to be seen less is not to be seen as well
 # the same: how much more what was known earlier, or the account backwards, has to explain
-CLEARER, BETTER = 0.01, 0.03
+BETTER = 0.01
 FEWER = 1  # parts than are known now: what was known earlier and had less explains less
 
 
@@ -50,7 +61,7 @@ def _with_what_was_known(twin: Twin) -> Twin:
         if len(known.parts) + FEWER >= len(twin.parts) and not twin.adds_to(known)
     ]
     best = max(others, key=Twin.explained, default=twin)
-    return _fitted(best) if best.explained() > twin.explained() + CLEARER else twin
+    return _fitted(best) if best.explained() > twin.explained() + BETTER else twin
 
 
 def take_further(known: Twin, twin: Twin) -> Twin:
@@ -84,27 +95,69 @@ def _fitted(twin: Twin) -> Twin:
 
 
 def drop_needless(twin: Twin) -> Twin:
-    """The twin without parts that explain no more than they cost, and that no hand has felt."""
+    """The twin without parts that explain too little, and that no hand has felt by themselves; one
+    that a hand took along with its carrier only if it explains nothing at all."""
     for number in reversed(range(len(twin.parts))):
         if twin.was_felt_by_itself(number):
             continue
-        other = twin.copy()
-        held = [part == number for part, _ in other.held]
-        other.remove(number, other.parts[number].parent)
-        for look in range(len(other.looks)):
-            other.relabel(look)
-        if any(part.parent == number for part in twin.parts):
-            # what it carried was only seen as if on it: a lid, taken for two hinges at once
-            other.refit(-1)
-            for look in range(len(other.looks)):
-                other.relabel(look)
+        other = max(_without(twin, number), key=Twin.explained)
+        held = [part == number for part, _ in twin.held]
         other.held = [
             (_part_that_went(other, before, handling), before) if lost else (part, before)
             for (part, before), lost, handling in zip(other.held, held, other.handled, strict=True)
         ]
-        if other.explained() > twin.explained():
+        least = NOTHING if twin.parts[number].ways else LITTLE
+        if other.explained() > twin.explained() + OF_PART - least:
             twin = other
     return twin
+
+
+def _without(twin: Twin, number: int) -> Iterator[Twin]:
+    """The twin without a part; what that carried was only seen as if on it, and is fitted again: a
+    lid, taken for two hinges at once, from where it is now, and then from the ways of hands."""
+    other = twin.copy()
+    other.remove(number, other.parts[number].parent)
+    carried = [
+        part - (part > number) for part, one in enumerate(twin.parts) if one.parent == number
+    ]
+    anew = other.copy()
+    for look in range(len(other.looks)):
+        other.relabel(look)
+    if carried:
+        other.refit(-1)
+        for look in range(len(other.looks)):
+            other.relabel(look)
+    yield other
+    if carried and all(_fit_to_ways(anew, part) for part in carried):
+        anew.refit(-1)
+        for look in range(len(anew.looks)):
+            for part in carried:
+                anew.find(part, look)
+            anew.relabel(look)
+        yield anew
+
+
+def _fit_to_ways(twin: Twin, number: int) -> bool:
+    """Give a part the joint that the ways of hands alone say, and seek it in every look; whether
+    they are of one joint, and a look says what is to be sought."""
+    part = twin.parts[number]
+    own = part.seen.get(part.shown, ())
+    if not part.ways or len(own) < FEWEST:
+        return False
+    if (found := joint_of_ways(twin, part, part.ways)) is None:
+        return False
+    part.settle(found)
+    back = twin.pose(number, part.shown).inverse
+    part.support = support_of([twin.looks[part.shown]], [own], [back])
+    beyond, step = SOUGHT[found.screw.joint]
+    tried = np.arange(-beyond, beyond, step)
+    for look in range(len(twin.looks)):
+        if look != part.shown:
+            seen = twin.seen_at(number, look, tried, fewest=ROUGHLY)
+            part.positions[look] = float(tried[seen.argmax()])
+    for look in range(len(twin.looks)):
+        twin.relabel(look)
+    return True
 
 
 def _part_that_went(twin: Twin, before: int, handling: Handling) -> int:

@@ -35,7 +35,7 @@ LITTLE, NOTHING = 0.008, 3e-4
 SOUGHT = {"revolute": (3.0, 0.05), "prismatic": (1.5, 0.03)}  # rad and m: how far, in which steps
 NEARLY = 0.02  # of evidence, for each of a part's points: to be seen less is not to be seen as well
 # the same: how much more what was known earlier, or the account backwards, has to explain
-BETTER = 0.01
+CLEARER, BETTER = 0.01, 0.03
 FEWER = 1  # parts than are known now: what was known earlier and had less explains less
 
 
@@ -61,7 +61,7 @@ def _with_what_was_known(twin: Twin) -> Twin:
         if len(known.parts) + FEWER >= len(twin.parts) and not twin.adds_to(known)
     ]
     best = max(others, key=Twin.explained, default=twin)
-    return _fitted(best) if best.explained() > twin.explained() + BETTER else twin
+    return _fitted(best) if best.explained() > twin.explained() + CLEARER else twin
 
 
 def take_further(known: Twin, twin: Twin) -> Twin:
@@ -97,29 +97,32 @@ def _fitted(twin: Twin) -> Twin:
 def drop_needless(twin: Twin) -> Twin:
     """The twin without parts that explain too little, and that no hand has felt by themselves; one
     that a hand took along with its carrier only if it explains nothing at all."""
-    for number in reversed(range(len(twin.parts))):
-        if twin.was_felt_by_itself(number):
-            continue
-        other = max(_without(twin, number), key=Twin.explained)
-        held = [part == number for part, _ in twin.held]
-        other.held = [
-            (_part_that_went(other, before, handling), before) if lost else (part, before)
-            for (part, before), lost, handling in zip(other.held, held, other.handled, strict=True)
-        ]
-        least = NOTHING if twin.parts[number].ways else LITTLE
-        if other.explained() > twin.explained() + OF_PART - least:
-            twin = other
+    while options := [one for part in range(len(twin.parts)) if (one := _dropped(twin, part))]:
+        twin = max(options, key=Twin.explained)
     return twin
+
+
+def _dropped(twin: Twin, number: int) -> Twin | None:
+    """The twin without a part; None if that was felt by itself, or explains too much."""
+    if twin.was_felt_by_itself(number):
+        return None
+    other = max(_without(twin, number), key=Twin.explained)
+    held = [part == number for part, _ in twin.held]
+    other.held = [
+        (_part_that_went(other, before, handling), before) if lost else (part, before)
+        for (part, before), lost, handling in zip(other.held, held, other.handled, strict=True)
+    ]
+    least = NOTHING if twin.parts[number].ways else LITTLE
+    return other if other.explained() > twin.explained() + OF_PART - least else None
 
 
 def _without(twin: Twin, number: int) -> Iterator[Twin]:
     """The twin without a part; what that carried was only seen as if on it, and is fitted again: a
-    lid, taken for two hinges at once, from where it is now, and then from the ways of hands."""
-    other = twin.copy()
-    other.remove(number, other.parts[number].parent)
-    carried = [
-        part - (part > number) for part, one in enumerate(twin.parts) if one.parent == number
-    ]
+    lid, taken for two hinges at once, from where it is now. Then it is fitted to the ways of hands,
+    and so is what carried the part, with the ways of that as well, if a hand has taken it."""
+    part, other = twin.parts[number], twin.copy()
+    other.remove(number, part.parent)
+    carried = [at - (at > number) for at, one in enumerate(twin.parts) if one.parent == number]
     anew = other.copy()
     for look in range(len(other.looks)):
         other.relabel(look)
@@ -128,11 +131,15 @@ def _without(twin: Twin, number: int) -> Iterator[Twin]:
         for look in range(len(other.looks)):
             other.relabel(look)
     yield other
-    if carried and all(_fit_to_ways(anew, part) for part in carried):
+    if part.parent >= 0 and twin.parts[part.parent].ways:
+        carrier = part.parent - (part.parent > number)
+        anew.parts[carrier].ways += part.ways
+        carried.append(carrier)
+    if fitted := [at for at in carried if _fit_to_ways(anew, at)]:
         anew.refit(-1)
         for look in range(len(anew.looks)):
-            for part in carried:
-                anew.find(part, look)
+            for at in fitted:
+                anew.find(at, look)
             anew.relabel(look)
         yield anew
 

@@ -148,7 +148,7 @@ def _fit_to_ways(twin: Twin, number: int) -> bool:
     """Give a part the joint that the ways of hands alone say, and seek it in every look; whether
     they are of one joint, and a look says what is to be sought."""
     part = twin.parts[number]
-    own = part.seen.get(part.shown, ())
+    own = part.seen.get(part.shown, np.zeros(0, int))
     if not part.ways or len(own) < FEWEST:
         return False
     if (found := joint_of_ways(twin, part, part.ways)) is None:
